@@ -58,7 +58,9 @@ def errors_after_request(problem: fp.Problem, controller: fp.ComputedTorque, req
     ready = checked(problem, controller)
     loop = close_loop(problem, ready)
     run = loop.function.mapaccum("run", cycles)
-    believed = np.diag(1 / ready.parameters(problem.plant)[:1]) if len(requests[0]) == 1 else np.eye(2)
+    believed = (
+        np.diag(1 / ready.plant_model(problem).parameters(problem.plant)[:1]) if len(requests[0]) == 1 else np.eye(2)
+    )
     collected = []
     for request in requests:
         memory = loop.memory.split(ca.DM(loop.memory.start()))

@@ -14,7 +14,8 @@ from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
 from fpirhc.conformance.loops import Trial, anything
 from fpirhc.conformance.loops import two_masses as two_masses
 from fpirhc.controllers.base import Controller, compose_controller
-from fpirhc.controllers.contract import checked, resolved
+from fpirhc.controllers.contract import checked, resolved, with_optimiser
+from fpirhc.deformation.base import with_inner
 from fpirhc.describe import describe
 from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
@@ -65,7 +66,7 @@ def facts_hold(trial: Trial, generator: np.random.Generator) -> None:  # noqa: A
         f"after resolved() its deformation still has the automatic settings {ready.deformation.automatic}",
     )
     if ready.inner is not None:
-        same = ready.around(ready.inner)
+        same = with_inner(ready, ready.inner)
         hold(describe(same) == describe(ready), "around its own inner controller it has another description")
     planner = ready.planner
     hold(
@@ -73,7 +74,7 @@ def facts_hold(trial: Trial, generator: np.random.Generator) -> None:  # noqa: A
         f"its planner is {planner}, and its cycle has {'a' if planner is None else 'no'} signal 'solve'",
     )
     if planner is not None:
-        same = ready.with_optimiser(planner.optimiser)
+        same = with_optimiser(ready, planner.optimiser)
         hold(describe(same) == describe(ready), "with its own optimiser it has another description")
     fed = {read: name for read, name in ready.feeds.items() if read != "output" or trial.problem.plant.outputs}
     for read, name in fed.items():
@@ -206,7 +207,8 @@ def _measured_once(trial: Trial, bad: float, entry: int | None, what: str) -> No
     run, lower, upper = trial.run, *trial.problem.limits.input_bounds(trial.problem.plant)
     # A stepper's gate keeps bad samples away; the controller itself must survive them too, inside of another one.
     composite = compose_controller(trial.problem, trial.controller)
-    bare, parameters = Evaluator(composite.function), trial.controller.parameters(trial.problem.plant)
+    bare, model = Evaluator(composite.function), trial.controller.plant_model(trial.problem)
+    parameters = model.parameters(trial.problem.plant)
 
     def step(*arguments: npt.ArrayLike) -> tuple[Array, Array, float]:
         *measured, before = arguments

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from fpirhc.conformance.laws import hold, within
 from fpirhc.conformance.loops import Replay, Trial, coarse_steps, spelled_by_states
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.contract import checked, tracking_law
 from fpirhc.controllers.form_check import MAPS
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.identity import Identity
@@ -36,9 +36,9 @@ _SHORT = 40  # cycles
 
 
 def exact_parameters_are_unknown(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """The command does not depend on the exact parameters, which nobody knows of a real plant, unless `knows_exact` says so."""
+    """The command does not depend on the exact parameters, which nobody knows of a real plant, unless `plant_model` says so."""
     plant = trial.problem.plant
-    if trial.controller.knows_exact or not plant.parameters:
+    if trial.controller.plant_model(trial.problem).exact or not plant.parameters:
         return
     other = replace(trial.problem, plant=plant.with_exact(plant.exact * _OTHER))
     one, two = (Replay(p, trial.controller, trial.run) for p in (trial.problem, other))
@@ -47,7 +47,7 @@ def exact_parameters_are_unknown(trial: Trial, generator: np.random.Generator) -
         hold(
             np.array_equal(command, its, equal_nan=True),
             f"with exact parameters {_OTHER - 1:.0%} larger, and the same approximate ones and measurements, its command of cycle "
-            f"{k} is {its} in place of {command}; use plant.approximate, or state knows_exact = True where this is meant",
+            f"{k} is {its} in place of {command}; use plant.approximate, or say PlantModel(..., exact=True) where this is meant",
         )
 
 
@@ -71,7 +71,7 @@ def deformation_acts(trial: Trial, generator: np.random.Generator) -> None:  # n
 
 
 def desired_response_is_deformed(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """Where `deforms_response` is true the signal 'deformed' is the map of the logged 'desired', and only there."""
+    """Where `deforms` is "response" the signal 'deformed' is the map of the logged 'desired', and only there."""
     ready = checked(trial.problem, trial.controller)
     gain = _PROBE if ready.deformation.effective_gain() >= 0 else -_PROBE
     probe = _with_deformation(trial, Affine(gain=-2 * gain))
@@ -87,16 +87,16 @@ def desired_response_is_deformed(trial: Trial, generator: np.random.Generator) -
             moved = max(moved, float(np.abs(cycle["deformed"] - cycle["desired"]).max() / size))
         before = cycle["deformed"] if free else None
     does = missed <= _SAME
-    if ready.deforms_response:
+    if ready.deforms == "response":
         hold(
             does,
-            f"deforms_response is true, but with the affine map of gain {gain:g} its 'deformed' misses "
+            f"deforms is 'response', but with the affine map of gain {gain:g} its 'deformed' misses "
             f"r - {gain:g} (realised - desired) by the share {missed:.3g}; log the desired response that is deformed",
         )
     else:
         hold(
             not does or moved <= _SAME,
-            f"deforms_response is false, but its 'deformed' is r - {gain:g} (realised - desired) in every cycle: reviews "
+            f"deforms is '{ready.deforms}', but its 'deformed' is r - {gain:g} (realised - desired) in every cycle: reviews "
             "would look for its deformation elsewhere",
         )
 
@@ -120,24 +120,25 @@ def learning_remembers(trial: Trial, generator: np.random.Generator) -> None:  #
 
 
 def model_is_of_the_plant(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """The parameters of its model, `model_plant`, have the exact values of the plant that a run moves, or of the problem's."""
+    """The parameters of its `plant_model` have the exact values of the plant that a run moves, or of the problem's."""
     problem = trial.problem
-    own = trial.controller.model_plant(problem).parameters
+    own = trial.controller.plant_model(problem).plant.parameters
     plants = (problem.plant, problem.real_plant)
     wrong = [n for n, p in own.items() if all(n in q.parameters and q.parameters[n].exact != p.exact for q in plants)]
     if wrong:
         name, plant = wrong[0], problem.plant
         hold(
             False,
-            f"model_plant() says that the exact '{name}' is {own[name].exact:.6g}, the plant has "
+            f"plant_model() says that the exact '{name}' is {own[name].exact:.6g}, the plant has "
             f"{plant.parameters[name].exact:.6g}: results would be compared with a plant that is not there",
         )
 
 
 def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """Near the reference it feeds the error back with the gains of its `law`, from which reviews read its speed."""
+    """Near the reference it feeds the error back with the gains of its `tracking` law, from which reviews read its speed."""
     ready, plant = checked(trial.problem, trial.controller), trial.problem.plant
-    if ready.law is None or ready.planner is not None or ready.feeds or plant.outputs or plant.step is not None:
+    law = tracking_law(ready)
+    if law is None or ready.planner is not None or ready.feeds or plant.outputs or plant.step is not None:
         return
     k = min(int(np.ceil(trial.problem.longest_warm_up)) + 2, trial.run.cycles - 1)
     replay = Replay(trial.problem, ready, trial.run)
@@ -145,7 +146,7 @@ def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  
     on = replay.cycle(k, memory)["reference"]
     at = replay.cycle(k, memory, state=on)["desired"]
     for row, (name, order) in enumerate(zip(plant.names, plant.orders, strict=True)):
-        feedback = ready.law.feedback(order)
+        feedback = law.feedback(order)
         if feedback is None or name not in plant.controlled_names:
             continue
         for s, gain in enumerate(feedback.gains[-order:]):
@@ -155,7 +156,7 @@ def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  
             hold(
                 within(slope - gain, _SLOPE * (1 + abs(gain))),
                 f"near the reference the error of '{plant.state.elements[place]}' is fed back with {slope:.6g}, its law "
-                f"{type(ready.law).__name__} says {gain:.6g}",
+                f"{type(law).__name__} says {gain:.6g}",
             )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.conformance.laws import hold, keep
-from fpirhc.deformation.base import Deformation, Demand
+from fpirhc.deformation.base import Deformation, Demand, with_inner
 from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
 
@@ -100,10 +100,10 @@ class _Cycles:
 
 
 def inner_can_be_exchanged(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """`around` replaces the inner map: around its own inner map a wrapper stays the same."""
+    """The inner map can be replaced: around its own inner map a wrapper stays the same."""
     deformation = trial.deformation
     if deformation.inner is not None:
-        same = deformation.around(deformation.inner)
+        same = with_inner(deformation, deformation.inner)
         hold(describe(same) == describe(deformation), f"around its own inner map it is {same}")
 
 

@@ -163,8 +163,8 @@ class Replay:
 
     def cycle(self, k: int, memory: Array, **instead: Array) -> Cycle:
         """The cycle k of the run from a memory, with other values of what is read where they are given by name."""
-        plant = self.controller.model_plant(self.problem)
-        seen = {"time": self.run.time[k], "parameters": self.controller.parameters(plant), **instead}
+        model = self.controller.plant_model(self.problem)
+        seen = {"time": self.run.time[k], "parameters": model.parameters(model.plant), **instead}
         names = self._composite.reads.names
         read = [seen[n] if n in seen else self.run[n][k] for n in names]
         after, trace, _ = self._evaluator(memory, *read)

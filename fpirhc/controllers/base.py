@@ -47,7 +47,7 @@ def controller_reads(problem: Problem, controller: Controller) -> Layout:
     """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
-    parameters = controller.model_plant(problem).parameter
+    parameters = controller.plant_model(problem).plant.parameter
     return Layout((plant.time, *measured_signals(plant), realised, parameters, *given_signals(problem)))
 
 
@@ -103,7 +103,8 @@ def compose_informed(
         delays: what the step remembers of its signals.
         ahead: whether the time is the one at which the command will act.
     """
-    known = Told(ready.model_plant(problem), ready.told(problem), problem.period)
+    model = ready.plant_model(problem)
+    known = Told(model.plant, model.signals, problem.period)
     compares = any(ACTED in block.reads for block in blocks)
     first = known.block(remembers=compares and not ahead)
     if first is None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Self
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -18,11 +18,11 @@ import numpy as np
 from fpirhc.controllers.demands import plan_demand, reference_demand
 from fpirhc.controllers.form_check import check_form, check_maps, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
-from fpirhc.deformation.base import Deformation, Demand, with_inner
+from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import replaced
 from fpirhc.errors import NotSupported
-from fpirhc.fields.checked import Checked, unnamed_inner
+from fpirhc.fields.checked import Checked, former_members, unnamed_inner
 from fpirhc.fields.given import described
 from fpirhc.horizon.cost import Cost
 from fpirhc.optimisers.base import Optimiser
@@ -38,6 +38,28 @@ if TYPE_CHECKING:
     from fpirhc.controllers.slots.floquet import Floquet
 
 
+FORMER = {  # members of earlier versions
+    "around": "hold the inner controller in a field",
+    "check_numbers": "write `check`",
+    "deforms_response": 'write `deforms`: "response", "command" or "target"',
+    "deforms_target": 'write `deforms`: "response", "command" or "target"',
+    "demand": "write `with_defaults`, which returns the controller with its automatic settings chosen",
+    "following_its_model": "have a field `follows_model`",
+    "knows_exact": "write `plant_model`: PlantModel(..., exact=True)",
+    "law": "have a field `tracking`",
+    "linear_around": "leave it out",
+    "model_acts_at_once": "write `planner`: Planner(..., follows_model=True)",
+    "model_plant": "write `plant_model`: PlantModel(plant, signals)",
+    "parameters": "write `plant_model`: PlantModel(plant, signals, given=...)",
+    "stated": "write `with_defaults`, which returns the controller with its automatic settings chosen",
+    "told": "write `plant_model`: PlantModel(plant, signals)",
+    "unadapted": "write `with_deformation`",
+    "with_margins": "have a field `margins`",
+    "with_optimiser": "have a field `optimiser`",
+}
+Deforms = Literal["response", "command", "target"]
+
+
 @dataclass(frozen=True, eq=False)
 class Response:
     """A response of the plant.
@@ -49,6 +71,29 @@ class Response:
 
     signal: Signal
     function: ca.Function
+
+
+@dataclass(frozen=True, eq=False)
+class PlantModel:
+    """What a controller knows of its plant.
+
+    Args:
+        plant: equations of the model.
+        signals: measured disturbances, with their preview.
+        exact: whether its parameters are the exact ones; such a controller is a bound to compare with.
+        given: values of parameters in place of the approximate ones, by name.
+    """
+
+    plant: Plant
+    signals: Mapping[str, External]
+    exact: bool = False
+    given: Mapping[str, float] = field(default_factory=dict)
+
+    def parameters(self, plant: Plant) -> np.ndarray:
+        """Return the parameters with which the controller evaluates a plant, shape (np,)."""
+        if self.exact or not self.given:
+            return plant.exact if self.exact else plant.approximate
+        return np.array([self.given.get(n, p.approximate) for n, p in plant.parameters.items()], dtype=float)
 
 
 @dataclass(frozen=True)
@@ -65,6 +110,7 @@ class Planner:
         consistent: whether a plan on outputs starts at the state at which the model has the measured ones; None: where the response
             is corrected.
         adapts: whether a deformation corrects the response.
+        follows_model: whether a change of the model's parameters changes the command in every cycle, also between plans.
     """
 
     optimiser: Optimiser
@@ -74,6 +120,7 @@ class Planner:
     margins: Mapping[str, Sequence[float]] | None = None
     consistent: bool | None = False
     adapts: bool = False
+    follows_model: bool = False
 
     def corrects(self, plant: Plant) -> bool:
         """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""
@@ -95,6 +142,16 @@ class Planner:
             horizon = replace(horizon, measured=measured)
         return costed if horizon is costed.horizon else replace(costed, horizon=horizon)
 
+    def check_weights(self, problem: Problem) -> None:
+        """Raise where the weights of the cost are not valid; `derived` of the plan block checks its other numbers.
+
+        Raises:
+            InvalidProblem: a weight that is negative or not finite.
+        """
+        cost = self.cost or problem.cost
+        if cost is not None:
+            cost.check(problem.plant)
+
     def _measured(self, problem: Problem) -> tuple[str, ...]:
         """The limited states that no output shows, where a plan starts at another state than the measured one."""
         plant = problem.plant
@@ -110,7 +167,7 @@ class Controller(Checked, ABC):
     Concrete controllers are frozen dataclasses. `fpirhc.conformance.check_controller` tests that a controller keeps this contract.
     """
 
-    LOADED: ClassVar[str] = "controllers[{}] of a loaded problem file"
+    _LOADED: ClassVar[str] = "controllers[{}] of a loaded problem file"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     if TYPE_CHECKING:
@@ -127,16 +184,14 @@ class Controller(Checked, ABC):
         deformation: Deformation
         inner = None
 
-    task_name: str = ""
-    """Name under which a loaded task has the controller, for results; it is no setting."""
-
-    def lacks(self) -> Iterator[str]:
+    def _lacks(self) -> Iterator[str]:
         """Yield what a controller must have and this one has not: its deformation; what it wraps, by name."""
         name, inner = type(self).__name__, self.inner
         if inner is not None and not isinstance(inner, Controller):
             yield f"{name}: `inner` is the controller that it wraps, or None, got {described(inner)}"
             return
         yield from unnamed_inner(self, Controller)
+        yield from former_members(self, FORMER)
         if not isinstance(getattr(self, "deformation", None), Deformation):
             yield (
                 f"{name} has no `deformation`, which its contract Controller asks for: the map in use. Add the field "
@@ -148,20 +203,6 @@ class Controller(Checked, ABC):
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of one control cycle, from (time, state, realised, parameters) to 'command', and what they remember."""
 
-    def named_in_task(self, name: str) -> Self:
-        """Return the same controller with a name for results."""
-        other = copy(self)
-        object.__setattr__(other, "task_name", name)
-        return other
-
-    def around(self, inner: Controller) -> Self:
-        """Return the same wrapper around another controller.
-
-        Raises:
-            NotSupported: no field holds the inner controller; override `around`.
-        """
-        return with_inner(self, inner)
-
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem that the inner controller is built for."""
         return problem
@@ -171,26 +212,9 @@ class Controller(Checked, ABC):
         """Signals that the inner controller is given under other names: 'time', 'state', 'output', 'realised' or 'parameters'."""
         return {} if self.inner is None else self.inner.feeds
 
-    def linear_around(self, inner: Controller) -> Controller:
-        """Return the controller that equals this wrapper near the reference, where `inner` equals the inner controller there."""
-        return self.around(inner)
-
-    def parameters(self, plant: Plant) -> np.ndarray:
-        """Return the parameters of the controller's model, shape (np,): the approximate ones."""
-        return plant.approximate if self.inner is None else self.inner.parameters(plant)
-
-    def told(self, problem: Problem) -> Mapping[str, External]:
-        """Return the measured disturbances that this controller's model has, with their preview: those of the problem."""
-        return problem.signals if self.inner is None else self.inner.told(problem)
-
-    def model_plant(self, problem: Problem) -> Plant:
-        """Return the plant that is the controller's model: the problem's."""
-        return problem.plant if self.inner is None else self.inner.model_plant(problem)
-
-    @property
-    def knows_exact(self) -> bool:
-        """Whether its command depends on the plant's exact parameters; such a controller is a bound to compare with."""
-        return False if self.inner is None else self.inner.knows_exact
+    def plant_model(self, problem: Problem) -> PlantModel:
+        """Return what the controller knows of its plant: the problem's equations, approximate parameters and signals."""
+        return PlantModel(problem.plant, problem.signals) if self.inner is None else self.inner.plant_model(problem)
 
     @property
     def learns(self) -> bool:
@@ -198,55 +222,20 @@ class Controller(Checked, ABC):
         return False if self.inner is None else self.inner.learns
 
     @property
-    def model_acts_at_once(self) -> bool:
-        """Whether a change of its model changes the command in every cycle; False where a plan holds its inputs."""
-        return self.planner is None if self.inner is None else self.inner.model_acts_at_once
+    def deforms(self) -> Deforms:
+        """What its deformation acts on: the desired response, a command, or the target of an inner controller.
 
-    @property
-    def deforms_response(self) -> bool:
-        """Whether its deformation acts on the desired response; False where it acts on another signal, such as a command."""
-        return True if self.inner is None else self.inner.deforms_response
-
-    @property
-    def deforms_target(self) -> bool:
-        """Whether its deformation acts on the target of an inner controller, and the response is the output itself."""
-        return False if self.inner is None else self.inner.deforms_target
-
-    @property
-    def law(self) -> Tracking | None:
-        """The law with which the controller tracks the reference: its field `tracking`; None without this field."""
-        return getattr(self, "tracking", None) if self.inner is None else self.inner.law
+        Where it is the target, the response is the output itself.
+        """
+        return "response" if self.inner is None else self.inner.deforms
 
     @property
     def planner(self) -> Planner | None:
         """How the controller plans; None for a controller that does not plan over a horizon."""
         return None if self.inner is None else self.inner.planner
 
-    def with_optimiser(self, optimiser: Optimiser) -> Self:
-        """Return the controller with another optimiser in its planner.
-
-        Raises:
-            NotSupported: it has no optimiser that can be replaced.
-        """
-        if self.inner is not None:
-            return self.around(self.inner.with_optimiser(optimiser))
-        raise NotSupported(f"{type(self).__name__} has no optimiser that can be replaced")
-
-    def with_margins(self, margins: Mapping[str, Sequence[float]]) -> Self:
-        """Return the controller whose plans keep these distances from limits of states; see `Horizon`.
-
-        Raises:
-            NotSupported: it does not plan over the problem's horizon.
-        """
-        changed = replaced(self, "margins", margins)
-        if changed is not None:
-            return changed
-        if self.inner is not None:
-            return self.around(self.inner.with_margins(margins))
-        raise NotSupported(f"{type(self).__name__} has no plan that could keep margins")
-
     def with_deformation(self, deformation: Deformation) -> Self:
-        """Return the controller with another deformation.
+        """Return the controller with another deformation, without adaptation where this one does not adapt.
 
         Raises:
             NotSupported: neither it nor an inner controller has a field `deformation`.
@@ -255,31 +244,17 @@ class Controller(Checked, ABC):
         if changed is not None:
             return changed
         if self.inner is not None:
-            return self.around(self.inner.with_deformation(deformation))
+            return with_inner(self, self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
 
-    def unadapted(self) -> Controller:
-        """Return the controller of the same settings that does not adapt, beside which a comparison judges this one.
-
-        Raises:
-            NotSupported: it has a deformation that cannot be left out.
-        """
-        return without_deformation(self)
-
-    def stated(self, problem: Problem) -> Controller:
-        """Return the controller with every number of its own stated that it would take from the problem; itself without any."""
-        del problem
-        return self
-
-    def following_its_model(self) -> Self:
-        """Return the controller whose command follows a change of its model's parameters in every cycle, also between plans."""
-        return self if self.inner is None else self.around(self.inner.following_its_model())
-
-    def demand(self, problem: Problem) -> Demand | None:
-        """Return how much the desired response changes; None where the deformation's automatic settings stay open."""
-        if self.inner is not None:
-            return self.inner.demand(self.inner_problem(problem))
-        return reference_demand(problem, self.law) if self.planner is None else plan_demand(problem)
+    def with_defaults(self, problem: Problem) -> Self:
+        """Return the controller with the numbers chosen that it leaves to the problem; what it wraps has its own already."""
+        deformation = self.deformation
+        if not deformation.automatic:
+            return self
+        where = problem if self.inner is None else self.inner_problem(problem)
+        demand = reference_demand(where, tracking_law(self)) if self.planner is None else plan_demand(where)
+        return self.with_deformation(deformation.suited(demand))
 
     def response(self, problem: Problem) -> Response | None:
         """Return the response that the controller reads as 'realised'; None: that of the plant's controlled coordinates."""
@@ -307,10 +282,6 @@ class Controller(Checked, ABC):
         if self.inner is not None:
             self.inner.check(self.inner_problem(problem))
 
-    def check_numbers(self, problem: Problem) -> None:
-        """Raise if other numbers of the settings cannot serve the problem; what they cannot change is checked already."""
-        self.check(problem)
-
 
 def resolved(problem: Problem, controller: Controller) -> Controller:
     """Return the controller with every automatic setting replaced by its value for this problem.
@@ -320,11 +291,8 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     """
     if controller.inner is not None:
         inner = resolved(controller.inner_problem(problem), controller.inner)
-        controller = controller if inner is controller.inner else controller.around(inner)
-    controller = controller.stated(problem)
-    deformation = controller.deformation
-    demand = controller.demand(problem) if deformation.automatic else None
-    return controller if demand is None else controller.with_deformation(deformation.suited(demand))
+        controller = controller if inner is controller.inner else with_inner(controller, inner)
+    return controller.with_defaults(problem)
 
 
 def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
@@ -349,12 +317,12 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     check_outputs(problem, controller)
     check_maps(problem, controller)
     ready = resolved(problem, controller)
-    if numbers_only:
-        ready.check_numbers(problem)
+    if numbers_only and ready.inner is None and ready.planner is not None:
+        ready.planner.check_weights(problem)
     else:
         ready.check(problem)
     check_form(problem, ready)
-    if ready.deforms_target:
+    if ready.deforms == "target":
         return ready  # its own check judges a gain that acts on targets
     if ready.response(problem) is None:
         check_gain_sign(problem, ready.deformation)
@@ -369,8 +337,65 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     return ready
 
 
+def tracking_law(controller: Controller) -> Tracking | None:
+    """Return the law with which a controller tracks the reference: the field `tracking` of the innermost one; None without."""
+    return getattr(innermost(controller), "tracking", None)
+
+
+def with_setting(controller: Controller, name: str, value: object) -> Controller | None:
+    """Return the controller with another value of a field, its own or that of an inner one; None where nobody has the field."""
+    changed = replaced(controller, name, value)
+    if changed is not None or controller.inner is None:
+        return changed
+    inner = with_setting(controller.inner, name, value)
+    return None if inner is None else with_inner(controller, inner)
+
+
+def with_optimiser(controller: Controller, optimiser: Optimiser) -> Controller:
+    """Return the controller with another optimiser in its planner.
+
+    Raises:
+        NotSupported: it has no optimiser that can be replaced.
+    """
+    changed = with_setting(controller, "optimiser", optimiser)
+    if changed is None:
+        raise NotSupported(f"{type(innermost(controller)).__name__} has no optimiser that can be replaced")
+    return changed
+
+
+def with_margins(controller: Controller, margins: Mapping[str, Sequence[float]]) -> Controller:
+    """Return the controller whose plans keep these distances from limits of states; see `Horizon`.
+
+    Raises:
+        NotSupported: it does not plan over the problem's horizon.
+    """
+    changed = with_setting(controller, "margins", margins)
+    if changed is None:
+        raise NotSupported(f"{type(innermost(controller)).__name__} has no plan that could keep margins")
+    return changed
+
+
+def innermost(controller: Controller) -> Controller:
+    """The controller inside all others."""
+    while controller.inner is not None:
+        controller = controller.inner
+    return controller
+
+
+def named_in_task(controller: Controller, name: str) -> Controller:
+    """Return the same controller with the name under which a loaded task has it; it is no setting."""
+    other = copy(controller)
+    object.__setattr__(other, "_task_name", name)
+    return other
+
+
+def name_in_task(controller: Controller) -> str:
+    """Return the name under which a loaded task has the controller, else that of its class."""
+    return vars(controller).get("_task_name") or type(controller).__name__
+
+
 def without_deformation(controller: Controller) -> Controller:
-    """Return the controller without adaptation.
+    """Return the controller of the same settings that does not adapt, beside which a comparison judges this one.
 
     Raises:
         NotSupported: it has a deformation that cannot be left out.

@@ -98,7 +98,7 @@ def check_believed(problem: Problem, controller: Controller) -> None:
             f"what is measured ({', '.join(sensing.measures(plant))})"
         )
     _check_late(problem)
-    model = controller.model_plant(problem)
+    model = controller.plant_model(problem).plant
     if model.parameter.elements != plant.parameter.elements:
         raise NotSupported(
             f"{type(controller).__name__} has a model with other parameters than the problem's, and states are believed by the "

@@ -82,20 +82,8 @@ class RecedingHorizon(Controller):
         """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
         ways = self.replanning
         adapts = self.deformation.adapts
-        return Planner(self.optimiser, self.cost, ways.restarts, ways.law, self.margins, ways.consistent, adapts)
-
-    @property
-    def model_acts_at_once(self) -> bool:
-        """Whether the inputs of a plan are corrected by what its model has learned since."""
-        return self.follows_model
-
-    def following_its_model(self) -> RecedingHorizon:
-        """Return the controller that corrects the plan's inputs between plans, by what its model has learned since."""
-        return replace(self, follows_model=True)
-
-    def with_optimiser(self, optimiser: Optimiser) -> RecedingHorizon:
-        """Return the controller with another optimiser."""
-        return replace(self, optimiser=optimiser)
+        consistent, follows = ways.consistent, self.follows_model
+        return Planner(self.optimiser, self.cost, ways.restarts, ways.law, self.margins, consistent, adapts, follows)
 
     @property
     def covers(self) -> frozenset[str]:
@@ -115,16 +103,6 @@ class RecedingHorizon(Controller):
         if self.cost is None and problem.cost is None:
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
         self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
-
-    def check_numbers(self, problem: Problem) -> None:
-        """Raise if the weights of the cost are not valid; `derived` of the plan block checks the rest.
-
-        Raises:
-            InvalidProblem: a weight that is negative or not finite.
-        """
-        cost = self.cost or problem.cost
-        assert cost is not None
-        cost.check(problem.plant)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, plan (every n-th cycle), nominal, deform, invert, limit, judge, running, command shift."""

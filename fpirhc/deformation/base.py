@@ -110,20 +110,12 @@ class Deformation(Checked, ABC):
     else:
         inner = None  # a plain attribute, so that a dataclass may have a field of this name
 
-    def lacks(self) -> Iterator[str]:
+    def _lacks(self) -> Iterator[str]:
         """Yield what a map must have and this one has not: what it wraps, by name."""
         if self.inner is not None and not isinstance(self.inner, Deformation):
             yield f"{type(self).__name__}: `inner` is the map that it is around, or None, got {described(self.inner)}"
         else:
             yield from unnamed_inner(self, Deformation)
-
-    def around(self, inner: Deformation) -> Self:
-        """Return the same map around another inner one.
-
-        Raises:
-            NotSupported: no field holds the inner map; override `around`.
-        """
-        return with_inner(self, inner)
 
     @property
     def adapts(self) -> bool:
@@ -181,7 +173,7 @@ class Deformation(Checked, ABC):
 
     def suited(self, demand: Demand) -> Self:
         """Return the map with its automatic settings chosen for how much the desired response changes."""
-        return self if self.inner is None else self.around(self.inner.suited(demand))
+        return self if self.inner is None else with_inner(self, self.inner.suited(demand))
 
     @property
     def slows_desired(self) -> bool:
@@ -255,7 +247,7 @@ def with_inner(wrapper: Wrapping, inner: object) -> Wrapping:
     changed = replaced(wrapper, names[0], inner) if names and current is not None else None
     if changed is None:
         raise NotSupported(
-            f"{type(wrapper).__name__} has no field that holds its `inner`, so the inner one cannot be replaced; override around()"
+            f"{type(wrapper).__name__} has no field that holds its `inner`, so the inner one cannot be replaced; hold it in a field"
         )
     return changed
 

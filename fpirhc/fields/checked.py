@@ -27,7 +27,7 @@ class _CheckedWhenCalled(ABCMeta):
         mistakes = _abstract(cls) if inspect.isabstract(cls) else tuple(_arguments_of(cls).mistakes(arguments, named))
         if not mistakes:
             value = type.__call__(cls, *arguments, **named)
-            mistakes = tuple(value.lacks())
+            mistakes = tuple(value._lacks())
         if mistakes:
             raise InvalidField(mistakes, users_place())
         find_by_name(value)
@@ -42,7 +42,7 @@ class Checked(metaclass=_CheckedWhenCalled):
             of a class of a user's own, what its contract asks for and it lacks.
     """
 
-    def lacks(self) -> Iterator[str]:
+    def _lacks(self) -> Iterator[str]:
         """Yield what the contract of the class asks for and this value does not have, beside abstract methods."""
         yield from ()
 
@@ -72,6 +72,14 @@ def unnamed_inner(value: object, contract: type) -> Iterator[str]:
                 f"{type(value).__name__} holds a {contract.__name__} in '{name}' and has no `inner`, by which its contract "
                 f"{contract.__name__} finds it; add a property `inner` that returns self.{name}"
             )
+
+
+def former_members(value: object, former: Mapping[str, str]) -> Iterator[str]:
+    """Yield a mistake for every member of an earlier contract that the class of a value still writes: nobody would ask it."""
+    for base in type(value).__mro__:
+        for name, instead in former.items():
+            if name in vars(base) and name not in getattr(base, "__dataclass_fields__", {}):
+                yield f"{base.__name__} writes `{name}`, which its contract does not ask for any more; {instead}"
 
 
 def _abstract(cls: type) -> tuple[str, ...]:

@@ -63,7 +63,7 @@ def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
             continue
     if contract is None:
         return ""
-    loaded = getattr(contract, "LOADED", "").format(repr(text))
+    loaded = getattr(contract, "_LOADED", "").format(repr(text))
     members = {_plain(name): member for name, member in _public(contract) if member is not contract or not loaded}
     close = get_close_matches(_plain(text), members, n=1, cutoff=0.5)
     if close:

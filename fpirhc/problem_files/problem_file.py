@@ -18,6 +18,7 @@ from typing import ClassVar
 
 from fpirhc.by_name import FoundByName
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import named_in_task
 from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.fields.given import call_of, described
@@ -48,7 +49,7 @@ class Task(FoundByName):
         pictures: further pictures for the report.
     """
 
-    LOADED: ClassVar[str] = "fp.load_problem({})"
+    _LOADED: ClassVar[str] = "fp.load_problem({})"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     name: str
@@ -65,7 +66,7 @@ class Task(FoundByName):
     def __post_init__(self) -> None:
         if self.problem.name != self.name:
             object.__setattr__(self, "problem", replace(self.problem, name=self.name))
-        named = {name: controller.named_in_task(name) for name, controller in self.controllers.items()}
+        named = {name: named_in_task(controller, name) for name, controller in self.controllers.items()}
         object.__setattr__(self, "controllers", named)
         super().__post_init__()
 

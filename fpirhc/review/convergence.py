@@ -70,7 +70,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     if growth.max() > -_SURE:
         where = f"between {radii.min():.6g} and {worst:.6g} along the reference"
         return Answer(QUESTION, Verdict.UNKNOWN, f"{text} ({where})", _mend(grid, controller, loops), numbers)
-    against = [*([] if controller.deforms_target else _steep(grid, controller)), *doubts]
+    against = [*([] if controller.deforms == "target" else _steep(grid, controller)), *doubts]
     if against:
         return Answer(
             QUESTION, Verdict.UNKNOWN, f"{text}, but {'; '.join(against)}", "See the questions named.", numbers
@@ -96,7 +96,7 @@ def box_converges(loops: Loops) -> Answer:
 def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
     if loops.ideal is not None and loops.ideal.radius >= 1:
         advised = not grid.problem.plant.outputs  # its stages are looked at along references of states
-        believed = controller.parameters(grid.problem.plant)
+        believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
         stiff = stiff_advice(grid, believed, planned=is_planned(controller)) if advised else ""
         outer = "The outer loop does not converge even with the right model"
         return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
@@ -127,7 +127,7 @@ def _without(loop: LinearLoop, rates: np.ndarray) -> float:
 def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
     """Reasons why large errors may not converge: the steepest secant of the map leaves its limit near the reference."""
     deformation = controller.deformation
-    believed = controller.parameters(grid.problem.plant)
+    believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
     eigenvalues = eigenvalues_near(grid, believed, grid.draws[:1], near=True).ravel()
     if not eigenvalues.size:
         return ["the response Jacobian is not finite near the reference"]

@@ -56,7 +56,9 @@ def recommended_for(problem: Problem, controller: Controller) -> Recommended | N
     try:
         grid = review_grid(problem, 0.0, 0)
         ready = resolved(grid.problem, controller)
-        boxed = spectrum_near(grid, ready.parameters(grid.problem.plant), grid.draws, near=False)
+        boxed = spectrum_near(
+            grid, ready.plant_model(grid.problem).parameters(grid.problem.plant), grid.draws, near=False
+        )
         case = Case(grid, ready, loops_along(grid, ready), NominalRuns(grid.problem))
         return gain_advice(case, boxed, leaves_right_model_alone(case))
     except FpirhcError:

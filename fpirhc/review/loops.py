@@ -65,7 +65,7 @@ def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
 
 def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     problem, plant = grid.problem, grid.problem.plant
-    believed = controller.parameters(plant)
+    believed = controller.plant_model(problem).parameters(plant)
     stand_in, plan = linear_stand_in(problem, controller)
     matrices = loop_matrices(problem, stand_in)
     usable = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
@@ -100,7 +100,7 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
         FpirhcError: every error that the controller raises about a linear plant.
     """
     problem, plant = grid.problem, grid.problem.plant
-    believed = controller.parameters(plant)
+    believed = controller.plant_model(problem).parameters(plant)
     stand_in, plan = linear_stand_in(problem, controller)
     feedbacks = plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed)
     matrices, straight = loop_matrices(problem, stand_in), straightened(problem)
@@ -124,7 +124,7 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
         FpirhcError: every error that the controller raises.
     """
     problem, plant = grid.problem, grid.problem.plant
-    believed = controller.parameters(plant)
+    believed = controller.plant_model(problem).parameters(plant)
     stand_in, plan = linear_stand_in(problem, controller)
     needed = grid.needed(believed)
     usable = [k for k in range(len(grid.times)) if np.isfinite(needed[k]).all()]

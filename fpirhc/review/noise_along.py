@@ -52,7 +52,9 @@ def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, f
         InvalidValue: no noise, a negative one. InvalidName: an unknown coordinate. NotSupported: a response that is
         estimated, whose noise must be given. NotContractive: no finite response Jacobian.
     """
-    jacobians, inverses = _along_the_reference(grid, controller.parameters(grid.problem.plant))
+    jacobians, inverses = _along_the_reference(
+        grid, controller.plant_model(grid.problem).parameters(grid.problem.plant)
+    )
     return Noisy(jacobians, inverses, np.diag(_deviations(grid.problem, noise) ** 2))
 
 

@@ -52,9 +52,10 @@ def null_runs(problem: Problem, controller: Controller, nominal: NominalRun | No
 def null_problem(problem: Problem, controller: Controller) -> Problem:
     """Return the problem whose plant is the controller's model, without disturbances and noise, shortened to `CYCLES` cycles."""
     ready = resolved(problem, controller)
-    plant = exactly(problem.plant, ready.parameters(problem.plant))
+    known = ready.plant_model(problem)
+    plant = exactly(problem.plant, known.parameters(problem.plant))
     sensing = replace(problem.sensing, sensors={})
-    signals = as_told(problem.plant, ready.told(problem))
+    signals = as_told(problem.plant, known.signals)
     model = replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
     return with_believed_way(shortened(model, CYCLES), ready.deformation)
 

@@ -52,7 +52,7 @@ def _of(grid: ReviewGrid, controller: Controller) -> tuple[Answer, ...]:
         return (Answer("Does the controller fit the problem?", Verdict.NO, str(error)),)
     if not ready.deformation.adapts:
         return ()
-    believed = ready.parameters(grid.problem.plant)
+    believed = ready.plant_model(grid.problem).parameters(grid.problem.plant)
     try:
         own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
     except InvalidValue as error:

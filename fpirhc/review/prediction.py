@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like
-from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.controllers.contract import resolved, tracking_law, without_deformation
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -87,7 +87,7 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
     _check(problem, controller)
     ready = resolved(problem, controller)
     ready.check(problem)
-    believed = ready.parameters(problem.plant)
+    believed = ready.plant_model(problem).parameters(problem.plant)
     own = known_exactly(problem.plant) if problem.plant.outputs else exactly(problem.plant, believed)
     model = replace(problem, plant=own, disturbances={}, sensing=Sensing())
     run = simulate(model, without_deformation(ready), seed=0, compiled=compiled)
@@ -187,8 +187,8 @@ def exactly(plant: Plant, values: np.ndarray) -> Plant:
 
 
 def _check(problem: Problem, controller: Controller) -> None:
-    follows = controller.law is not None or controller.planner is not None
-    if controller.learns or controller.feeds or not controller.deforms_response or not follows:
+    follows = tracking_law(controller) is not None or controller.planner is not None
+    if controller.learns or controller.feeds or controller.deforms != "response" or not follows:
         raise NotSupported(
             f"no prediction for {type(controller).__name__}: it needs a controller that tracks or plans with one model and one "
             "map, and is given the measured state"

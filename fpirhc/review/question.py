@@ -17,6 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review import questions
@@ -60,7 +61,7 @@ class Case:
     @cached_property
     def believed(self) -> np.ndarray:
         """Parameters of the model, shape (np,)."""
-        return self.controller.parameters(self.problem.plant)
+        return self.controller.plant_model(self.problem).parameters(self.problem.plant)
 
     @cached_property
     def by_gain(self) -> LoopsByGain | None:
@@ -69,7 +70,7 @@ class Case:
 
     @cached_property
     def _trials(self) -> Trials:
-        return Trials(self.grid.real or self.problem, self.controller.unadapted(), cycles=_TRIED)
+        return Trials(self.grid.real or self.problem, without_deformation(self.controller), cycles=_TRIED)
 
     @cached_property
     def _tried(self) -> dict[str, tuple[ErrorPair | None, ErrorPair] | str]:

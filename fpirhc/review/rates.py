@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import tracking_law
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
@@ -36,7 +37,8 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
     if _of_zero_dynamics(grid, radius):
         change = "It is the mode of the zero dynamics, which no rate and no period changes: see there."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
-    change = stiff_advice(grid, controller.parameters(grid.problem.plant), planned=is_planned(controller)) or (
+    believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
+    change = stiff_advice(grid, believed, planned=is_planned(controller)) or (
         "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
     )
     if radius < 1 + NEUTRAL:
@@ -56,4 +58,5 @@ def _of_zero_dynamics(grid: ReviewGrid, radius: float) -> bool:
 
 def _rate(controller: Controller) -> float | None:
     """Rate of the tracking law, per unit of time, where the controller has such a law."""
-    return None if controller.law is None else controller.law.speed
+    law = tracking_law(controller)
+    return None if law is None else law.speed

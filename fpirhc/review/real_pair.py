@@ -102,12 +102,12 @@ def real_loops(grid: ReviewGrid, controller: Controller, points: Sequence[RealPo
     problem, model, reality = grid.real, grid.problem.plant, _reality(grid.real)
     if model.outputs:
         raise NotSupported("a reality beside outputs has other inner states than the model; simulate it")
-    if controller.model_plant(problem) is not model:
+    if controller.plant_model(problem).plant is not model:
         raise NotSupported("its model is the reality")
     hidden = [c for c in problem.judged_names if reality.true_name(c) not in reality.plant.coordinates]
     if hidden:
         raise NotSupported(f"{', '.join(hidden)} of the reality are outputs and no coordinates; simulate it")
-    believed = controller.parameters(model)
+    believed = controller.plant_model(grid.problem).parameters(model)
     stand_in, plan = linear_stand_in(grid.problem, controller)
     linear = linear_problem(grid.problem, stand_in)
     plant = linear_reality(reality.plant)

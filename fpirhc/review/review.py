@@ -101,7 +101,7 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     general = _answers((well_posed, inverse_exists, commands_inside), own)
     loops = loops_along(own, ready)
     case = Case(own, ready, loops, NominalRuns(own.problem))
-    if ready.deforms_target:
+    if ready.deforms == "target":
         return converges(own, ready, loops, _doubts(_doubtful(case)))
     suited = [*_speed_and_range(own, ready, loops), *_doubtful(case), free_of_two_cycles(case)]
     return converges(own, ready, loops, _doubts([*general, *suited]))
@@ -123,7 +123,7 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
     if loops is None:
         return (Answer("Is there a linear loop along the reference?", Verdict.UNKNOWN, broken[0]),)
     case = Case(grid, ready, loops, runs)
-    of_map = _of_target if ready.deforms_target else _of_map
+    of_map = _of_target if ready.deforms == "target" else _of_map
     inner = (
         attempted("the answers about the map", of_map, case, general, broken=broken) if ready.deformation.adapts else []
     )
@@ -166,7 +166,7 @@ def _doubtful(case: Case) -> list[Answer]:
 def _concerns(question: ControllerQuestion, controller: Controller) -> bool:
     """Whether a question is asked about a controller."""
     adapts = controller.deformation.adapts
-    return not question.adaptive or (adapts and (question.of_targets or not controller.deforms_target))
+    return not question.adaptive or (adapts and (question.of_targets or controller.deforms != "target"))
 
 
 def _of_target(case: Case, general: list[Answer]) -> list[Answer]:
@@ -213,7 +213,7 @@ def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
 
 
 def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> list[Answer]:
-    deformation, believed = controller.deformation, controller.parameters(grid.problem.plant)
+    deformation, believed = controller.deformation, controller.plant_model(grid.problem).parameters(grid.problem.plant)
     ideal = loops.ideal if is_planned(controller) else None
     answers = (
         _asked(slew_enough, grid, deformation, believed, ideal),

@@ -24,7 +24,7 @@ def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> s
         controller: resolved.
         grows: whether the iteration is no contraction along the run.
     """
-    if controller.deforms_target or not controller.deformation.adapts:
+    if controller.deforms == "target" or not controller.deformation.adapts:
         return ""
     if grows:
         advice = recommended_for(problem, controller)

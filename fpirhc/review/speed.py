@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fpirhc.contraction import Spectrum, bearable_lag, least_product
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import tracking_law
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 
@@ -59,7 +60,7 @@ def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer
 
 def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
     """Return rate and number of poles of the tracking law for the most demanding coordinate; None where there is no such law."""
-    law, plant = controller.law, grid.problem.plant.face
+    law, plant = tracking_law(controller), grid.problem.plant.face
     laws = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law else []
     known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]
     return max(known, key=lambda pair: pair[1]) if known else None

@@ -1,7 +1,8 @@
 """The controller that acts on a linear plant as another controller acts near the reference.
 
 A controller without a plan stands for itself. A plan that restarts from the measured state is a feedback of the state. A plan that
-starts from its own state leaves the motion to its tracking law. A wrapper adds its part by `linear_around`.
+starts from its own state leaves the motion to its tracking law. A wrapper that changes the model alone is
+what it wraps: its parameters are those of the start.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.form_check import MAPS
 from fpirhc.controllers.tracked import tracked_blocks
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import NotSupported
 from fpirhc.review.plan_feedback import PlanFeedback
 from fpirhc.symbolic.block import Block, Delay
@@ -54,7 +55,9 @@ def linear_stand_in(problem: Problem, controller: Controller) -> tuple[Controlle
     """
     if controller.inner is not None:
         inner, planner = linear_stand_in(problem, controller.inner)
-        return controller.linear_around(inner), planner
+        own = set(controller.feeds) - set(controller.inner.feeds)
+        changes_model = own <= {"parameters"} and controller.deforms == controller.inner.deforms
+        return inner if changes_model else with_inner(controller, inner), planner
     planner = controller.planner
     if planner is None:
         return controller, None

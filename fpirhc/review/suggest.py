@@ -19,7 +19,7 @@ from fpirhc.by_name import FoundByName
 from fpirhc.contraction import filter_pole
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
 from fpirhc.fields.checked_call import checked_call
@@ -165,7 +165,7 @@ def _with(deformation: Deformation, gain: float, pole: float) -> Deformation:
         return Filtered(changed, pole=pole) if pole else changed
     if deformation.error_pole != inner.error_pole:  # a filter, which the new one replaces
         return _with(inner, gain, pole)
-    return deformation.around(_with(inner, gain, pole))
+    return with_inner(deformation, _with(inner, gain, pole))
 
 
 def _floor(ideal: LinearLoop | None, noisy: Noisy, problem: Problem) -> dict[str, float]:

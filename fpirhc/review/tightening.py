@@ -29,7 +29,7 @@ from dataclasses import replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.contract import resolved, with_margins
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.fields.kinds import Seed
@@ -75,7 +75,7 @@ def tightened(
             a limit that is still passed in the last run.
     """
     margins = state_margins(problem, controller, mismatch=mismatch, widen=widen, passes=passes, seed=seed)
-    planned = controller.with_margins(margins)
+    planned = with_margins(controller, margins)
     planned.check(problem)
     return planned
 
@@ -98,7 +98,7 @@ def state_margins(
     plants = _parameters(problem, mismatch, seed)
     margins = _predicted(problem, controller, plants, widen)
     for k in range(passes):
-        beyond = np.max([_beyond(problem, controller.with_margins(margins), p, seed) for p in plants], axis=0)
+        beyond = np.max([_beyond(problem, with_margins(controller, margins), p, seed) for p in plants], axis=0)
         passed = {
             e: float(v) for e, v in zip(problem.plant.state.elements, beyond, strict=True) if v > 0 and e in margins
         }

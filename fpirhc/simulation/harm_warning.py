@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import name_in_task, without_deformation
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.place import users_level
 from fpirhc.simulation.trials import Trials
@@ -35,7 +36,7 @@ def warn_of_harm(problem: Problem, controller: Controller) -> None:
     except FpirhcError:  # what the runs cannot do says nothing about the controller
         return
     if reasons:
-        what = ", ".join(part for part in (problem.name, controller.task_name or type(controller).__name__) if part)
+        what = ", ".join(part for part in (problem.name, name_in_task(controller)) if part)
         text = f"{what}: adaptation does harm, by runs of {CYCLES} cycles: {'; '.join(reasons)}. {_REMEDY}"
         warnings.warn(text, HarmfulAdaptation, stacklevel=users_level())
 
@@ -57,7 +58,7 @@ def _ignored() -> bool:
 
 
 def _reasons(problem: Problem, controller: Controller) -> list[str]:
-    real, null = Trials(problem, controller.unadapted(), cycles=CYCLES).errors(controller)
+    real, null = Trials(problem, without_deformation(controller), cycles=CYCLES).errors(controller)
     reasons = [] if real is None or not real.fails else [f"on the plant {real.sentence}"]
     if null.fails and (real is None or null.adapted[null.worst] > real.without[null.worst]):
         reasons.append(f"on its own model, with nothing to adapt {null.sentence}")

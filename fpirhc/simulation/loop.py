@@ -123,8 +123,8 @@ def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
 
 
 def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
-    plant, model = problem.real_plant, controller.model_plant(problem)
-    believed = _held("parameters", model, controller.parameters(model))
+    plant, model = problem.real_plant, controller.plant_model(problem)
+    believed = _held("parameters", model.plant, model.parameters(model.plant))
     if problem.foreign is not None:
         return [believed]
     start = tuple(float(v) for v in problem.real_start)

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import tracking_law
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.plant.units import derivative_unit, with_space
 from fpirhc.simulation.run import Run
@@ -116,7 +117,7 @@ def _unit(problem: Problem) -> str:
 
 def _feedbacks(problem: Problem, controller: Controller) -> list[Feedback]:
     """The law's feedback for every controlled coordinate; empty without a law, and for a law without constant gains."""
-    law, plant = controller.law, problem.plant.face
+    law, plant = tracking_law(controller), problem.plant.face
     feedbacks = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law is not None else []
     return [one for one in feedbacks if one is not None] if None not in feedbacks else []
 

@@ -23,14 +23,15 @@ def real_name(problem: Problem) -> str:
 
 def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
     """Return blocks that write the real parameters of this cycle, 'signals' and 'signals_told'; none without signals."""
-    real, model = problem.real_plant, controller.model_plant(problem)
+    real, known = problem.real_plant, controller.plant_model(problem)
+    model = known.plant
     blocks = []
     if real_name(problem) == _NOW:
         values = real_values(real, problem.signals)
         assert values is not None
         blocks.append(_block("outside", problem, real, values, "signals", (_HELD, _NOW)))
     if model.signal_names:
-        believed = model_values(model, controller.told(problem)) or _unchanged(model)
+        believed = model_values(model, known.signals) or _unchanged(model)
         blocks.append(_block("told", problem, model, believed, "signals_told", ("parameters", "")))
     return blocks
 

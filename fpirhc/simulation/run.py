@@ -41,7 +41,7 @@ class Run(Log):
         settings: of problem and controller, as plain data.
     """
 
-    LOADED: ClassVar[str] = "fp.load_run({})"
+    _LOADED: ClassVar[str] = "fp.load_run({})"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     def __repr__(self) -> str:

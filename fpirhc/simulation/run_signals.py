@@ -41,7 +41,7 @@ def judgements(
     if problem.cost is not None and problem.horizon is not None and whole:
         judged.append(attempted("the signal 'cost'", _costs, problem, layout, log, broken=broken))
     gain = controller.deformation.effective_gain()
-    of_responses = controller.response(problem) is None and not controller.deforms_target
+    of_responses = controller.response(problem) is None and controller.deforms != "target"
     if gain != 0 and log.shape[0] and of_responses:
         named = "the signal 'contraction'"
         factors = attempted(named, _contraction, problem, controller, layout, log, broken=broken)
@@ -56,8 +56,8 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
     With a foreign reality it is the factor that the run shows, the same in every cycle, or NaN.
     """
     states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
-    gain, plant = controller.deformation.effective_gain(), controller.model_plant(problem)
-    believed = controller.parameters(plant)
+    gain, model = controller.deformation.effective_gain(), controller.plant_model(problem)
+    plant, believed = model.plant, model.parameters(model.plant)
     if problem.foreign is not None:
         shown = (
             np.nan if problem.response_delay else identified_factor(deformed, log[:, layout.slice("realised")], gain)
@@ -76,10 +76,11 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
 def _contraction_outside(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:
     """The factor of every cycle with signals from outside: plant and model have those of the cycle."""
     states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
-    plant, own = problem.real_plant, controller.model_plant(problem)
+    plant, model = problem.real_plant, controller.plant_model(problem)
+    own = model.plant
     times = log[:, layout.slice("time")].ravel() + problem.period / 2
     real = rows_of(real_values(plant, problem.signals), times, plant.exact)
-    believed = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
+    believed = rows_of(model_values(own, model.signals), times, model.parameters(own))
     modelled = problem if own is problem.plant else replace(problem, plant=own)
 
     def jacobians(rows: np.ndarray) -> np.ndarray:

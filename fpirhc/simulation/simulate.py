@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
 from fpirhc.fields.checked_call import checked_call
@@ -110,11 +111,12 @@ class Simulator:
         step_limit = controller.deformation.largest_step()
         planner = controller.planner
         cost = (planner.cost or problem.cost) if planner else None
+        model = controller.plant_model(problem)
         facts: dict[str, object] = {
             "weighs_effort": cost is not None and cost.weighs_effort,
             "step_limit": step_limit if np.isfinite(step_limit) else None,
             "effective_gain": float(controller.deformation.effective_gain()),
-            "parameters": [float(v) for v in controller.parameters(controller.model_plant(problem))],
+            "parameters": [float(v) for v in model.parameters(model.plant)],
             "controller": describe(controller),
             "problem": describe(problem),
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",
@@ -126,7 +128,7 @@ class Simulator:
         if points:
             facts["setpoints"] = points
         if problem.reality is not None:
-            facts["model is reality"] = controller.model_plant(problem) is not problem.plant
+            facts["model is reality"] = model.plant is not problem.plant
         title = name or type(self.controller).__name__
         return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
 
@@ -226,7 +228,7 @@ def judged_run(
         changes: numbers of live settings from a time on.
         setpoints: by coordinate, in place of those of the reference.
     """
-    title = name or ready.controller.task_name or type(ready.controller).__name__
+    title = name or name_in_task(ready.controller)
     run = ready.run(seed=seed, name=title, progress=progress, settings=settings, changes=changes, setpoints=setpoints)
     problem, controller = ready.problem, ready.controller
     if settings:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fpirhc.by_name import ByName
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.contract import checked, name_in_task
 from fpirhc.controllers.gap import BRIDGED
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import Numbers, live_settings
@@ -133,10 +133,11 @@ class Stepper(Checked):
         self.signals: Layout = self._composite.trace
         self.measures = measures(problem, ready)  # names of the raw measurements
         self.why_failed = ""
-        self._title = f"{problem.name}, {controller.task_name or type(controller).__name__}"
+        self._title = f"{problem.name}, {name_in_task(controller)}"
         self._may_fail = self._composite.opaque  # scalar code cannot fail
         function = backend.function if backend else self._composite.function
-        parameters = ready.parameters(ready.model_plant(problem))
+        model = ready.plant_model(problem)
+        parameters = model.parameters(model.plant)
         arguments = StepArguments(function, self._composite, problem, parameters, ages=max_age is not None)
         self._now = NumbersNow(settings, self._composite, arguments.settings, arguments.setpoints)
         self.estimates, self.beside = arguments.estimates, arguments.beside

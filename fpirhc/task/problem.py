@@ -76,7 +76,7 @@ class Problem(Checked):
         InvalidProblem: all mistakes together.
     """
 
-    LOADED: ClassVar[str] = "fp.load_problem({}).problem"
+    _LOADED: ClassVar[str] = "fp.load_problem({}).problem"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     plant: Plant

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -22,11 +23,21 @@ from fpirhc.controllers.base import (
     invert_block,
     reference_block,
 )
-from fpirhc.controllers.contract import Planner, Response, checked, resolved, without_deformation
+from fpirhc.controllers.contract import (
+    FORMER,
+    Planner,
+    PlantModel,
+    Response,
+    checked,
+    resolved,
+    tracking_law,
+    with_optimiser,
+    without_deformation,
+)
 from fpirhc.controllers.demands import command_demand, plan_demand, reference_demand
 from fpirhc.controllers.mirror import MEASURED
-from fpirhc.deformation.base import Deformation, Demand
-from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.deformation.base import Deformation, with_inner
+from fpirhc.errors import InvalidField, InvalidValue, NotContractive, NotSupported
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import scalar
@@ -210,13 +221,14 @@ class Telling(Controller):
         """None: only its facts are asked for."""
         return [], []
 
-    def parameters(self, plant):
-        """Twice the approximate ones."""
-        return 2 * plant.approximate
+    def plant_model(self, problem):
+        """Another first mass."""
+        return PlantModel(problem.plant, problem.signals, given={"m": 2.0})
 
-    def demand(self, problem):
-        """The first approximate parameter."""
-        return Demand(float(problem.plant.approximate[0]), sudden=True)
+    def with_defaults(self, problem):
+        """The gain of a map is the first approximate parameter."""
+        gained = fp.Affine(float(problem.plant.approximate[0]))
+        return replace(self, deformation=gained) if self.deformation.adapts else self
 
     def response(self, problem):
         """The plant's, under the same name, where it reads responses of its own."""
@@ -242,9 +254,27 @@ class Telling(Controller):
         """Refuse, naming the mass."""
         raise InvalidValue(f"mass {problem.plant.approximate[0]}")
 
-    def with_optimiser(self, optimiser):  # noqa: ARG002
-        """Return another map, so that the change is seen."""
-        return replace(self, deformation=fp.Affine(-0.5))
+
+@dataclass(frozen=True)
+class Planning(Telling):
+    """A controller with an optimiser in a field."""
+
+    optimiser: Any = "one"
+
+
+def test_a_member_of_an_earlier_contract_is_refused():
+    """Nobody would ask it, so a cheat would not be told, and a wish not be heard."""
+    for name, instead in FORMER.items():
+        former = type("Former", (Telling,), {name: property(lambda self: None)})
+        with pytest.raises(
+            InvalidField, match=re.escape(f"Former writes `{name}`, which its contract does not ask for")
+        ):
+            former()
+        assert instead
+    field_of_that_name: Any = dataclass(frozen=True)(
+        type("Mine", (Telling,), {"__annotations__": {"law": Any}, "law": None, "__module__": __name__})
+    )
+    assert field_of_that_name().law is None
 
 
 def test_a_wrapper_tells_the_facts_of_what_it_wraps():
@@ -253,7 +283,7 @@ def test_a_wrapper_tells_the_facts_of_what_it_wraps():
     outer = fp.ExactModel(inner)
     assert outer.learns
     assert (outer.planner, dict(outer.feeds)) == (inner.planner, {"state": "predicted"})
-    assert outer.demand(problem) == Demand(2.0, sudden=True)
+    assert resolved(problem, outer) == fp.ExactModel(Telling(fp.Affine(2.0)))
     assert outer.covers == {"maps"}
     stability: Any = outer.floquet(problem)
     assert stability == 2.0
@@ -263,7 +293,9 @@ def test_a_wrapper_tells_the_facts_of_what_it_wraps():
     with pytest.raises(InvalidValue, match=r"mass 2\.0"):
         outer.check(problem)
     assert outer.with_deformation(fp.Identity()) == fp.ExactModel(Telling())
-    assert outer.with_optimiser(PLANNER.optimiser) == fp.ExactModel(Telling(fp.Affine(-0.5)))
+    assert with_optimiser(fp.ExactModel(Planning()), PLANNER.optimiser) == fp.ExactModel(
+        Planning(optimiser=PLANNER.optimiser)
+    )
     assert without_deformation(outer) == fp.ExactModel(Telling())
     assert without_deformation(fp.ExactModel(Telling())) == fp.ExactModel(Telling())
 
@@ -272,16 +304,20 @@ def test_a_controller_that_stands_alone_has_no_facts_of_others():
     """It believes the approximate parameters, learns nothing, plans nothing, and tracks by its own law."""
     problem, alone = masses(), fp.ComputedTorque(TRACK)
     assert (alone.inner, alone.learns, alone.planner, dict(alone.feeds)) == (None, False, None, {})
-    assert alone.law is fp.ExactModel(alone).law is TRACK
-    assert alone.parameters(problem.plant).tolist() == [1.0, 8.0]
+    assert tracking_law(alone) is tracking_law(fp.ExactModel(alone)) is TRACK
+    assert tracking_law(Telling()) is None
+    model = alone.plant_model(problem)
+    assert (model.plant, model.exact, model.parameters(problem.plant).tolist()) == (problem.plant, False, [1.0, 8.0])
+    assert Telling().plant_model(problem).parameters(problem.plant).tolist() == [2.0, 8.0]
+    assert fp.ExactModel(Telling()).plant_model(problem).parameters(problem.plant).tolist() == [2.0, 4.0]
     assert (alone.response(problem), alone.floquet(problem)) == (None, None)
     assert alone.notes(problem) == ()
     assert alone.inner_problem(problem) is problem
     alone.check(problem)
     with pytest.raises(NotSupported, match="ComputedTorque has no optimiser"):
-        alone.with_optimiser(PLANNER.optimiser)
+        with_optimiser(alone, PLANNER.optimiser)
     with pytest.raises(NotSupported, match="no field that holds its `inner`"):
-        alone.around(alone)
+        with_inner(alone, alone)
     assert controller_reads(problem, alone).names == ("time", "state", "realised", "parameters")
 
 

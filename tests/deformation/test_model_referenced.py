@@ -118,7 +118,7 @@ def adaptive_problems() -> list[str]:
     for name in sorted(shipped_problems()):
         module: Any = fp.load_problem(name)
         adaptive = resolved(module.problem, module.controllers[module.headline[1]])
-        collected += [name] if adaptive.deformation.adapts and adaptive.deforms_response else []
+        collected += [name] if adaptive.deformation.adapts and adaptive.deforms == "response" else []
     return collected
 
 

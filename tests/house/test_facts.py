@@ -18,7 +18,7 @@ from fpirhc.baselines.measuring import first_plan
 from fpirhc.conformance import check_deformation
 from fpirhc.conformance.deformation_facts import check_deformation_facts
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, rename
-from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.controllers.contract import resolved, with_optimiser, without_deformation
 from fpirhc.deformation.base import Deformation, Pairing, Reach
 from fpirhc.deformation.wrappers.base import Wrapper
 from fpirhc.errors import InvalidProblem, NotSupported
@@ -330,11 +330,11 @@ def test_a_pair_is_found_through_wrappers():
 
 
 def test_a_wrapper_that_hides_its_inner_controller_says_what_to_do():
-    """A wrapper whose inner controller is in no field must say how it is rebuilt."""
+    """A wrapper whose inner controller is in no field cannot be rebuilt."""
 
     @dataclass(frozen=True)
     class Listed(Named):
-        wrapped: tuple[Controller, ...]  # type: ignore[assignment]  # what `around` cannot rebuild
+        wrapped: tuple[Controller, ...]  # type: ignore[assignment]  # where nobody finds it
 
         @property
         def inner(self):
@@ -344,8 +344,8 @@ def test_a_wrapper_that_hides_its_inner_controller_says_what_to_do():
         def deformation(self):
             return self.inner.deformation
 
-    with pytest.raises(NotSupported, match=r"override around\(\)"):
-        Listed((PLAN,)).with_optimiser(fp.ReducedGradient(iterations=5, tolerance=1e-3))
+    with pytest.raises(NotSupported, match=r"hold it in a field"):
+        with_optimiser(Listed((PLAN,)), fp.ReducedGradient(iterations=5, tolerance=1e-3))
 
 
 # What generic code names

@@ -6,6 +6,7 @@ into every comparison.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from wrong import controllers, maps, observers, optimisers
 from wrong.tables import CONTROLLERS, MAPS, OBSERVERS, OPTIMISERS
 
 import fpirhc as fp
+from fpirhc.conformance.loops import two_masses
 
 DEFORMATION = fp.Sigmoid(gain=-0.5)
 
@@ -88,8 +90,11 @@ def test_a_controller_that_knows_the_exact_parameters_may_say_so():
     """As the bound of a comparison: the same command, honestly named."""
 
     class Honest(controllers.KnowsThePlant):
-        knows_exact = True
+        def plant_model(self, problem):
+            """Says that it knows them."""
+            return replace(super().plant_model(problem), exact=True)
 
     check_controller(Honest(6.0, DEFORMATION))
-    assert fp.ExactModel(controllers.Gentle(6.0)).knows_exact
-    assert not fp.ComputedTorque(fp.Exponential(rate=6.0)).knows_exact
+    problem = two_masses()
+    assert fp.ExactModel(controllers.Gentle(6.0)).plant_model(problem).exact
+    assert not fp.ComputedTorque(fp.Exponential(rate=6.0)).plant_model(problem).exact

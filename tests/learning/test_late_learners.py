@@ -290,5 +290,5 @@ def test_a_model_that_does_not_learn_is_followed_by_nothing():
     """The commands are those of the controller that does not follow its model, to rounding."""
     problem = spring()
     plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6), fp.Affine(gain=-0.3))
-    first, second = run(problem, plan), run(problem, plan.following_its_model())
+    first, second = run(problem, plan), run(problem, replace(plan, follows_model=True))
     np.testing.assert_allclose(first["command"], second["command"], atol=1e-12)

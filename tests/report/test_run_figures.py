@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from plants import chain
 
 import fpirhc as fp
+from fpirhc.controllers.contract import name_in_task
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.contraction_figure import contraction_figure
 from fpirhc.report.figures import pair_figures
@@ -52,7 +53,7 @@ def test_the_plot_of_a_run_names_quantities_units_and_controller():
 def test_a_shipped_task_gives_its_controllers_their_names():
     """As in the tutorial: simulate(task.problem, task.controllers[name])."""
     shipped = fp.load_problem("two_mass")
-    assert {name: c.task_name for name, c in shipped.controllers.items()} == {
+    assert {name: name_in_task(c) for name, c in shipped.controllers.items()} == {
         name: name for name in shipped.controllers
     }
     fresh = fp.ComputedTorque(fp.Exponential(rate=6.0))

@@ -12,6 +12,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.contraction import leaking_limit
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation import Deformation
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.scenarios.bench import Bench, Conditions
@@ -188,7 +189,7 @@ def test_the_loop_is_asked_and_not_the_iteration_alone(weight, verdict):
     assert answer.verdict == verdict
     for name, cycles in (("longer", 66), ("shorter", 54)):
         late = replace(problem, dead_time=fp.DeadTime(inputs={"u": cycles * PERIOD}))
-        for which, one in (("without", controller.unadapted()), ("with", controller)):
+        for which, one in (("without", without_deformation(controller)), ("with", controller)):
             run = fp.simulate(late, one, seed=0, compiled=False)
             assert answer.numbers[f"{name}_{which}"] == pytest.approx(fp.measure(late, run).rms_error["q"], rel=1e-9)
     assert (answer.numbers["longer_with"] > 3 * answer.numbers["longer_without"]) == (verdict == "no")

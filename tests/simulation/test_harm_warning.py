@@ -12,6 +12,7 @@ import pytest
 from plants import linear
 
 import fpirhc as fp
+from fpirhc.controllers.contract import without_deformation
 from fpirhc.simulation import harm_warning
 from fpirhc.studies.comparison.timing import stepper_to_time
 
@@ -50,7 +51,7 @@ def test_a_gentle_plain_form_is_warned_of_once_with_its_numbers():
     assert found
     short = replace(PROBLEM, duration=1.5, measure_from=0.75)
     own = replace(short, plant=linear(1.02, 1.02))
-    runs = [(p, c) for p in (short, own) for c in (GENTLE.unadapted(), GENTLE)]
+    runs = [(p, c) for p in (short, own) for c in (without_deformation(GENTLE), GENTLE)]
     rms = [fp.measure(p, fp.simulate(p, c, seed=0, compiled=False)).rms_error["y"] for p, c in runs]
     assert [float(number) for number in found.groups()] == pytest.approx(rms, rel=6e-3)
     assert rms[1] > 2 * rms[0]
@@ -66,7 +67,7 @@ def test_the_model_referenced_form_is_not_warned_of(map_):
 def test_without_adaptation_nothing_runs(monkeypatch):
     """Neither where there is nothing to judge nor where the warning is ignored, nor where a cycle is timed."""
     monkeypatch.setattr(harm_warning, "_reasons", lambda *_: pytest.fail("it ran"))
-    assert told(PROBLEM, GENTLE.unadapted()) == []
+    assert told(PROBLEM, without_deformation(GENTLE)) == []
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", fp.HarmfulAdaptation)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.controllers.contract import named_in_task
 from fpirhc.errors import FpirhcError, InvalidShape, InvalidValue
 from fpirhc.status import Status
 
@@ -54,7 +55,7 @@ def test_it_says_what_it_is():
     assert one.refused == 0
     assert one.deadline is None
     assert "command" in one.signals
-    assert repr(stepper(controller=CONTROLLER.named_in_task("mine"))).startswith(f"Stepper({PROBLEM.name}, mine, ")
+    assert repr(stepper(controller=named_in_task(CONTROLLER, "mine"))).startswith(f"Stepper({PROBLEM.name}, mine, ")
 
 
 def test_results_are_nobody_elses():

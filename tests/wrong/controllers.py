@@ -8,6 +8,7 @@ import casadi as ca
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.contract import PlantModel
 from fpirhc.deformation import Deformation, Identity
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Layout
@@ -84,9 +85,9 @@ class SaysItDeformsNoResponse(Gentle):
     """Deforms the response all the same."""
 
     @property
-    def deforms_response(self):
+    def deforms(self):
         """Wrong."""
-        return False
+        return "command"
 
 
 class DeformsAnotherResponse(Gentle):
@@ -105,17 +106,19 @@ class DeformsAnotherResponse(Gentle):
 class TellsAnotherModel(Gentle):
     """Names a plant as its model that is neither the problem's nor the real one."""
 
-    def model_plant(self, problem):
+    def plant_model(self, problem):
         """Wrong."""
-        return problem.plant.with_exact(problem.plant.exact * 1.1)
+        return PlantModel(problem.plant.with_exact(problem.plant.exact * 1.1), problem.signals)
 
 
 class IsGivenTheExactParameters(Gentle):
     """Asks the loop for the exact parameters."""
 
-    def parameters(self, plant):
+    def plant_model(self, problem):
         """Wrong."""
-        return plant.exact
+        plant = problem.plant
+        exact = {name: parameter.exact for name, parameter in plant.parameters.items()}
+        return PlantModel(plant, problem.signals, given=exact)
 
 
 class AlwaysOk(Gentle):
@@ -146,7 +149,7 @@ class NamesAnotherLaw(Gentle):
     """Tells of a law ten times as fast."""
 
     @property
-    def law(self):
+    def tracking(self):
         """Wrong."""
         return fp.Exponential(rate=10 * self.rate, integral=False)
 

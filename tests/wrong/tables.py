@@ -8,7 +8,7 @@ CONTROLLERS = {
     controllers.KnowsThePlant: ("exact parameters are unknown", "in place of.*use plant.approximate"),
     controllers.LeavesTheLimits: ("command keeps the limits", "outside"),
     controllers.SaysItLearns: ("learning remembers", "learns is true, but after 400 cycles"),
-    controllers.SaysItDeformsNoResponse: ("desired response is deformed", "deforms_response is false, but"),
+    controllers.SaysItDeformsNoResponse: ("desired response is deformed", "deforms is 'command', but"),
     controllers.DeformsAnotherResponse: ("desired response is deformed", r"'deformed' misses .* by the share 0\.0[34]"),
     controllers.TellsAnotherModel: ("model is of the plant", r"the exact 'm' is 1\.1, the plant has 1:"),
     controllers.IsGivenTheExactParameters: ("exact parameters are unknown", "its command of cycle 0 is"),

@@ -18,16 +18,16 @@ References:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
-import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like
+from fpirhc.controllers.contract import Deforms, PlantModel
 from fpirhc.controllers.demands import command_demand
 from fpirhc.controllers.face import on_face
 from fpirhc.controllers.tracked import bounded, desired_blocks
-from fpirhc.deformation.base import Deformation, Demand, Mirror
+from fpirhc.deformation.base import Deformation, Mirror
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.real_number import finite_number
 from fpirhc.members import Example
@@ -53,18 +53,21 @@ class ForceMRAC(Controller):
     deformation: Deformation
     model: Mapping[str, float] = field(default_factory=dict)
 
-    def demand(self, problem: Problem) -> Demand:
-        """Return the demand of the command that the reference model needs along the reference."""
-        return command_demand(problem, self.parameters(problem.plant))
+    def with_defaults(self, problem: Problem) -> ForceMRAC:
+        """Return the controller with a scale for the command that the reference model needs along the reference."""
+        if not self.deformation.automatic:
+            return self
+        demand = command_demand(problem, self.plant_model(problem).parameters(problem.plant))
+        return replace(self, deformation=self.deformation.suited(demand))
 
-    def parameters(self, plant: Plant) -> np.ndarray:
-        """Return the parameters of the reference model, shape (np,)."""
-        return np.array([self.model.get(n, p.approximate) for n, p in plant.parameters.items()], dtype=float)
+    def plant_model(self, problem: Problem) -> PlantModel:
+        """Return the reference model."""
+        return PlantModel(problem.plant, problem.signals, given=self.model)
 
     @property
-    def deforms_response(self) -> bool:
-        """No: it deforms a command."""
-        return False
+    def deforms(self) -> Deforms:
+        """A command."""
+        return "command"
 
     def check(self, problem: Problem) -> None:
         """Raise if the reference model has parameters that the plant does not have, or values that are no numbers.

@@ -111,9 +111,10 @@ class Slotted(Controller):
         """Return the controller with this deformation in every slot."""
         return replace(self, slots=tuple(replace(slot, deformation=deformation) for slot in self.slots))
 
-    def demand(self, problem: Problem) -> None:
-        """Return None: the deformation of every slot needs its settings from the user."""
+    def with_defaults(self, problem: Problem) -> Slotted:
+        """Return itself: the deformation of every slot needs its settings from the user."""
         del problem
+        return self
 
     def floquet(self, problem: Problem) -> Floquet:
         """Return the stability of the schedule, with ideal deformations and the plant's exact parameters."""

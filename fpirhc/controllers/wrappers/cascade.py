@@ -26,6 +26,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like, reference_block
+from fpirhc.controllers.contract import Deforms, without_deformation
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.target_pairing import ThroughModel
 from fpirhc.deformation.base import Deformation, Demand
@@ -66,28 +67,28 @@ class Cascade(Controller):
         return replace(problem, reference=Shifted(problem.reference))
 
     @property
-    def deforms_response(self) -> bool:
-        """No: it deforms a target."""
-        return False
-
-    @property
-    def deforms_target(self) -> bool:
-        """Yes."""
-        return True
+    def deforms(self) -> Deforms:
+        """The target."""
+        return "target"
 
     @property
     def planner(self) -> None:
         """None: plans of the inner controller follow the target, and not the reference of the problem."""
 
-    def unadapted(self) -> Controller:
-        """Return the inner controller: without a shift its target is the reference."""
-        return self.controller.unadapted()
+    def with_deformation(self, deformation: Deformation) -> Controller:  # type: ignore[override]
+        """Return the cascade with another map; without adaptation the inner controller, whose target is then the reference."""
+        return replace(self, deformation=deformation) if deformation.adapts else without_deformation(self.controller)
 
-    def stated(self, problem: Problem) -> Cascade:
-        """Return the cascade with lag and dead time of its pairing as numbers."""
-        return self if self.paired is None else replace(self, paired=self.paired.stated(problem))
+    def with_defaults(self, problem: Problem) -> Cascade:
+        """Return the cascade with lag and dead time of its pairing as numbers, and a scale of the map where it has none."""
+        paired, map_ = self.paired, self.deformation
+        return replace(
+            self,
+            paired=None if paired is None else paired.stated(problem),
+            deformation=map_.suited(self._demand(problem)) if map_.automatic else map_,
+        )
 
-    def demand(self, problem: Problem) -> Demand:
+    def _demand(self, problem: Problem) -> Demand:
         """Return the size of the reference's controlled quantities, which the shift may have to make up for at once."""
         plant, function = problem.plant, problem.reference.function(problem.plant)
         times = np.linspace(0.0, problem.duration, _SAMPLES)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, command_before, compose_controller, embedded, like
+from fpirhc.controllers.contract import Planner, with_setting
 from fpirhc.controllers.form_check import MAPS
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.deformation.base import Deformation
@@ -77,18 +78,15 @@ class Estimating(Controller):
         return True
 
     @property
-    def model_acts_at_once(self) -> bool:
-        """Whether a new estimate changes the command in every cycle."""
-        return self.at_once or self.estimator.acts_at_once or self.controller.model_acts_at_once
+    def planner(self) -> Planner | None:
+        """That of the wrapped controller, which a new estimate changes in every cycle where it acts at once."""
+        planner, at_once = self.controller.planner, self.at_once or self.estimator.acts_at_once
+        return replace(planner, follows_model=True) if planner is not None and at_once else planner
 
     @property
     def covers(self) -> frozenset[str]:
         """No maps: the estimators add what they learn to derivatives."""
         return self.controller.covers - {MAPS}
-
-    def linear_around(self, inner: Controller) -> Controller:
-        """Return the inner controller: near the reference the parameters are those of the start."""
-        return inner
 
     def check(self, problem: Problem) -> None:
         """Raise if the estimator or the wrapped controller does not fit the problem.
@@ -116,7 +114,8 @@ class Estimating(Controller):
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the block estimate, and the wrapped controller as one block."""
         modelled = self.inner_problem(problem)
-        controller = self.controller.following_its_model() if self.at_once else self.controller
+        following = with_setting(self.controller, "follows_model", True) if self.at_once else None
+        controller = following or self.controller
         inner = compose_controller(modelled, controller)
         outputs = self.estimator.reads_outputs(modelled.plant)
         pairs = ResponsePairs(problem, self.dead_time or problem.dead_time, outputs)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import PlantModel
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
-from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.task.outside import External, really_known, signals_of
+from fpirhc.task.outside import really_known, signals_of
 from fpirhc.task.problem import Problem
 
 
@@ -39,37 +36,20 @@ class ExactModel(Controller):
         """The deformation of the wrapped controller."""
         return self.controller.deformation
 
-    @property
-    def knows_exact(self) -> bool:
-        """True: that is what it is for."""
-        return True
-
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
-        plant = self.model_plant(problem)
+        model = self.plant_model(problem)
+        plant, signals = model.plant, signals_of(model.plant, model.signals)
         exact = {name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()}
-        signals = signals_of(plant, self.told(problem))
         return replace(problem, plant=replace(plant, parameters=exact), reality=None, signals=signals)
 
-    def told(self, problem: Problem) -> Mapping[str, External]:
-        """Return the signals told as they really are."""
-        return really_known(problem.signals)
-
-    def model_plant(self, problem: Problem) -> Plant:
-        """Return the plant that a run moves."""
+    def plant_model(self, problem: Problem) -> PlantModel:
+        """Return the plant that a run moves, its exact parameters, and the signals as they really are."""
         if problem.foreign is not None:
             raise NotSupported("a foreign reality has no equations that could be the exact model; leave ExactModel out")
         if problem.symbolic_reality is not None:
             problem.symbolic_reality.check_as_model(problem.plant)
-        return problem.real_plant
-
-    def linear_around(self, inner: Controller) -> Controller:
-        """Return the inner controller: `parameters` already gives the exact ones."""
-        return inner
-
-    def parameters(self, plant: Plant) -> np.ndarray:
-        """Return the exact parameters, shape (np,)."""
-        return plant.exact
+        return PlantModel(problem.real_plant, really_known(problem.signals), exact=True)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of the wrapped controller."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import without_deformation
+from fpirhc.controllers.contract import with_optimiser, without_deformation
 from fpirhc.describe import as_written, describe
 from fpirhc.errors import FpirhcError
 from fpirhc.optimisers.base import Optimiser
@@ -70,7 +70,7 @@ def _remedy(model: Problem, bare: Controller, optimiser: Optimiser) -> str:
         if longer is None:
             return "Take an optimiser that iterates until its plans are solved, or shorten the horizon."
         try:
-            if unsolved(model, bare.with_optimiser(longer))[1] < MANY:
+            if unsolved(model, with_optimiser(bare, longer))[1] < MANY:
                 return f"Give the optimiser {times} times the iterations: {as_written(longer)}."
         except FpirhcError:
             break

@@ -7,6 +7,7 @@ prediction and a tracking law or a plan, loses its own margin sooner; so it is r
 from __future__ import annotations
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import without_deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.late import is_late, scaled
@@ -47,7 +48,7 @@ _CHANGES = {"longer": _PERCENT, "shorter": -_PERCENT}
 
 def _errors(late: Problem, controller: Controller) -> ErrorPair:
     return errors_of(
-        late, [simulate(late, one, seed=0, compiled=False) for one in (controller.unadapted(), controller)]
+        late, [simulate(late, one, seed=0, compiled=False) for one in (without_deformation(controller), controller)]
     )
 
 

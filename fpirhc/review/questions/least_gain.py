@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
@@ -25,7 +26,7 @@ _POINTS = 3
 def plan_keeps_up(case: Case) -> Answer | None:
     """Return the map's gain over the smallest stable one of its plan; None for other forms and laws with known poles."""
     deformation = case.controller.deformation
-    if case.controller.law is not None or not deformation.slows_desired or not deformation.constant:
+    if tracking_law(case.controller) is not None or not deformation.slows_desired or not deformation.constant:
         return None
     factor = _least_factor(case) if case.loops.loops and deformation.effective_gain() else None
     too_large = factor is not None and factor <= 1 and case.loops.radii.max() >= 1  # which other questions say

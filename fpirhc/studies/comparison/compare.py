@@ -13,7 +13,7 @@ from fpirhc.broken import attempted
 from fpirhc.by_name import FoundByName
 from fpirhc.contraction import assess_gain
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, resolved
+from fpirhc.controllers.contract import checked, resolved, without_deformation
 from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
@@ -371,7 +371,7 @@ def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Pred
 def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:
     """The controller with the same settings and no adaptation."""
     try:
-        wanted = describe(controllers[name].unadapted())
+        wanted = describe(without_deformation(controllers[name]))
     except NotSupported:
         return None
     plain = ((n, c) for n, c in controllers.items() if not c.deformation.adapts)

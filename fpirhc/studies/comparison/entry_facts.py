@@ -27,10 +27,11 @@ def plan_every(problem: Problem, controller: Controller) -> int:
 
 def has_exact_model(problem: Problem, controller: Controller) -> bool:
     """Whether it is the bound of a controller with a wrong model: exact parameters, nothing adapted, nothing learned."""
-    plant, real = controller.model_plant(problem), problem.real_plant
+    model, real = controller.plant_model(problem), problem.real_plant
+    plant = model.plant
     wrong = problem.reality is not None or not np.array_equal(plant.approximate, plant.exact)
     fixed = not controller.deformation.adapts and not controller.learns
-    return bool(wrong and fixed and plant is real and np.array_equal(controller.parameters(plant), real.exact))
+    return bool(wrong and fixed and plant is real and np.array_equal(model.parameters(plant), real.exact))
 
 
 def no_bound_because(

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import without_deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.slow_gain import reviewed_gain
 from fpirhc.simulation.metrics import Metric, measure
@@ -49,7 +50,7 @@ def harm_of_adaptation(
     if not controller.deformation.adapts:
         return ()
     try:
-        both = controller.unadapted(), controller
+        both = without_deformation(controller), controller
         return _harm(problem, (f"{name} without adaptation", name), both, seed, compiled, metrics)
     except FpirhcError:
         return ()

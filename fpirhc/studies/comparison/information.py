@@ -41,7 +41,7 @@ def information(problem: Problem, controller: Controller, loop: Composite, cycle
         loop: closed with it.
         cycles: from plan to plan; 1 for a controller that does not plan.
     """
-    waits = cycles > 1 and controller.learns and not controller.model_acts_at_once
+    waits = cycles > 1 and controller.learns and not _acts_at_once(controller)
     return Information(_used(problem, loop), _rate(controller, cycles), waits)
 
 
@@ -109,14 +109,19 @@ def _used(problem: Problem, loop: Composite) -> tuple[str, ...]:
     return tuple(used)
 
 
+def _acts_at_once(controller: Controller) -> bool:
+    """Whether a change of its model changes the command in every cycle; a plan may hold its inputs."""
+    return controller.planner is None or controller.planner.follows_model
+
+
 def _rate(controller: Controller, cycles: int) -> str:
     """The words for when a controller acts."""
     if cycles == 1:
         return "in every cycle"
     between = ["its deformation acts"] if controller.deformation.adapts else []
-    between += ["its newest estimate acts"] if controller.learns and controller.model_acts_at_once else []
+    between += ["its newest estimate acts"] if controller.learns and _acts_at_once(controller) else []
     text = f"with a new plan every {cycles} cycles"
     text += f", between plans {' and '.join(between)} in every cycle" if between else ""
-    if controller.learns and not controller.model_acts_at_once:
+    if controller.learns and not _acts_at_once(controller):
         text += ", in which a new estimate takes effect"
     return text

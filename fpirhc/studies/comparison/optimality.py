@@ -61,8 +61,8 @@ def measure_optimality(
     if ready.learns or "parameters" in feeds or own_signals(problem):
         return None
     times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
-    model = ready.model_plant(problem)
-    known = ready.told(problem)
+    plant_model = ready.plant_model(problem)
+    model, known = plant_model.plant, plant_model.signals
     other = (
         replace(problem, plant=model, reality=None, signals=signals_of(model, known))
         if model is not problem.plant
@@ -86,7 +86,7 @@ def measure_optimality(
     plans = np.arange(stride, run.cycles, stride)
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
     times = np.ravel(times)
-    parameters = rows_of(model_values(model, known), times + problem.period / 2, ready.parameters(model))
+    parameters = rows_of(model_values(model, known), times + problem.period / 2, plant_model.parameters(model))
     seen = run[feeds["output"] if feeds.get("output") in run.layout.names else "output"] if of_measured else states
     excess = []
     for row in rows:

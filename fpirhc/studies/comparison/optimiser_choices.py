@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import with_optimiser
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.members import member_modules
 from fpirhc.optimisers.base import Optimiser
@@ -54,4 +55,4 @@ def _varied(name: str, controller: Controller, optimisers: Sequence[Choice]) -> 
     if controller.planner is None:
         return {name: controller}
     tolerance = float(getattr(controller.planner.optimiser, "tolerance", 1e-3))
-    return {f"{name} ({label})": controller.with_optimiser(build(tolerance)) for label, build in optimisers}
+    return {f"{name} ({label})": with_optimiser(controller, build(tolerance)) for label, build in optimisers}
