@@ -107,7 +107,7 @@ def partners(
             missing[name] = "its pair without adaptation is not among the controllers, and the plant is outside"
             continue
         try:
-            loop = simulator(problem, controllers[name].unadapted(), compiled=compiled)
+            loop = simulator(problem, without_deformation(controllers[name]), compiled=compiled)
             found[name] = _entry(problem, f"{name} without adaptation", loop, seed, metrics), loop
         except FpirhcError as error:
             missing[name] = f"it cannot run without adaptation ({error})"
