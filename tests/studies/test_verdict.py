@@ -109,7 +109,7 @@ def test_a_deformation_that_cannot_be_left_out_is_not_judged():
     """The verdict says so by name."""
 
     class Bound(fp.ComputedTorque):
-        def with_deformation(self, deformation):
+        def with_deformation(self, deformation):  # noqa: ARG002
             raise NotSupported("the map is part of the law")
 
     task = case(fp.Sigmoid(gain=-0.5, scale=10.0))
