@@ -10,7 +10,9 @@ from .conformance import (
     check_plant,
     check_tracking,
 )
-from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
+from .contraction.delayed import delayed_limit
+from .contraction.gains import assess_gain, check_gain
+from .contraction.spectrum import response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
 from .controllers.feedforward_only import FeedforwardOnly
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun

@@ -1,13 +1,7 @@
-"""How large a gain may be when the response is an average of several past requests.
+"""How large a gain may be when the response is late or smoothed: an average of several past requests.
 
-With the estimated response f_k = lambda sum_j w_j r_{k-j}, a map with effective gain a that pairs it with the request of 1 + d
-cycles ago and filters the error with the pole p, the request follows
-
-    r_k = r_{k-1-d} - a g_k,     g_k = p g_{k-1} + (1 - p) f_k,
-    D(z) = (1 - p / z) (1 - z^-(1+d)) + a lambda (1 - p) sum_j w_j z^-j = 0,
-
-where a fraction of d interpolates between two requests. For small a lambda a root z0 of z0^(1+d) = 1 moves inwards when
-Re[lambda (1 - p) W(z0) / (1 - p / z0)] > 0. With a larger gain the loop stays stable until a root meets the unit circle.
+W(z) = sum_j w_j z^-j goes from request to response; the map pairs the response with its own value of d cycles earlier, and
+filters the error with a pole.
 """
 
 from __future__ import annotations
@@ -21,10 +15,19 @@ from fpirhc.contraction.spectrum import Array
 _NONE = 1e-9  # a damping below this counts as none
 _DIGITS = 6  # decimals of the pairing in cycles, so that a number next to a whole one becomes whole
 _PER_TERM = 256  # points of the unit circle per term of the polynomials
+_LEAKING_PER_TERM = 64  # points of the unit circle per term of the polynomial
+_STEPS, _HALVINGS = 400, 30
+_AT_ONCE = 20  # gains, so that a search that ends early is short
+_RANGE = 1e-3, 20.0  # of the gain times |lambda| that is searched
 
 
 def delayed_limit(weights: Array, *, pairing: float = 0.0, pole: float = 0.0, eigenvalue: complex = 1.0) -> float:
     """Return the effective gain below which the delayed iteration converges; 0 when no gain does.
+
+        D(z) = (1 - p / z) (1 - z^-(1+d)) + a lambda (1 - p) W(z) = 0
+
+    For a small a lambda a root z0 of z0^(1+d) = 1 moves inwards when Re[lambda (1 - p) W(z0) / (1 - p / z0)] > 0. With a larger
+    gain the loop stays stable until a root meets the unit circle. A fraction of d interpolates between two requests.
 
     Args:
         weights: w_1, w_2, ... of past requests in the response.
@@ -77,3 +80,94 @@ def _on_grid(coefficients: Array, size: int) -> Array:
     shifted = coefficients * np.exp(-1j * np.pi * np.arange(coefficients.size) / size)
     values = np.fft.fft(shifted, size)
     return np.append(values, values[0])
+
+
+def leaking_limit(
+    weights: Array,
+    *,
+    cycles: float = 0.0,
+    leak: float = 0.0,
+    pole: float = 0.0,
+    eigenvalue: complex = 1.0,
+    referenced: bool = False,
+    width: int = 0,
+) -> float:
+    """Return the effective gain up to which every gain converges; 0 when none does, infinite when all below 20 / |lambda| do.
+
+    The deformation leaks, or is model-referenced:
+
+        1 = p / z + (1 - p) [ z^-(1+d) - a F(z) E(z) ],     F = (1 - f) / (1 - f / z),
+        E = lambda W(z)                                     increment
+        E = (lambda - 1) W(z) + z^-(1+d)                    model-referenced: the model's response passes W too
+
+    With a model of the right gain, lambda = 1, W drops out of the model-referenced form, and the limit is that without delay.
+
+    Args:
+        weights: w_1, w_2, ... of past requests in the response, dead time included.
+        cycles: d, age of the deformation that the next one is paired with, cycles.
+        leak: p, dimensionless.
+        pole: f of the filter of the error.
+        eigenvalue: lambda of the response Jacobian; give -lambda for the limit of a negative gain.
+        referenced: whether the form is the model-referenced one.
+        width: half width of a triangular mean of the paired values, whole cycles (`Paired(uncertainty=...)`).
+    """
+    if complex(eigenvalue).real <= 0:
+        return 0.0
+
+    at_zero, at_one = (
+        _on_circle(loop_polynomial(weights, gain, cycles, leak, pole, eigenvalue, referenced, width))
+        for gain in (0.0, 1.0)
+    )
+
+    def stable(gains: Array) -> Array:
+        return _circled_nothing(at_zero + gains[:, np.newaxis] * (at_one - at_zero))
+
+    gains = np.geomspace(*_RANGE, _STEPS) / abs(eigenvalue)
+    wrong = next(
+        (k + first for k in range(0, _STEPS, _AT_ONCE) for first in np.flatnonzero(~stable(gains[k : k + _AT_ONCE]))),
+        None,
+    )
+    if wrong is None:
+        return math.inf
+    low, high = (float(gains[wrong - 1]) if wrong else 0.0), float(gains[wrong])
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(np.array([middle]))[0] else (low, middle)
+    return low
+
+
+def loop_polynomial(
+    weights: Array,
+    gain: float,
+    cycles: float,
+    leak: float,
+    pole: float,
+    eigenvalue: complex,
+    referenced: bool,
+    width: int = 0,
+) -> Array:
+    """Return the coefficients in 1 / z of (1 - f / z) times (left side minus right side); arguments as in `leaking_limit`."""
+    whole = math.floor(cycles + 1e-9)
+    share = max(cycles - whole, 0.0)
+    own = np.zeros(max(whole + 3 + width, len(weights) + 1), dtype=complex)
+    own[whole + 1], own[whole + 2] = 1 - share, share
+    triangle = (1 - np.abs(np.arange(-width, width + 1)) / (width + 1)) / (width + 1)
+    own = np.convolve(own, triangle)[width : width + own.size]
+    delayed = np.zeros_like(own)
+    delayed[1 : len(weights) + 1] = weights
+    smooth = np.array([1.0, -pole])
+    error = (eigenvalue - 1) * delayed + own if referenced else eigenvalue * delayed
+    left_side = np.convolve(smooth, [1.0, -leak])
+    right_side = (1 - leak) * (np.convolve(smooth, own) - gain * (1 - pole) * np.append(error, 0.0))
+    return np.asarray(np.pad(left_side, (0, right_side.size - left_side.size)) - right_side)
+
+
+def _on_circle(coefficients: Array) -> Array:
+    """The polynomial in 1 / z at points round the unit circle."""
+    return np.fft.fft(coefficients, 2 ** math.ceil(math.log2(_LEAKING_PER_TERM * coefficients.size)))
+
+
+def _circled_nothing(curves: Array) -> Array:
+    """Whether all roots are inside the unit circle, a curve a row: it does not go round zero."""
+    turned = np.angle(np.roll(curves, -1, axis=1) * np.conj(curves)).sum(axis=1) / (2 * np.pi)
+    return (np.abs(curves).min(axis=1) >= 1e-12) & (np.abs(turned) < 0.5)

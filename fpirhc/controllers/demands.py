@@ -4,7 +4,7 @@ The sigmoid, for example, moves the request by at most 0.81 S per cycle (for D =
 desired response per cycle, or the loop falls behind and diverges. The desired response of a tracking law changes as its reference
 does; a plan may move between the input limits within one cycle.
 
-Around a tracking law the step must also cover the errors from which the loop is to come back (`fpirhc.contraction.basin`). Their
+Around a tracking law the step must also cover the errors from which the loop is to come back. Their
 size is unknown before a run. The error of a model is assumed to be no larger than the effect of the model's own command:
 |f - d| <= |r^N - response(x^N, 0)|, along the reference.
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction import step_for_basin
+from fpirhc.contraction.large_errors import step_for_basin
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.base import Demand
 from fpirhc.errors import InvalidValue

@@ -17,8 +17,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, leaking_limit, linear_limit, spectrum_over_run
-from fpirhc.contraction.sampled import sampled_jacobians
+from fpirhc.contraction.delayed import delayed_limit, leaking_limit
+from fpirhc.contraction.gains import assess_gain, linear_limit
+from fpirhc.contraction.measured import sampled_jacobians
+from fpirhc.contraction.spectrum import Spectrum, spectrum_over_run
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotContractive
 from fpirhc.plant.plant import Plant

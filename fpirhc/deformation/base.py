@@ -82,7 +82,7 @@ class Demand:
         sudden: whether the change is an occasional jump, which one step has to cover. Otherwise it goes on from cycle to cycle,
             and the map needs room beyond it.
         recovery: step per cycle with which the plain form comes back from the largest response error that is expected, in units
-            of the response (`fpirhc.contraction.basin`).
+            of the response (`fpirhc.contraction.large_errors`).
     """
 
     change: float

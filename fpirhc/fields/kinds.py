@@ -32,9 +32,7 @@ class Range:
         return above and below
 
 
-Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
-NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
 Deviation: TypeAlias = Annotated[  # its square is finite, and not zero
     float, Range("a positive number from 1e-100 to 1e100", low=1e-100, high=1e100)
 ]

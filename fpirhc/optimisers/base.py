@@ -33,6 +33,8 @@ FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept,
 KEPT = 1e-6  # the same as a share of half the range, where it has one
 _ITERATIONS = "iterations", "most_iterations"  # settings of an optimiser that bound its work
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
+_PATIENCE = 4  # calls in a row that may leave the violation as it is
+_SHRINKING = 0.9  # a violation counts as shrinking below this share of the last one
 
 
 class Optimiser(Checked, ABC):
@@ -233,26 +235,6 @@ def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, toler
     return ca.if_else(finite, feasible, int(Status.NON_FINITE))
 
 
-class _Same:
-    """A value as a key that equals itself alone, whether it can be hashed or not.
-
-    The key keeps the value: the address of one that is gone is given to another, which would then find its Function.
-    """
-
-    def __init__(self, value: object) -> None:
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.value is self.value
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-
-_PATIENCE = 4  # calls in a row that may leave the violation as it is
-_SHRINKING = 0.9  # a violation counts as shrinking below this share of the last one
-
-
 def improved(
     optimiser: Optimiser,
     ocp: OptimalControl,
@@ -293,3 +275,19 @@ def improved(
         stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
     diagnostics[3] = iterations if diagnostics[3] >= 0 else diagnostics[3]
     return inputs, diagnostics, memory, count
+
+
+class _Same:
+    """A value as a key that equals itself alone, whether it can be hashed or not.
+
+    The key keeps the value: the address of one that is gone is given to another, which would then find its Function.
+    """
+
+    def __init__(self, value: object) -> None:
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)

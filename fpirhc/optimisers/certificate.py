@@ -21,6 +21,7 @@ from fpirhc.summary import line, number, table
 _ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
 _REMEMBERED = 4  # horizons whose Functions are kept
 _AT_BOUND = 1e-9  # relative distance within which an input counts as at its bound
+_RANK = 1e-9  # relative singular value below which active limits depend on each other
 
 
 @dataclass(frozen=True)
@@ -189,9 +190,6 @@ def _model(plan: Plan) -> np.ndarray:
         sensitivity[:, own] += b
     final = np.asarray(end(plan.states[:, n], data[:, n])[2].full())
     return np.asarray(total + sensitivity.T @ final @ sensitivity)
-
-
-_RANK = 1e-9  # relative singular value below which active limits depend on each other
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,10 @@ from fpirhc.optimisers.limited_settings import (
 )
 from fpirhc.optimisers.scales import Scales, scales
 
+PURE, INTERIOR = 0, 1  # phase
+BEGINS, ENDS = 0, 1  # place_of: whether a pure phase stands before an interior one or after it
+KEPT, COLD, WARM = 0, 1, 2  # slacks: as they are, made from the distances, or from the distances and the multipliers
+
 
 @dataclass(frozen=True, eq=False)
 class Call:
@@ -65,9 +69,6 @@ class Call:
 
 
 State = dict[str, ca.MX]
-PURE, INTERIOR = 0, 1  # phase
-BEGINS, ENDS = 0, 1  # place_of: whether a pure phase stands before an interior one or after it
-KEPT, COLD, WARM = 0, 1, 2  # slacks: as they are, made from the distances, or from the distances and the multipliers
 _POINT = tuple(f"point_{name}" for name in Expansion._fields)
 
 

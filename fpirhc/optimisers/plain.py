@@ -37,6 +37,7 @@ from fpirhc.symbolic.live import LiveNumber, Number
 
 MOST = 100  # iterations of one converging call
 _MOST_PLAIN = 30  # plain steps after which a converging call gives up
+_TEXTS = ("kernels", "fixed_point", "entry")
 
 
 @dataclass(frozen=True)
@@ -72,9 +73,6 @@ def plain_memory(ocp: OptimalControl) -> Layout:
             scalar("plan_step", start=0.0),
         )
     )
-
-
-_TEXTS = ("kernels", "fixed_point", "entry")
 
 
 def plain_step(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:

@@ -19,6 +19,10 @@ from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 
 _WORST = 5  # violations in a text
+_EQUATION = 1e-6  # limits closer together than this are an equation
+_AT_LIMIT = 1e-3  # of its range: an input this near counts as at its limit
+_MOSTLY = 0.5  # share of the stages on which an input that stands at its limit is named
+_AT_BOUND = 1e-6  # relative distance within which an input counts as at its bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,11 +190,6 @@ def _shown(value: float | None, text: Callable[[float], str]) -> str:
     return "none" if value is None else text(value)
 
 
-_EQUATION = 1e-6  # limits closer together than this are an equation
-_AT_LIMIT = 1e-3  # of its range: an input this near counts as at its limit
-_MOSTLY = 0.5  # share of the stages on which an input that stands at its limit is named
-
-
 @dataclass(frozen=True, eq=False)
 class _Breach:
     """One side of one limit, and by how much the states s_0 ... s_N are beyond it.
@@ -302,9 +301,6 @@ def _at_their_limits(ocp: OptimalControl, inputs: np.ndarray, bounds: tuple[np.n
     near = _AT_LIMIT * reach[:, None]
     share = ((inputs - lower[:, None] <= near) | (upper[:, None] - inputs <= near)).mean(axis=1)
     return [f"'{ocp.input.elements[k]}'" for k in np.flatnonzero(share >= _MOSTLY)]
-
-
-_AT_BOUND = 1e-6  # relative distance within which an input counts as at its bound
 
 
 def _fit_multipliers(

@@ -25,6 +25,7 @@ DRAWN_IN = 0.01  # least factor of gamma after a plain step that was rejected
 SHORTEST = 0.05  # below it the plain fixed-point step is taken
 ROUNDING = 1e-13  # relative to the cost: smaller differences are rounding
 UNTRIED = 1e299  # a cost from which on an anchor counts as not evaluated
+_TINY = 1e-300
 
 
 class Arguments(NamedTuple):
@@ -186,9 +187,6 @@ def _stage_shapes(ns: int, nu: int) -> tuple[tuple[int, int], ...]:
 def _turned(stacked: ca.MX, stages: int) -> ca.MX:
     """The blocks of the stages in reverse order."""
     return ca.horzcat(*reversed(ca.horzsplit(stacked, stacked.shape[1] // stages))) if stages > 1 else stacked
-
-
-_TINY = 1e-300
 
 
 def _judgement(ocp: OptimalControl) -> ca.Function:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fpirhc.contraction import ContractionReport
+    from fpirhc.contraction.gains import ContractionReport
     from fpirhc.studies.comparison.compare import Comparison
     from fpirhc.studies.comparison.entry import Contraction, Entry
 

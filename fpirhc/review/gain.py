@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
+from fpirhc.contraction.gains import ContractionReport, assess_gain
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.recommended_gain import Recommended

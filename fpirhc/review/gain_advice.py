@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from fpirhc.contraction import Spectrum, assess_gain
+from fpirhc.contraction.gains import assess_gain
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import FpirhcError

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fpirhc.contraction import leaking_limit
+from fpirhc.contraction.delayed import leaking_limit
 from fpirhc.controllers.gain_check import product_limit
 from fpirhc.deformation.base import Deformation
 from fpirhc.task.problem import Problem

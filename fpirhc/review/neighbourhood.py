@@ -9,7 +9,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction import Spectrum, response_jacobian
+from fpirhc.contraction.spectrum import Spectrum, response_jacobian
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each
 from fpirhc.symbolic.expression import kind

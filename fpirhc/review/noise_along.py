@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction import noise_spread, response_jacobians
+from fpirhc.contraction.noise import noise_spread
+from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
 from fpirhc.review.grid import ReviewGrid

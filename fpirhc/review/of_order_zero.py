@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fpirhc.contraction import assess_gain
+from fpirhc.contraction.gains import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
 from fpirhc.errors import FpirhcError, InvalidValue

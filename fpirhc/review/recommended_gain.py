@@ -3,7 +3,7 @@
 Limits of the effective gain a are set by
 
     the steepest secant     a secant times every eigenvalue of the box is below 2, less behind a delay, an estimator or a filter
-    a two-cycle             the secant at which the whole loop has a bounded two-cycle, see `fpirhc.contraction.two_cycle`
+    a two-cycle             the secant at which the whole loop has a bounded two-cycle, see `fpirhc.contraction.large_errors`
     the poles               a pole of the whole loop (tracking law or plan, delay, filter) reaches the unit circle, at a point of
                             the reference or in a draw of the box
     the margins             the gain margin of an input's loop falls below 1.4, or its phase margin below 25 degrees
@@ -20,7 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.contraction import ContractionReport, two_cycle_limit
+from fpirhc.contraction.gains import ContractionReport
+from fpirhc.contraction.large_errors import two_cycle_limit
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.linear import LinearLoop

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fpirhc.contraction import Spectrum
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.review.answer import Answer, Verdict
 
 QUESTION = "Do the eigenvalues of the response Jacobian have one sign?"

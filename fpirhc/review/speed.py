@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from fpirhc.contraction import Spectrum, bearable_lag, least_product
+from fpirhc.contraction.lag import bearable_lag
+from fpirhc.contraction.large_errors import least_product
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.review.answer import Answer, Verdict

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 
 from fpirhc.by_name import FoundByName
-from fpirhc.contraction import filter_pole
+from fpirhc.contraction.noise import filter_pole
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, with_inner

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
-from fpirhc.contraction import response_jacobians
+from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.errors import NotSupported
 from fpirhc.review.grid import review_grid
 from fpirhc.review.linear import LinearLoop

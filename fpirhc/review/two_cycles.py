@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fpirhc.contraction import two_cycle_amplitudes
+from fpirhc.contraction.large_errors import two_cycle_amplitudes
 from fpirhc.deformation.base import Deformation, innermost
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict

@@ -8,10 +8,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.broken import attempted
-from fpirhc.contraction import contraction_along
-from fpirhc.contraction.identified import identified_factor
-from fpirhc.contraction.sampled import sampled_jacobians
-from fpirhc.contraction.spectrum import factors_along, response_jacobians
+from fpirhc.contraction.measured import identified_factor, sampled_jacobians
+from fpirhc.contraction.spectrum import contraction_along, factors_along, response_jacobians
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.own_reference import own_signals
 from fpirhc.horizon.problem import OptimalControl

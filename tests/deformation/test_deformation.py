@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fpirhc import RFPT, Affine, Guarded, RFPTVector, Rotation, Sigmoid
 from fpirhc.conformance import check_deformation
-from fpirhc.deformation import RFPT, Affine, Deformation, Guarded, Identity, RFPTVector, Rotation, Sigmoid
+from fpirhc.deformation import Deformation, Identity
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.members import examples, member_classes
 

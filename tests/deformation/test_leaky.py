@@ -10,8 +10,7 @@ import pytest
 from test_dead_time import DUFFING, LAW, affine, iteration_radius
 
 import fpirhc as fp
-from fpirhc.contraction import leaking_limit
-from fpirhc.contraction.leaking import loop_polynomial
+from fpirhc.contraction.delayed import leaking_limit, loop_polynomial
 from fpirhc.deformation import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 

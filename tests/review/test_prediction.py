@@ -11,7 +11,7 @@ import pytest
 from chains import chain
 
 import fpirhc as fp
-from fpirhc.contraction import least_product
+from fpirhc.contraction.large_errors import least_product
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.review.prediction import nominal_run, response_errors
 from fpirhc.review.tube import majorant, tube

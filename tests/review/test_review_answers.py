@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.contraction import Spectrum, assess_gain
+from fpirhc.contraction.gains import assess_gain
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges

@@ -12,7 +12,7 @@ from chains import chain, errors_after_request
 from sampled import lag, poles
 
 import fpirhc as fp
-from fpirhc.contraction import least_product
+from fpirhc.contraction.large_errors import least_product
 from fpirhc.deformation import Deformation
 
 RATE, PERIOD = 20.0, 1e-3  # 1/s, s

@@ -28,7 +28,8 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction import Spectrum, assess_gain
+from fpirhc.contraction.gains import assess_gain
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller, Response, command_before, deform_block
 from fpirhc.controllers.slots.floquet import Floquet, radius_of
 from fpirhc.controllers.slots.schedules import Schedule

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from fpirhc.contraction import basin_of_plain_form
+from fpirhc.contraction.large_errors import basin_of_plain_form
 from fpirhc.errors import InvalidValue
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.neighbourhood import spectrum_near

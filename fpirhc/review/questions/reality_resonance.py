@@ -1,13 +1,13 @@
 """Is the gain small enough for a resonance of the reality? It is for lambda (N Lambda + a / T) < 2 zeta w0.
 
-See `fpirhc.contraction.resonance` for the rule.
+See `fpirhc.contraction.lag` for the rule.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.contraction.resonance import resonant_limit
+from fpirhc.contraction.lag import resonant_limit
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.real_pair import Extra, extra_modes, real_points

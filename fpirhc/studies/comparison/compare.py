@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from fpirhc.broken import attempted
 from fpirhc.by_name import FoundByName
-from fpirhc.contraction import assess_gain
+from fpirhc.contraction.gains import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved, without_deformation
 from fpirhc.deformation.base import innermost

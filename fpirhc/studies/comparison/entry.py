@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fpirhc.contraction import ContractionReport, Spectrum
+from fpirhc.contraction.gains import ContractionReport
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.review.response_prediction import Prediction
 from fpirhc.simulation.lyapunov_view import LyapunovView
 from fpirhc.simulation.metrics import Metrics

@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from fpirhc.contraction import Spectrum, identified_factor, predicted_factor, spectrum_over_run
-from fpirhc.contraction.sampled import sampled_jacobians
+from fpirhc.contraction.gains import predicted_factor
+from fpirhc.contraction.measured import identified_factor, sampled_jacobians
+from fpirhc.contraction.spectrum import Spectrum, spectrum_over_run
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.metrics.window import measured_cycles
 from fpirhc.simulation.run import Run

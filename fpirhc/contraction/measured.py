@@ -1,27 +1,66 @@
-"""Eigenvalues of the response Jacobian of a reality: what a request of this cycle has done to the response at the end of it.
-
-The response of a reality with a lag does not see the command at once, so its derivative at an instant is zero. Between two
-measurements, the command held, it is
-
-    J = dy^(r)(x(t + T; u), u)/du  du/dr,        u = inverse(state, request; approximate),
-
-differentiated through the integrator of the run. Without a lag and for short periods it is the Jacobian at an instant.
-"""
+"""The response Jacobian over a cycle: fitted to a run, and differentiated through the integrator of a reality."""
 
 from __future__ import annotations
-
-from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
+from fpirhc.contraction.gains import predicted_factor
+from fpirhc.contraction.spectrum import Array
+from fpirhc.errors import InvalidShape
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
 
-Array: TypeAlias = np.ndarray
+_WINDOW = 15  # times (number of coordinates + 1): the cycles that are used; the transient of a useful gain is shorter
+_INDEPENDENT = 1e-3  # share of the size of the requests that each direction must reach, apart from the drift
 
 
-def sampled_jacobian(problem: Problem) -> ca.Function:
+def identified_factor(deformed: Array, realised: Array, effective_gain: float) -> float:
+    """Return max|1 - a eig(J)| with J fitted to a run; NaN when the run does not excite every direction.
+
+        realised[k+1] - realised[k] = J (deformed[k] - deformed[k-1]) + drift
+
+    Only the cycles from the largest increment of the request onwards are used, and the drift there is taken as linear in time:
+    later the request only follows the drift of the task, which hides the response of the plant.
+
+    Args:
+        deformed: requests, shape (cycles, n).
+        realised: responses, shape (cycles, n); row k is the response to the request issued in cycle k - 1.
+        effective_gain: a of the deformation, dimensionless.
+
+    Raises:
+        InvalidShape: the arrays differ in shape.
+    """
+    requests, responses = np.asarray(deformed, dtype=float), np.asarray(realised, dtype=float)
+    if requests.shape != responses.shape or requests.ndim != 2:
+        raise InvalidShape(
+            f"deformed has shape {requests.shape} but realised {responses.shape}; expected the same, (cycles, n)"
+        )
+    request_steps, response_steps = np.diff(requests, axis=0)[:-1], np.diff(responses, axis=0)[1:]
+    finite = np.isfinite(request_steps).all(axis=1) & np.isfinite(response_steps).all(axis=1)
+    request_steps, response_steps = request_steps[finite], response_steps[finite]
+    n = request_steps.shape[1]
+    count = min(len(request_steps), _WINDOW * (n + 1))
+    if count < n + 3:
+        return float("nan")
+    first = min(int(np.argmax(np.linalg.norm(request_steps, axis=1))), len(request_steps) - count)
+    request_steps, response_steps = request_steps[first : first + count], response_steps[first : first + count]
+    excitation, answer = _without_trend(request_steps), _without_trend(response_steps)
+    smallest = np.linalg.svd(excitation, compute_uv=False)[-1]
+    if not smallest > _INDEPENDENT * np.linalg.norm(request_steps):
+        return float("nan")
+    fitted = np.linalg.lstsq(excitation, answer, rcond=None)[0].T
+    return predicted_factor(np.linalg.eigvals(fitted), effective_gain)
+
+
+def _without_trend(rows: Array) -> Array:
+    """The rows minus their least-squares line in time."""
+    time = np.arange(len(rows))
+    line = np.vander(time, 2)
+    return np.asarray(rows - line @ np.linalg.lstsq(line, rows, rcond=None)[0])
+
+
+def _sampled_jacobian(problem: Problem) -> ca.Function:
     """Return the Function (reality's state, model's state, request, reality's parameters, model's parameters) -> J (n, n).
 
     Raises:
@@ -88,5 +127,5 @@ def sampled_jacobians(
     count, n = len(real), deformed.shape[1]
     true = np.asarray(problem.real_plant.exact if exact is None else exact, dtype=float)
     rows = (np.broadcast_to(v, (count, v.shape[-1])).T for v in (true, np.asarray(believed, dtype=float)))
-    stacked = sampled_jacobian(problem).map(count)(real.T, states.T, deformed.T, *rows)
+    stacked = _sampled_jacobian(problem).map(count)(real.T, states.T, deformed.T, *rows)
     return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
