@@ -2,7 +2,8 @@
 
 The controller runs with its deformation and without, on the plant of the problem with the exact parameters and on its own model. It
 is warned of where adaptation makes the first larger by far, or where it makes an error on the model, with nothing to adapt, that
-is larger than that of the wrong model without adaptation. A plant outside is not run for that.
+is larger than that of the wrong model without adaptation. A plant outside is not run for that. A gain that is refused is answered
+with the one that a review recommends.
 """
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task, without_deformation
-from fpirhc.errors import FpirhcError, HarmfulAdaptation
+from fpirhc.errors import FpirhcError, HarmfulAdaptation, NotContractive
 from fpirhc.fields.place import users_level
 from fpirhc.simulation.trials import Trials
 from fpirhc.symbolic.latest import Latest
@@ -39,6 +41,21 @@ def warn_of_harm(problem: Problem, controller: Controller) -> None:
         what = ", ".join(part for part in (problem.name, name_in_task(controller)) if part)
         text = f"{what}: adaptation does harm, by runs of {CYCLES} cycles: {'; '.join(reasons)}. {_REMEDY}"
         warnings.warn(text, HarmfulAdaptation, stacklevel=users_level())
+
+
+@contextmanager
+def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[None]:
+    """Add the recommended gain to a refusal of the controller's gain within it."""
+    try:
+        yield
+    except NotContractive as error:
+        review = import_module(
+            "fpirhc.review.gain_advice"
+        )  # of a layer above, which is only asked when nothing else follows
+        advice = review.recommended_for(problem, controller)
+        if advice is None:
+            raise
+        raise NotContractive(f"{error}; {advice.text}") from None
 
 
 @contextmanager

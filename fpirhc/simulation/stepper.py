@@ -20,7 +20,7 @@ from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import Checked
 from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.simulation.deadline import Clock, Deadline
-from fpirhc.simulation.harm_warning import warn_of_harm
+from fpirhc.simulation.harm_warning import warn_of_harm, with_recommended_gain
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch
 from fpirhc.simulation.missed import missed_cycles, most_missed
 from fpirhc.simulation.numbers_now import NumbersNow
@@ -116,6 +116,7 @@ class Stepper(Checked):
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
             InvalidName: a live setting that does not exist.
             InvalidValue: a deadline that is no positive number.
+            NotContractive: a gain with which the deformation cannot converge; the message names the recommended one.
             NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
             CompileError: the compiler fails on a controller with live settings.
         """
@@ -123,7 +124,8 @@ class Stepper(Checked):
         if self.deadline is not None:
             vars(self)["step"] = self.deadline.timed(self.step)  # a stepper without a deadline pays nothing
         settings = live_settings(problem, controller, live)
-        ready = checked(problem, settings.controller)
+        with with_recommended_gain(problem, settings.controller):
+            ready = checked(problem, settings.controller)
         if bounded:
             refuse_unbounded(ready)
         ranges = plausible_range(problem, plausible)

@@ -68,9 +68,14 @@ def test_review_refusal_and_report_name_the_same_gain(folder, capsys):
     assert refused.replace("\n", " ").count(sentence) == 1
     assert main(["run", "car.py", REFERENCED]) == 2
     assert sentence in capsys.readouterr().err.replace("\n", " ")
+    with pytest.raises(fp.FpirhcError, match=re.escape(f"; {sentence}")):
+        fp.Stepper(TASK.problem, TASK.controllers[REFERENCED].with_deformation(fp.ModelReferenced(fp.Affine(gain=0.8))))
+    Path("car.py").write_text(STEERING)
+    assert main(["run", "car.py", REFERENCED, "--no-compile", "--set", "deformation.map.gain=0.8"]) == 2
+    assert sentence in capsys.readouterr().err.replace("\n", " ")
     Path("car.py").write_text(STEERING.replace(old, "fp.BeyondLimit(fp.ModelReferenced(fp.Affine(gain=-5.4)))"))
     assert main(["compare", "car.py", "--no-compile", "--controllers", "RHC", REFERENCED]) == 0
-    assert f"{REFERENCED}: its gain: {sentence}" in capsys.readouterr().out
+    assert f" Its gain is too large: {sentence}." in capsys.readouterr().out
 
 
 def test_with_the_recommended_gain_the_wheel_moves_as_without_adaptation():

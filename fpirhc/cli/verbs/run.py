@@ -117,22 +117,35 @@ def _simulated(
     from fpirhc.controllers.live_settings import live_settings
     from fpirhc.errors import NotSupported
     from fpirhc.problem_files.settings import is_whole, with_settings
+    from fpirhc.simulation.harm_warning import with_recommended_gain
     from fpirhc.simulation.simulate import simulate
 
     run["setpoints"] = setpoints
     if not settings:
         return problem, controller, simulate(problem, controller, **run)
+    with with_recommended_gain(problem, _with_gains(controller, settings)):
+        try:
+            live = simulate(problem, controller, settings=settings, **run)
+            changed, ready, _ = live_settings(problem, controller, list(settings)).changed(settings)
+            return changed, ready, live
+        except NotSupported:
+            values: dict[str, Any] = {
+                p: v if isinstance(v, tuple) or v % 1 or not is_whole(controller, p) else int(v)
+                for p, v in settings.items()
+            }
+            rebuilt = with_settings(controller, values)
+            return problem, rebuilt, simulate(problem, rebuilt, **run)
+
+
+def _with_gains(controller: Controller, settings: Mapping[str, Any]) -> Controller:
+    """The controller with those settings that are numbers of its deformation; itself where they are wrong, which a run says."""
+    from fpirhc.errors import FpirhcError
+    from fpirhc.problem_files.settings import with_settings
+
     try:
-        live = simulate(problem, controller, settings=settings, **run)
-        changed, ready, _ = live_settings(problem, controller, list(settings)).changed(settings)
-        return changed, ready, live
-    except NotSupported:
-        values: dict[str, Any] = {
-            p: v if isinstance(v, tuple) or v % 1 or not is_whole(controller, p) else int(v)
-            for p, v in settings.items()
-        }
-        rebuilt = with_settings(controller, values)
-        return problem, rebuilt, simulate(problem, rebuilt, **run)
+        return with_settings(controller, {p: v for p, v in settings.items() if p.startswith("deformation.")})
+    except FpirhcError:
+        return controller
 
 
 def _named(progress: Progress, name: str) -> Callable[[int, int], None]:
