@@ -421,7 +421,7 @@ def test_pytest_plugin(pytester, blessed):
     pytester.makepyfile(test_line=TEST)
     path = pytester.path / "line.py"
     path.write_text(LINE)
-    run = lambda *more: pytester.runpytest_subprocess("--fpirhc-no-compile", "-p", "no:cacheprovider", *more)  # noqa: E731
+    run = lambda *more: pytester.runpytest_inprocess("--fpirhc-no-compile", "-p", "no:cacheprovider", *more)  # noqa: E731
     missing = run("-k", "RHC")
     missing.assert_outcomes(failed=1, deselected=2)
     missing.stdout.fnmatch_lines(["*there is no baseline 'line.json'*"])
@@ -430,7 +430,6 @@ def test_pytest_plugin(pytester, blessed):
     first = read_baseline(file)
     assert list(first.controllers) == ["CTC", "CTC+FPI", "RHC+FPI"], "in this order, whichever worker was first"
     assert first.controllers == read_baseline(blessed / "baselines" / "line.json").controllers
-    run("-n", "2").assert_outcomes(passed=3)
     path.write_text(
         LINE.replace('"CTC": fp.ComputedTorque(tracking)', '"CTC": fp.ComputedTorque(fp.Exponential(rate=9.0))')
     )
@@ -455,6 +454,6 @@ def test_pytest_plugin(pytester, blessed):
 def test_pytest_plugin_wants_a_reason(option, pytester):
     """An empty one is refused before anything runs, under the earlier name too."""
     pytester.makepyfile(test_line=TEST)
-    result = pytester.runpytest_subprocess(option, " ")
+    result = pytester.runpytest_inprocess(option, " ")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*needs a reason*"])
