@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import abroad
@@ -42,15 +44,30 @@ tuning = {"CTC+gentle": {"deformation.gain": fp.Span(-0.05, -0.04)}}
 '''
 
 
+TERMINAL = {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "4000"}
+
+
 @pytest.fixture
 def file(tmp_path, monkeypatch) -> Path:
     """A folder with the file, and a terminal with colours and wide lines."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "4000")
+    for name, value in TERMINAL.items():
+        monkeypatch.setenv(name, value)
     Path("line.py").write_text(FILE)
     return Path("line.py")
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory) -> tuple[str, Path]:
+    """What a comparison of the file prints, and its results."""
+    folder = tmp_path_factory.mktemp("compared")
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as printed:
+        patch.chdir(folder)
+        for name, value in TERMINAL.items():
+            patch.setenv(name, value)
+        Path("line.py").write_text(FILE)
+        assert main(["compare", "line.py", "--no-compile"]) == 0
+    return printed.getvalue(), folder / "results" / "line"
 
 
 def shown(capsys, *words: str) -> str:
@@ -68,9 +85,9 @@ LOSES = r"- CTC\+gentle does not help: it raises the rms error of y from (\S+) t
 FAILS = r"- Null test \(the approximate model as plant\): failed, CTC\+gentle is worse than (CTC.*) although"
 
 
-def test_a_pair_that_is_no_headline_stands_in_red_before_the_table(file, capsys):
+def test_a_pair_that_is_no_headline_stands_in_red_before_the_table(compared):
     """Both reasons are there, the run and the null test; the good pair has no red line."""
-    printed = shown(capsys, "compare", "line.py", "--no-compile")
+    printed, results = compared
     before, title, _ = printed.partition("line, from t = 1 s")
     assert title
     first, second = red(before)
@@ -79,21 +96,20 @@ def test_a_pair_that_is_no_headline_stands_in_red_before_the_table(file, capsys)
     assert float(lost[2]) > 2 * float(lost[1])
     assert re.match(FAILS, second)
     assert red(printed) == [first, second]
-    facts = json.loads(Path("results/line/results.json").read_text())
+    facts = json.loads((results / "results.json").read_text())
     assert facts["outcome"] == "better"
     assert [test["harmful"] for test in facts["null_tests"]] == [False, True]
     assert facts["null_tests"][1]["pair"] == ["CTC", "CTC+gentle"]
     assert facts["null_test"] == facts["null_tests"][0]
-    page = Path("results/line/report.html").read_text()
+    page = (results / "report.html").read_text()
     assert page.count("class='outcome-worse'") == 2
 
 
-def test_a_run_of_it_says_the_same_as_its_comparison(file, capsys):
+def test_a_run_of_it_says_the_same_as_its_comparison(file, compared, capsys):
     """The numbers are those of the comparison; a controller that helps has no red line."""
-    compared = red(shown(capsys, "compare", "line.py", "--no-compile"))
     printed = shown(capsys, "run", "line.py", "CTC+gentle", "--no-compile")
     alone = [line.replace("CTC+gentle without adaptation", "CTC") for line in red(printed)]
-    assert alone == compared
+    assert alone == red(compared[0])
     assert printed.startswith(RED)
     assert red(shown(capsys, "run", "line.py", "CTC+model-referenced", "--no-compile")) == []
     assert red(shown(capsys, "run", "line.py", "CTC", "--no-compile")) == []
