@@ -25,6 +25,7 @@ Reference: I. J. Schoenberg, The elementary cases of Landau's problem of inequal
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -55,21 +56,27 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
     Raises:
         InvalidProblem: a name that is unknown or not measured, or an interval that is none.
     """
-    plant, columns = problem.plant.face, _columns(problem)
+    columns = _columns(problem)
     _check(own or {}, columns)
-    ranges = _behind_outputs(problem)
-    responses = _largest_responses(problem)
+    shown = {columns[name]: interval for name, interval in _automatic(problem).items() if name in columns}
+    return shown | {columns[name]: interval for name, interval in (own or {}).items()}
+
+
+@lru_cache(maxsize=8)  # every controller of a comparison has the same ones
+def _automatic(problem: Problem) -> Mapping[str, Interval]:
+    """Intervals by the name of the measured quantity."""
+    plant, ranges = problem.plant.face, _behind_outputs(problem)
+    responses, values = _largest_responses(problem), _values(problem)
     for k in plant.controlled_indices:
         name, order = plant.names[k], plant.orders[k]
-        middle, reach = _about(_values(problem)[name])
+        middle, reach = _about(values[name])
         limit = responses[plant.controlled_names.index(name)]
         for power in range(order + 1):
             half = _derivative(reach, limit, power, order, problem.period)
             if 0 < half < np.inf:
                 centre = middle if power == 0 else 0.0
                 ranges[name + "'" * power] = (centre - half, centre + half)
-    shown = {columns[name]: interval for name, interval in ranges.items() if name in columns}
-    return shown | {columns[name]: interval for name, interval in (own or {}).items()}
+    return ranges
 
 
 def _about(values: np.ndarray) -> tuple[float, float]:
@@ -154,7 +161,7 @@ def _values(problem: Problem) -> dict[str, np.ndarray]:
     """Values of every coordinate that the problem names: reference, start, and finite limits."""
     plant, function = problem.plant.face, problem.reference.function(problem.plant)
     times = np.linspace(0.0, problem.duration, _SAMPLES)
-    reference = np.array([np.asarray(function(t)[0].full()).ravel() for t in times])
+    reference = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full()).T
     values = {}
     for name in plant.names:
         at = plant.state.elements.index(name)

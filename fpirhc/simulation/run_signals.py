@@ -17,6 +17,7 @@ from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.loop import REALITY_STATE
 from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.output_disturbance import LOGGED
 from fpirhc.task.outside import model_values, real_values, rows_of
@@ -24,6 +25,9 @@ from fpirhc.task.problem import Problem
 
 _CHUNK = 500  # cycles whose costs are evaluated in one call
 Judgement = tuple[Signal, np.ndarray]
+_COSTS: Latest[tuple[OptimalControl, Evaluator]] = Latest(
+    2
+)  # every controller of a comparison is judged by the same cost
 
 
 def judgements(
@@ -97,13 +101,8 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     The same cost judges all controllers of a problem, whatever their models: effort relative to a feedforward is relative to the
     feedforward of the plant.
     """
-    assert problem.horizon is not None
-    assert problem.cost is not None
-    plant = problem.plant
-    one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
-    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
-    own, outside = bool(own_signals(problem)), real_values(plant, problem.signals)
-    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
+    shifted, own = LOGGED in layout.names, bool(own_signals(problem))
+    ocp, evaluator = _COSTS.of((problem,), (shifted,), lambda: _cost_evaluator(problem, shifted=shifted))
     states = log[:, layout.slice("plant_state")]
     commands = log[:, layout.slice("command")]
     states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
@@ -111,11 +110,9 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     # Along the reference that the run had, where it is no function of the time alone.
     motion = [log[:, layout.slice(name)] for name in ("reference", "reference_response")] if own else []
     # A disturbed output is h + d; its error is that of h to the reference less d.
-    shift = [log[:, layout.slice(LOGGED)]] if LOGGED in layout.names else []
-    function = _cost_function(ocp, data_of, _CHUNK, shifted=bool(shift))
-    evaluator = Evaluator(function)
+    shift = [log[:, layout.slice(LOGGED)]] if shifted else []
     costs = np.empty((log.shape[0], len(ocp.terms)))
-    evaluator.arguments[-1][:] = plant.exact
+    evaluator.arguments[-1][:] = problem.plant.exact
     for at in range(0, log.shape[0], _CHUNK):
         size = min(_CHUNK, log.shape[0] - at)
         for argument, source in zip(evaluator.arguments, (times, *motion, *shift, states, commands), strict=False):
@@ -123,6 +120,18 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
         evaluator.evaluate()
         costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
     return Signal("cost", tuple(ocp.terms)), costs
+
+
+def _cost_evaluator(problem: Problem, *, shifted: bool) -> tuple[OptimalControl, Evaluator]:
+    """A horizon of one cycle, and its cost terms of many cycles."""
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    plant, own = problem.plant, bool(own_signals(problem))
+    one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
+    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
+    outside = real_values(plant, problem.signals)
+    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
+    return ocp, Evaluator(_cost_function(ocp, data_of, _CHUNK, shifted=shifted))
 
 
 def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shifted: bool) -> ca.Function:
