@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 from fpirhc.cli.crash import closed_by_reader, crash, interrupted, of_a_problem_file, silence_output
 from fpirhc.cli.discovery import Known, former_names, known, shipped
 from fpirhc.cli.exit_codes import ExitCode, table
-from fpirhc.cli.verb import DEBUG, GROUPS, aligned
+from fpirhc.cli.verb import DEBUG, GROUPS, Parser, aligned
 from fpirhc.summary import printable
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; wrong options end with SystemExit(2), as argparse does."""
+    """Run the command line and return its exit code; `--help` ends with SystemExit(0), as argparse does."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code = int(_run([word for word in words if word != DEBUG]))
@@ -73,7 +73,7 @@ def _about(words: list[str], verbs: Mapping[str, Known]) -> ExitCode:
     """Answer `fpirhc`, `fpirhc --help` and `fpirhc --version`."""
     commands = "\n\n".join(filter(None, (_listed(title, group, verbs) for group, title in GROUPS.items())))
     codes = table({code: code.meaning for code in ExitCode})
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="fpirhc",
         usage="fpirhc [--help] [--version] COMMAND ...",
         description=f"Adaptive receding-horizon control by fixed-point iteration.\n\n{commands}",

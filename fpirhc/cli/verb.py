@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NoReturn
 
 from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode, table
 
@@ -47,7 +49,7 @@ class Verb:
     def parser(self) -> argparse.ArgumentParser:
         """Return the parser of the command's own options, with examples and exit codes below them."""
         notes = f"\n{self.notes.strip()}\n" if self.notes else ""
-        parser = argparse.ArgumentParser(
+        parser = Parser(
             prog=f"fpirhc {self.name}",
             description=f"{self.summary[0].upper()}{self.summary[1:]}.",
             epilog=f"examples:\n{aligned(self.examples)}\n{notes}\nexit codes:\n{table(self.exit_codes)}",
@@ -63,18 +65,75 @@ class Verb:
         Raises:
             InvalidName: an unknown option, or a word too many; the nearest option is offered.
         """
-        parser = self.parser()
-        options, unknown = parser.parse_known_args(words)
-        if not unknown:
-            return options
-        from fpirhc.errors import InvalidName, nearest
+        return self.parser().parse_args(words)
 
-        first = unknown[0]
-        valid = [name for name in parser._option_string_actions if name.startswith("--")]
-        if first.startswith("-"):
-            raise InvalidName(f"{self.name}: the option '{first}' is unknown.{nearest(first, valid)}")
-        needed = [str(one.metavar or one.dest) for one in parser._actions if not one.option_strings]
-        raise InvalidName(f"'{first}' is a word too many; write {' '.join((parser.prog, *needed))} [options]")
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose error is one sentence with what was expected, the nearest valid name, and where the help is."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise the error.
+
+        Raises:
+            InvalidName: an unknown option or choice, or a word too many.
+            InvalidValue: every other mistake.
+        """
+        from fpirhc.errors import InvalidName, InvalidValue
+
+        for pattern, tell in _MISTAKES.items():
+            found = re.match(pattern, message, re.DOTALL)
+            if found:
+                kind = InvalidName if tell in (_unknown, _no_choice) else InvalidValue
+                raise kind(f"{tell(self, *found.groups())} See {self.prog} --help.")
+        raise InvalidValue(f"{message.removeprefix('argument ')}. See {self.prog} --help.")
+
+
+def _unknown(parser: Parser, words: str) -> str:
+    from fpirhc.errors import nearest
+
+    first = words.split()[0]
+    if first.startswith("-"):
+        options = [name for name in parser._option_string_actions if name.startswith("--")]
+        return f"the option '{first}' is unknown.{nearest(first, options)}"
+    needed = [str(one.metavar or one.dest) for one in parser._actions if not one.option_strings]
+    return f"'{first}' is a word too many; write {' '.join((parser.prog, *needed))} [options]."
+
+
+def _no_choice(_: Parser, name: str, value: str, choices: str) -> str:
+    from fpirhc.errors import nearest
+
+    valid = re.findall(r"[^\s,']+", choices)
+    return f"{name} '{value}' is unknown.{nearest(value, valid)}"
+
+
+def _missing(parser: Parser, names: str) -> str:
+    helps = {str(one.metavar or one.dest): one.help for one in parser._actions if not one.option_strings}
+    lacking = [f"{name} ({helps[name]})" if helps.get(name) else name for name in names.split(", ")]
+    return f"{' and '.join(lacking)} {'is' if len(lacking) == 1 else 'are'} missing."
+
+
+def _no_value(parser: Parser, name: str, _: str) -> str:
+    option = name.split("/")[0]
+    return f"{name} needs a value: {option} {parser._option_string_actions[option].metavar}."
+
+
+def _wrong_value(_: Parser, name: str, kind: str, value: str) -> str:
+    return f"{name} {value}: expected {_KINDS.get(kind, f'a value of the kind {kind}')}."
+
+
+def _ambiguous(_: Parser, option: str, options: str) -> str:
+    return f"the option '{option}' may be {', '.join(options.split(', ')[:-1])} or {options.split(', ')[-1]}; write the whole name."
+
+
+_KINDS = {"int": "a whole number", "float": "a number"}
+_MISTAKES: dict[str, Callable[..., str]] = {  # what argparse says, by the sentence that says it to a user
+    r"unrecognized arguments: (.*)": _unknown,
+    r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)": _no_choice,
+    r"the following arguments are required: (.*)": _missing,
+    r"argument (\S+): expected (one|at least one) argument": _no_value,
+    r"argument (\S+): invalid (\w+) value: (.*)": _wrong_value,
+    r"ambiguous option: (\S+) could match (.*)": _ambiguous,
+}
 
 
 def aligned(examples: tuple[tuple[str, str], ...]) -> str:
