@@ -16,7 +16,6 @@ from fpirhc.conformance.laws import hold, within
 from fpirhc.conformance.loops import Replay, Trial, coarse_steps, spelled_by_states
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, tracking_law
-from fpirhc.controllers.form_check import MAPS
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError
@@ -179,10 +178,8 @@ def outputs_are_controlled(trial: Trial, generator: np.random.Generator) -> None
 
 
 def maps_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """If it covers maps, it does not drive away a plant that moves in coarse steps and is known exactly."""
+    """A map that it does not refuse, which moves in coarse steps and is known exactly, it does not drive away."""
     problem = coarse_steps()
-    if MAPS not in trial.controller.covers:
-        return
     run = _moved(problem, trial)
     if run is None:
         return
@@ -190,8 +187,9 @@ def maps_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  
     rest, first = float(errors[-run.cycles // 4 :].max()), float(errors[0].max())
     hold(
         run.stop is None and within(rest, first * (1 + _SAME)),
-        f"it says that it covers maps, but the error {first:.3g} of stocks that are filled in steps of {problem.period:g} s is "
-        f"{rest:.3g} after {run.cycles} steps; write its law for differences of steps, or give the reason why it cannot",
+        f"it takes a map, but the error {first:.3g} of stocks that are filled in steps of {problem.period:g} s is "
+        f"{rest:.3g} after {run.cycles} steps; write its law for differences of steps, or raise NotSupported in check() with "
+        "the reason",
     )
 
 

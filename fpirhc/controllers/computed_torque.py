@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.form_check import MAPS
 from fpirhc.controllers.tracked import tracked_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -30,11 +29,6 @@ class ComputedTorque(Controller):
 
     tracking: Tracking
     deformation: Deformation = field(default_factory=Identity)
-
-    @property
-    def covers(self) -> frozenset[str]:
-        """Maps: in their cycles its law has differences in place of derivatives."""
-        return frozenset({MAPS})
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update."""

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.demands import plan_demand, reference_demand
-from fpirhc.controllers.form_check import check_form, check_maps, check_outputs
+from fpirhc.controllers.form_check import check_form, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.identity import Identity
@@ -260,15 +260,6 @@ class Controller(Checked, ABC):
         """Return the response that the controller reads as 'realised'; None: that of the plant's controlled coordinates."""
         return None if self.inner is None else self.inner.response(self.inner_problem(problem))
 
-    @property
-    def covers(self) -> frozenset[str]:
-        """Which plants it controls besides differential equations whose inputs show in derivatives: of `MAPS`, `ORDER_ZERO`.
-
-        None by default: a law for derivatives with respect to time is another one for differences of steps, and an output of
-        order 0 has no derivative to prescribe.
-        """
-        return frozenset() if self.inner is None else self.inner.covers
-
     def floquet(self, problem: Problem) -> Floquet | None:
         """Return the stability of one period of a controller that switches; None for a controller that does not switch."""
         return None if self.inner is None else self.inner.floquet(self.inner_problem(problem))
@@ -308,14 +299,13 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     Raises:
         FpirhcError: the controller's own check fails.
         NotContractive: the gain of the deformation has the wrong sign, or is too large behind estimator and filter.
-        NotSupported: a form of the deformation that cannot be used here; outputs, or a map, that the controller does not cover; a
+        NotSupported: a form of the deformation that cannot be used here; a
             response of the controller's own behind sensors or dead time.
     """
     if not numbers_only and is_live(problem, controller):
         checked(nominal(problem), nominal(controller))
         return controller
     check_outputs(problem, controller)
-    check_maps(problem, controller)
     ready = resolved(problem, controller)
     if numbers_only and ready.inner is None and ready.planner is not None:
         ready.planner.check_weights(problem)

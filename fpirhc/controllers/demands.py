@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction.large_errors import step_for_basin
-from fpirhc.controllers.reference_states import reference_states
+from fpirhc.controllers.reference_states import nominal_motion, reference_states
 from fpirhc.deformation.base import Demand
 from fpirhc.errors import InvalidValue
 from fpirhc.task.problem import Problem
@@ -27,7 +27,7 @@ _SAMPLES = 2000
 def reference_demand(problem: Problem, law: Tracking | None = None) -> Demand:
     """Return the change period max|d/dt r^N| of the nominal response r^N, or its largest jump, with the recovery for `law`."""
     t = ca.MX.sym("t")
-    responses = problem.reference.function(problem.plant)(t)[1][list(problem.plant.face.controlled_indices)]
+    responses = nominal_motion(problem)(t)[1]
     response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant.face)
     smooth = problem.period * _slew(response_of, problem.duration)
     change = max(jump, _largest_change(response_of, problem)) if jump else smooth
@@ -57,20 +57,17 @@ def plan_demand(problem: Problem) -> Demand:
 def command_demand(problem: Problem, parameters: np.ndarray) -> Demand:
     """Return the change period max|dQ/dt| of the command Q that the model with these parameters needs along the reference."""
     plant, times = problem.plant, np.linspace(0.0, problem.duration, _SAMPLES)
-    responses = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[1].full())
+    wanted = nominal_motion(problem).map(_SAMPLES)(times[None, :])[1]
     values = plant.inverse_function.map(_SAMPLES)(
-        reference_states(problem, _SAMPLES),
-        responses[list(plant.face.controlled_indices)],
-        np.repeat(parameters[:, None], _SAMPLES, axis=1),
+        reference_states(problem, _SAMPLES), wanted, np.repeat(parameters[:, None], _SAMPLES, axis=1)
     )
     return Demand(problem.period * _steepest(np.asarray(values.full()), times), sudden=False)
 
 
 def _recovery(problem: Problem, law: Tracking | None) -> float:
     """Step per cycle with which the plain form comes back from the largest expected error; 0 without a law of one rate."""
-    face = problem.plant.face
-    laws = [law.feedback(face.orders[k]) for k in face.controlled_indices] if law else []
-    rates = [(len(one.gains), one.rate) for one in laws if one is not None and one.rate is not None]
+    laws = [law.feedback(order) for order in problem.plant.response_orders.values()] if law else []
+    rates = [(len(one.gains), one.rate) for one in laws if one is not None and one.rate is not None and one.gains]
     if not rates:
         return 0.0
     error = _largest_error(problem)
@@ -82,10 +79,10 @@ def _largest_error(problem: Problem) -> float:
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     states = reference_states(problem, _SAMPLES)
-    responses = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[1].full())
+    wanted = np.asarray(nominal_motion(problem).map(_SAMPLES)(times[None, :])[1].full())
     model, still = np.repeat(plant.approximate[:, None], _SAMPLES, axis=1), np.zeros((plant.input.size, _SAMPLES))
     free = np.asarray(plant.controlled_response_function.map(_SAMPLES)(states, still, model).full())
-    sizes = np.linalg.norm(responses[list(plant.face.controlled_indices)] - free, axis=0)
+    sizes = np.linalg.norm(wanted - free, axis=0)
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.controllers.form_check import MAPS, ORDER_ZERO
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotInvertible, NotSupported
@@ -35,11 +34,6 @@ class FeedforwardOnly(Controller):
     def deformation(self) -> Deformation:
         """Identity(): no request is iterated."""
         return Identity()
-
-    @property
-    def covers(self) -> frozenset[str]:
-        """Everything that has an inverse: it has no law."""
-        return frozenset({MAPS, ORDER_ZERO})
 
     def check(self, problem: Problem) -> None:
         """Raise if the model has no inverse, or a derivative is prescribed where states have no reference.

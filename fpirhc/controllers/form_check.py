@@ -11,8 +11,6 @@ from fpirhc.deformation.queue import every
 from fpirhc.errors import NotSupported
 from fpirhc.task.problem import Problem
 
-MAPS, ORDER_ZERO = "maps", "outputs of order 0"  # of `Controller.covers`
-
 
 class _Controller(Protocol):
     """The members of a controller that the check needs; the contract itself imports this module."""
@@ -20,20 +18,14 @@ class _Controller(Protocol):
     @property
     def deformation(self) -> Deformation: ...
 
-    @property
-    def covers(self) -> frozenset[str]: ...
-
-    @property
-    def planner(self) -> object: ...
-
 
 def check_outputs(problem: Problem, controller: _Controller) -> None:
-    """Raise if the problem's plant has outputs that the deformation does not cover, or outputs of order 0.
+    """Raise if the problem's plant has outputs that the deformation does not cover, or of order 0 behind an estimator.
 
     Raises:
         NotSupported: with the reason.
     """
-    _check_order_zero(problem, controller)
+    _check_order_zero(problem)
     plant, mirror = problem.plant, controller.deformation.mirror
     late = 0.0 if mirror is None else mirror.measurement
     if plant.outputs and (late % 1 > NONE or (plant.step and late)):
@@ -41,19 +33,6 @@ def check_outputs(problem: Problem, controller: _Controller) -> None:
             f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
             f"({', '.join(plant.outputs)}): its twin moves from the state that is given with the samples, and these are late by "
             f"{late:g} cycles; believe in whole cycles, and for a map in none"
-        )
-
-
-def check_maps(problem: Problem, controller: _Controller) -> None:
-    """Raise if the problem's plant is a map and the controller does not cover maps.
-
-    Raises:
-        NotSupported: with the reason.
-    """
-    if problem.plant.step is not None and MAPS not in controller.covers:
-        raise NotSupported(
-            f"{type(controller).__name__} does not cover maps: it is written for derivatives with respect to time; use "
-            "ComputedTorque, RecedingHorizon or FeedforwardOnly"
         )
 
 
@@ -95,22 +74,36 @@ def check_form(problem: Problem, controller: _Controller) -> None:
         )
 
 
-def _check_order_zero(problem: Problem, controller: _Controller) -> None:
-    """Raise for outputs of order 0 that the controller does not cover."""
-    plant, name = problem.plant, type(controller).__name__
-    controlled = [n for n in plant.controlled_names if n in plant.instant_names]
-    if controlled and ORDER_ZERO not in controller.covers:
+def _check_order_zero(problem: Problem) -> None:
+    """Raise for outputs of order 0 beside an estimator: their response is measured."""
+    instant = [name for name, order in problem.plant.response_orders.items() if not order]
+    if instant and not problem.sensing.estimator.measures_all:
         raise NotSupported(
-            f"{name} does not cover outputs of order 0 ({', '.join(controlled)}): the command moves them at once, so there "
-            "is no derivative to prescribe; use FeedforwardOnly(), and Cascade(FeedforwardOnly(), map) to iterate on its target"
-        )
-    if plant.instant_names and controller.planner is not None:
-        raise NotSupported(
-            f"{name} plans with outputs that are functions of the state, and {', '.join(plant.instant_names)} depends on the "
-            "command too (order 0); leave it out of the outputs of the plant"
-        )
-    if controlled and not problem.sensing.estimator.measures_all:
-        raise NotSupported(
-            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(controlled)}) "
+            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
             "need none; leave the estimator out: Sensing(sensors=...)"
+        )
+
+
+def check_derivatives(problem: Problem, law: str) -> None:
+    """Raise for a map or an output of order 0, where a law has no meaning.
+
+    Args:
+        problem: the problem.
+        law: what the law does with derivatives, as the beginning of a sentence.
+
+    Raises:
+        NotSupported: with the law.
+    """
+    plant = problem.plant
+    instant = [name for name, order in plant.response_orders.items() if not order]
+    what = (
+        "a map has differences of its steps"
+        if plant.step is not None
+        else f"{instant[0]} is of order 0"
+        if instant
+        else ""
+    )
+    if what:
+        raise NotSupported(
+            f"{law} a derivative with respect to time, and {what}; use ComputedTorque with a deformation"
         )

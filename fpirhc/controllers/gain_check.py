@@ -105,8 +105,7 @@ def product_limit(problem: Problem, deformation: Deformation) -> float | None:
 
 def _delayed_weights(problem: Problem, form: _Form) -> list[np.ndarray]:
     """Weights of past requests in the estimated responses, dead time included; empty without estimator and filter."""
-    face = problem.plant.face
-    orders = {face.orders[k] for k in face.controlled_indices}
+    orders = set(problem.plant.response_orders.values())
     weights = [problem.sensing.estimator.weights(order, problem.period) for order in orders]
     dead_times = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
     if (form.pole == 0 and all(w.size == 1 for w in weights)) or len(dead_times) > 1:

@@ -23,7 +23,6 @@ from fpirhc.controllers.base import Controller, closing_blocks, like, reference_
 from fpirhc.controllers.consistent_start import at_consistent_start, consistent_start
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.first_plan import built_first_memory, first_memory
-from fpirhc.controllers.form_check import MAPS
 from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.planned_model import as_planned, held_model
@@ -85,11 +84,6 @@ class RecedingHorizon(Controller):
         consistent, follows = ways.consistent, self.follows_model
         return Planner(self.optimiser, self.cost, ways.restarts, ways.law, self.margins, consistent, adapts, follows)
 
-    @property
-    def covers(self) -> frozenset[str]:
-        """Maps: a stage is a whole number of their steps."""
-        return frozenset({MAPS})
-
     def check(self, problem: Problem) -> None:
         """Raise if the problem has no horizon or cost, or the optimiser does not support it.
 
@@ -130,7 +124,9 @@ class RecedingHorizon(Controller):
 def _check_states_of_plans(plant: Plant, replanning: Replanning, on_failure: OnFailure) -> None:
     """Raise where a way of replanning, or of failing, needs states that the outputs do not give."""
     reason = ""
-    if plant.outputs and replanning.law is not None:
+    if plant.instant_names:
+        reason = f"{', '.join(plant.instant_names)} depends on the command too (order 0), and plans are for functions of the state"
+    elif plant.outputs and replanning.law is not None:
         reason = f"{type(replanning).__name__} tracks the planned motion of the model's states; use FromMeasurement"
     elif on_failure.uses_feedforward and not known_on_reference(plant):
         reason = f"{type(on_failure).__name__} needs references of states that no output gives; use HoldPlan"

@@ -1,12 +1,21 @@
-"""States along the reference: those that it gives, or of a plant with outputs those of the model's nominal run."""
+"""What a reference asks of the model: outputs and responses, and the states that belong to them."""
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.nominal import known_on_reference
 from fpirhc.horizon.regular_gain import nominal_run
+from fpirhc.plant.instant import nominal_responses
 from fpirhc.task.problem import Problem, nominal_start
+
+
+def nominal_motion(problem: Problem) -> ca.Function:
+    """Return the Function time -> (nominal outputs, nominal responses of the controlled ones)."""
+    t = ca.MX.sym("t")
+    outputs, responses = problem.reference.function(problem.plant)(t)
+    return ca.Function("fpirhc_wanted", [t], [outputs, nominal_responses(problem.plant, outputs, responses)])
 
 
 def reference_states(problem: Problem, count: int) -> np.ndarray:

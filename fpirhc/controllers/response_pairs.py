@@ -35,11 +35,13 @@ class ResponsePairs:
         problem: with the plant that is measured.
         dead_time: that is believed.
         outputs: whether the measured outputs of that instant belong to a pair.
+        age: cycles by which the state is older; a map's response belongs to the state of the cycle before (`response_age`).
     """
 
     problem: Problem
     dead_time: DeadTime
     outputs: bool = False
+    age: int = 0
 
     @property
     def waiting(self) -> bool:
@@ -126,7 +128,7 @@ class ResponsePairs:
 
     @property
     def _states(self) -> Queue:
-        return Queue(self._delay)
+        return Queue(self._delay + self.age)
 
     @property
     def _commands(self) -> Queue:

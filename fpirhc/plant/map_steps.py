@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.plant.integrators import Integrator
+from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 
 
@@ -29,6 +29,11 @@ class MapSteps(Integrator):
         for _ in range(max(1, round(period / plant.sampling))):
             after = plant.next_function(after, u, p, w)
         return ca.Function("fpirhc_map", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
+
+
+def one_step(plant: Plant, period: float) -> ca.Function:
+    """Function (state, input, parameters, forcing) -> state one cycle later: one Runge-Kutta step, or the cycle of a map."""
+    return motion_of(plant, RungeKutta4(), RungeKutta4()).step(plant, period)
 
 
 def motion_of(plant: Plant, integrator: Integrator, usual: Integrator) -> Integrator:

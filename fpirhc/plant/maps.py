@@ -28,6 +28,7 @@ from typing import TypeVar, cast
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import expm
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.real_number import finite_number
@@ -129,6 +130,16 @@ def decay_rates(modes: np.ndarray, cycle: float) -> np.ndarray:
     """
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
+
+
+def response_age(plant: Motion) -> int:
+    """Return how many cycles before a measured response its state was: at one instant, or one step earlier on a map."""
+    return 0 if plant.step is None else 1
+
+
+def step_of(plant: Motion, matrix: np.ndarray, cycle: float) -> np.ndarray:
+    """Return the matrix by which x' = A x moves in one control cycle, or delta x = A x in that of a map."""
+    return np.asarray(expm(matrix * cycle)) if plant.step is None else np.eye(len(matrix)) + plant.sampling * matrix
 
 
 def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:

@@ -72,6 +72,10 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
     command = u[plant.input.elements.index(name)]
     first = [x[plant.state.elements.index(coordinate)]] if coordinate in plant.coordinates else []
     derivatives = first or [output_expression(plant, coordinate, x, u, p)]
+    if ca.jacobian_sparsity(derivatives[0], u).nnz():
+        raise NotInvertible(
+            f"the command moves '{coordinate}' at once (order 0), so a slot has no derivative to prescribe"
+        )
     for order in range(1, plant.state.size + 1):
         derivative = ca.jtimes(derivatives[-1], x, rate)
         if ca.jacobian_sparsity(derivative, command).nnz():

@@ -22,10 +22,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.plant.instant import nominal_responses
+from fpirhc.controllers.reference_states import nominal_motion
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.review.inner import inner_motion, inner_places
-from fpirhc.symbolic.expression import kind
 from fpirhc.task.problem import Problem
 
 _POINTS = 41
@@ -127,7 +126,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     problem = problem.of_model
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _POINTS)
-    nominal = _nominal(problem).map(_POINTS)(times[None, :])
+    nominal = nominal_motion(problem).map(_POINTS)(times[None, :])
     states, responses = (np.asarray(v.full()).T for v in nominal)
     states = np.full((_POINTS, plant.state.size), np.nan) if plant.outputs else states
     ranges = exact_ranges(plant, mismatch)
@@ -141,13 +140,6 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     else:
         states[:, list(inner)] = own
     return ReviewGrid(problem, times, states, responses, rows, inner, mismatch, real, elsewhere)
-
-
-def _nominal(problem: Problem) -> ca.Function:
-    """Function time -> (nominal state or outputs, nominal responses of the controlled ones)."""
-    t = kind(problem.reference.opaque).sym("t")
-    outputs, responses = problem.reference.function(problem.plant)(t)
-    return ca.Function("fpirhc_wanted", [t], [outputs, nominal_responses(problem.plant, outputs, responses)])
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:

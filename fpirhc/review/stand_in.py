@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import Planner
-from fpirhc.controllers.form_check import MAPS
 from fpirhc.controllers.tracked import tracked_blocks
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import NotSupported
@@ -32,11 +31,6 @@ class StandIn(Controller):
 
     tracking: Tracking
     deformation: Deformation
-
-    @property
-    def covers(self) -> frozenset[str]:
-        """Maps: the plan's feedback is that of the map's stages."""
-        return frozenset({MAPS})
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Blocks reference, tracking, deform, invert, limit, judge, tracking update."""

@@ -139,7 +139,7 @@ def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
     Raises:
         InvalidValue: a pole z on or outside the unit circle.
     """
-    if plant.step is None:
+    if plant.step is None or not gains:
         return
     poles = 1 + plant.sampling * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
     if np.abs(poles).max() >= 1:
@@ -164,9 +164,11 @@ def integral_signal(plant: Plant, name: str) -> Signal:
 
 
 def error_chains(plant: Plant, error: Expression) -> list[list[Expression]]:
-    """Per controlled coordinate: [e, e', ...] below its order."""
-    chains = []
-    for k in plant.controlled_indices:
-        name, order = plant.names[k], plant.orders[k]
-        chains.append([error[plant.state.elements.index(name + "'" * s)] for s in range(order)])
-    return chains
+    """Per controlled coordinate: [e, e', ...] below its relative order; nothing for one of order 0."""
+    place = plant.state.elements.index
+    return [[error[place(name + "'" * s)] for s in range(order)] for name, order in plant.response_orders.items()]
+
+
+def own_errors(plant: Plant, error: Expression) -> list[Expression]:
+    """The error e of every controlled coordinate."""
+    return [error[plant.state.elements.index(name)] for name in plant.controlled_names]

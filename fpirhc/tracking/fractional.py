@@ -41,7 +41,16 @@ from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.error import ROOM, Useful, check_modes, error_chains, integral_delay, integral_update, law_signals
+from fpirhc.tracking.error import (
+    ROOM,
+    Useful,
+    check_modes,
+    error_chains,
+    integral_delay,
+    integral_update,
+    law_signals,
+    own_errors,
+)
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default
@@ -152,7 +161,7 @@ class Fractional(Tracking):
             summed = ca.vertcat(*(ca.dot(weights, queue) for queue in queues))
             next_decaying = -(summed + stiffness * first) / (1 + stiffness)
             return {
-                "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
+                "_target_error": ca.vertcat(*own_errors(plant, s._target - s.state)),
                 "desired": s.nominal + drift - (next_decaying - (decaying - first)) / period,
                 "_integral_used": integral,
                 "decay_past_next": ca.vertcat(*queues),
@@ -182,7 +191,7 @@ class Fractional(Tracking):
         """What the integrals may ask for by way of rate S."""
         if not self.largest:
             return []
-        gains = [(*self.gains(plant.orders[k]), 1.0)[:2] for k in plant.controlled_indices]
+        gains = [(*self.gains(order), 1.0, 0.0)[:2] for order in plant.response_orders.values()]
         return [Useful(self.rate * i, self.rate * e, most) for (i, e), most in zip(gains, self.largest, strict=True)]
 
     def _useful_decay(self, measured: Expression, last: Expression) -> Expression:
@@ -202,7 +211,8 @@ class Fractional(Tracking):
         decaying, drift = [], []
         for k, chain in enumerate(errors):
             gains = self.gains(len(chain))
-            decaying.append(chain[-1] + sum(g * e for g, e in zip(gains, [integral[k], *chain], strict=False)))
+            whole = [integral[k], *chain]
+            decaying.append(whole[-1] + sum(g * e for g, e in zip(gains, whole, strict=False)))
             drift.append(sum(g * e for g, e in zip(gains, chain, strict=True)))
         return ca.vertcat(*decaying), ca.vertcat(*drift)
 

@@ -23,6 +23,7 @@ from fpirhc.tracking.error import (
     integral_delay,
     integral_update,
     law_signals,
+    own_errors,
 )
 
 
@@ -59,8 +60,8 @@ class LinearLaw(Tracking):
             InvalidValue: a mode that does not decay, with its pole.
         """
         del period
-        for k in plant.controlled_indices:
-            check_modes(self, plant, self.gains(plant.orders[k]))
+        for order in plant.response_orders.values():
+            check_modes(self, plant, self.gains(order))
 
     def within(self, largest: Sequence[float]) -> Self:
         """Return the law with these largest responses, unless the user has set them."""
@@ -74,17 +75,17 @@ class LinearLaw(Tracking):
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         self.check_cycle(plant, period)
         reads, writes = law_signals(plant)
-        orders = [plant.orders[k] for k in plant.controlled_indices]
+        orders = plant.response_orders.values()
         first_gains = [self.gains(order)[0] for order in orders] if self.integral else []
 
         def step(s: Signals) -> dict[str, Expression]:
-            errors = error_chains(plant, s._target - s.state)
-            first_integral = ca.vertcat(*(self._first_integral(chain) for chain in errors))
+            errors, own = error_chains(plant, s._target - s.state), own_errors(plant, s._target - s.state)
+            first_integral = ca.vertcat(*map(self._first_integral, own, errors))
             integral_before, remembered = bumpless(s, first_gains)
             integral = ca.if_else(s.warm_up > 0.5, integral_before, first_integral)
             feedback = [self._feedback(integral[k], chain) for k, chain in enumerate(errors)]
             return {
-                "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
+                "_target_error": ca.vertcat(*own),
                 "desired": s.nominal + ca.vertcat(*feedback),
                 "_integral_used": integral,
                 **remembered,
@@ -104,15 +105,15 @@ class LinearLaw(Tracking):
         """What the integrals may ask for; nothing where they are not fed back."""
         if not (self.integral and self.largest):
             return []
-        gains = [self.gains(plant.orders[k])[:2] for k in plant.controlled_indices]
+        gains = [(*self.gains(order), 1.0)[:2] for order in plant.response_orders.values()]
         return [Useful(integral, error, most) for (integral, error), most in zip(gains, self.largest, strict=True)]
 
     def _feedback(self, integral: Expression, chain: list[Expression]) -> Expression:
         terms = [integral, *chain] if self.integral else chain
         return total(g * e for g, e in zip(self.gains(len(chain)), terms, strict=True))
 
-    def _first_integral(self, chain: list[Expression]) -> Expression:
+    def _first_integral(self, error: Expression, chain: list[Expression]) -> Expression:
         if not (self.integral and self.bumpless):
-            return chain[0] * 0
+            return error * 0
         first, *others = self.gains(len(chain))
         return -total(g * e for g, e in zip(others, chain, strict=True)) / first

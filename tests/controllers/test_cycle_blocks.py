@@ -237,11 +237,6 @@ class Telling(Controller):
             Response(plant.response_signal("realised"), plant.controlled_response_function) if self.of_its_own else None
         )
 
-    @property
-    def covers(self):
-        """Maps."""
-        return frozenset({"maps"})
-
     def floquet(self, problem) -> Any:
         """Anything."""
         return problem.plant.approximate[0]
@@ -284,7 +279,6 @@ def test_a_wrapper_tells_the_facts_of_what_it_wraps():
     assert outer.learns
     assert (outer.planner, dict(outer.feeds)) == (inner.planner, {"state": "predicted"})
     assert resolved(problem, outer) == fp.ExactModel(Telling(fp.Affine(2.0)))
-    assert outer.covers == {"maps"}
     stability: Any = outer.floquet(problem)
     assert stability == 2.0
     assert outer.notes(problem) == ("mass 2.0",)

@@ -17,7 +17,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import InvalidProblem, NotSupported
+from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.comparison.compare import compare
 
@@ -256,16 +256,58 @@ def test_an_output_of_order_zero_may_be_judged_beside_a_controlled_one() -> None
         simulated(planned, fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-3)))
 
 
+def test_computed_torque_of_order_zero_is_the_cascade() -> None:
+    """A chain of length zero leaves the reference alone, so the model-referenced form is the cascade without a lag."""
+    pure = fp.Exponential(rate=1.0, integral=False)
+    run = simulated(heated(element()), fp.ComputedTorque(pure, fp.ModelReferenced(affine(0.4))))
+    cascade = simulated(heated(element()), fp.Cascade(STATIC, affine(0.4)))
+    assert run["command"] == pytest.approx(cascade["command"], rel=1e-9)
+    plain = simulated(heated(element()), fp.ComputedTorque(pure))
+    assert plain["command"] == pytest.approx(simulated(heated(element()), STATIC)["command"], rel=1e-12)
+
+
+def test_the_integral_of_order_zero_removes_a_constant_error() -> None:
+    """The law is y^N + rate e_int with measured errors: e_{k+1} = e_k - J rate T e_{k-1}."""
+    problem = heated(element(), reference=fp.Trajectory(lambda t: {"power": 200.0 + 0 * t}), start={"theta": 100.0})
+    still = replace(element(), response=lambda x, u, p: {"theta": 0 * u.u}, inverse=element().inverse)
+    problem = replace(problem, plant=still)
+    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.5, bumpless=False)))
+    share = 14.0 / (COLD * (1 + WARMER * 100.0))
+    error = run["error.power"]
+    assert error[3:60] == pytest.approx(error[2:59] - 0.5 * 0.1 * share * error[1:58], abs=1e-9)
+
+
+LAWLESS = fp.Exponential(rate=1.0, integral=False)
+ZERO_RIVALS = {
+    "force MRAC": (fp.ForceMRAC(LAWLESS, affine(0.4), {}), 2.0),
+    "sigmoid": (fp.ComputedTorque(LAWLESS, fp.Sigmoid(gain=-0.5)), 20.0),
+    "fractional": (fp.ComputedTorque(fp.Fractional(rate=1.0, order=0.8, memory=5.0)), 20.0),
+    "PID": (fp.PID(proportional={"power": 0.02}, integral={"power": 0.2}), 10.0),
+}
+
+
+@pytest.mark.parametrize("name", ZERO_RIVALS)
+def test_rivals_control_an_output_of_order_zero(name: str) -> None:
+    """The inverse alone leaves 83 W."""
+    controller, limit = ZERO_RIVALS[name]
+    assert rms(heated(element()), controller) < limit
+
+
 REFUSED: dict[str, tuple[Callable[[], Controller], dict[str, Any], str]] = {
-    "tracking law": (
-        lambda: fp.ComputedTorque(fp.Exponential(rate=1.0)),
+    "surface": (
+        lambda: fp.SlidingMode(rate=1.0, gain=1.0, width=1.0),
         {},
-        r"ComputedTorque .* order 0 \(power\).* FeedforwardOnly",
+        r"the command moves 'power' at once \(order 0\), so there is no surface to slide on",
     ),
-    "inside a cascade": (
-        lambda: fp.Cascade(fp.ComputedTorque(fp.Exponential(rate=1.0)), affine(0.4)),
+    "Lyapunov": (
+        lambda: fp.LyapunovMRAC(rate=1.0, adaptation=1.0),
         {},
-        "Cascade does not cover outputs of order 0",
+        "LyapunovMRAC proves that errors vanish by a derivative .* power is of order 0",
+    ),
+    "slot": (
+        lambda: fp.Slotted([fp.Slot("power", LAWLESS)], fp.Periodic({"power": 1.0}), blend=0.1),
+        {},
+        r"the command moves 'power' at once \(order 0\)",
     ),
     "estimator": (
         lambda: STATIC,
@@ -278,7 +320,7 @@ REFUSED: dict[str, tuple[Callable[[], Controller], dict[str, Any], str]] = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_has_no_meaning_for_order_zero_is_refused(name: str) -> None:
     make, settings, words = REFUSED[name]
-    with pytest.raises(NotSupported, match=words):
+    with pytest.raises(FpirhcError, match=words):
         simulated(heated(element(), **settings), make())
 
 

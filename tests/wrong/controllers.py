@@ -155,6 +155,4 @@ class NamesAnotherLaw(Gentle):
 
 
 class SaysItControlsMaps(Gentle):
-    """Takes differences of steps for derivatives."""
-
-    covers = frozenset({"maps"})
+    """Takes differences of steps for derivatives, and refuses no map."""

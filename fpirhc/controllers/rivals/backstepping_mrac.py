@@ -23,7 +23,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.face import on_face
-from fpirhc.controllers.rivals.reference_model import model_block
+from fpirhc.controllers.rivals.reference_model import decay_gains, model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
@@ -33,7 +33,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import error_chains
+from fpirhc.tracking.error import check_modes, error_chains
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class BacksteppingMRAC(Controller):
     deformation: Deformation
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(k) and k > 0 for k in (self.model_rate, *self.rates)):
+        if not self.rates or not all(math.isfinite(k) and k > 0 for k in (self.model_rate, *self.rates)):
             raise InvalidValue(
                 f"BacksteppingMRAC(model_rate={self.model_rate!r}, rates={self.rates!r}): expected positive numbers, 1/s"
             )
@@ -64,14 +64,15 @@ class BacksteppingMRAC(Controller):
 
         Raises:
             InvalidProblem: all mistakes together.
+            InvalidValue: an error that does not decay in the steps of a map.
         """
-        plant, mistakes = problem.plant.face, Mistakes("BacksteppingMRAC")
-        for k in plant.controlled_indices:
-            if plant.orders[k] != len(self.rates):
-                mistakes.add(
-                    f"'{plant.names[k]}' has relative order {plant.orders[k]}, but rates has {len(self.rates)}"
-                )
+        plant, mistakes = problem.plant, Mistakes("BacksteppingMRAC")
+        for name, order in plant.response_orders.items():
+            if order != len(self.rates):
+                mistakes.add(f"'{name}' has relative order {order}, but rates has {len(self.rates)}")
         mistakes.raise_if_any()
+        for gains in (decay_gains(self.model_rate, len(self.rates)), self.nested()[-1][:-1]):
+            check_modes(self, plant, gains)
 
     def nested(self) -> list[list[float]]:
         """Return the nested errors as sums over (e, e', ..., e^(n)), one per row; the law makes the last row zero."""

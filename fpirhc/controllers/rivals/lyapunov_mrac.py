@@ -35,6 +35,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
 from fpirhc.controllers.face import measured_signals, on_face
+from fpirhc.controllers.form_check import check_derivatives
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -91,8 +92,10 @@ class LyapunovMRAC(Controller):
         """Raise if the proof of the rule does not cover the plant.
 
         Raises:
+            NotSupported: a map, or an output of order 0.
             InvalidProblem: not fully actuated, or the inputs' effect on the response is not of one sign at the start.
         """
+        check_derivatives(problem, "LyapunovMRAC proves that errors vanish by")
         plant, mistakes = problem.plant, Mistakes("LyapunovMRAC")
         followed = plant.face.names
         if len(plant.controlled_names) != len(followed):
@@ -122,7 +125,7 @@ class LyapunovMRAC(Controller):
     def _law_block(self, plant: Plant) -> Block:
         """Block (state, model, reference, gains) -> command, regressor, p z, and the gains in use."""
         face, seen = plant.face, plant.output
-        rows = [self.weights(face.orders[k])[-1] for k in face.controlled_indices]
+        rows = [self.weights(order)[-1] for order in plant.response_orders.values()]
         start, response, rate = _start_gains(plant), plant.controlled_response_function, self.rate
 
         def pull(row: np.ndarray, chain: list[Expression]) -> Expression:

@@ -44,6 +44,7 @@ from fpirhc.tracking.error import (
     integral_delay,
     integral_signal,
     integral_update,
+    own_errors,
 )
 
 
@@ -91,13 +92,12 @@ class PID(Controller):
         mistakes.raise_if_any()
         x, u, p = plant.symbols()
         effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
-        at_start = effect(problem.start_state, [0] * len(plant.inputs), plant.approximate)
-        face = plant.face
-        for k, (name, index) in enumerate(zip(names, face.controlled_indices, strict=True)):
-            gains, order = self.gains(name, face.orders[index]), face.orders[index]
-            if len(gains) > order + 1:
+        at_start = effect(problem.start_state, problem.inputs_before, plant.approximate)
+        for k, (name, order) in enumerate(plant.response_orders.items()):
+            gains = self.gains(name, order)
+            if len(gains) > max(order, 1) + 1:
                 mistakes.add(
-                    f"derivative: '{name}' of relative order {order} has at most {order - 1} gains of e', e'', ..."
+                    f"derivative: '{name}' of relative order {order} has at most {max(order - 1, 0)} gains of e', e'', ..."
                 )
             if not all(finite_number(g) for g in gains):
                 mistakes.add(f"the gains of '{name}' must be finite numbers, got {gains!r}")
@@ -135,12 +135,14 @@ class PID(Controller):
     def _law(self, problem: Problem) -> Block:
         """Block (state, reference, integral, warm_up) -> command, and the model's response to it (for readers of a log)."""
         plant, face, seen = problem.plant, problem.plant.face, problem.plant.output
-        orders = [face.orders[k] for k in face.controlled_indices]
-        gains = [self.gains(n, order) for n, order in zip(plant.controlled_names, orders, strict=True)]
+        gains = [self.gains(name, order) for name, order in plant.response_orders.items()]
         integral_gains = [k[0] for k in gains]
 
         def step(s: Signals) -> dict[str, Expression]:
-            errors = error_chains(face, s.reference - getattr(s, seen.name))
+            away = s.reference - getattr(s, seen.name)
+            own = own_errors(face, away)
+            # An output of order 0 has no chain, but an error.
+            errors = [chain or [e] for chain, e in zip(error_chains(face, away), own, strict=True)]
             direct = [
                 total(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
             ]
@@ -149,7 +151,7 @@ class PID(Controller):
             integral = ca.if_else(s.warm_up > 0.5, integral_before, ca.vertcat(*starts))
             command = ca.vertcat(*(k[0] * integral[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
             return {
-                "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
+                "_target_error": ca.vertcat(*own),
                 "_integral_used": integral,
                 "command_unclipped": command,
                 "_deformed_unclipped": plant.controlled_response_function(s.state, command, s.parameters),

@@ -4,7 +4,8 @@ For a controlled coordinate of relative order n the deviation eps = q^N - y obey
 
     y^(n) = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) (q^N - y)^(s),     y(0) = q(0), y'(0) = q'(0), ...
 
-The deviation follows its exact solution over one period, so the model has no integration error.
+The deviation follows its exact solution over one period, so the model has no integration error. On a map the divided differences
+delta stand in place of d/dt, and all modes of the deviation have the pole z = 1 - rate T.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import expm
 
 from fpirhc.controllers.base import like
+from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Values
 from fpirhc.symbolic.expression import Signals, expression
@@ -44,14 +45,14 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
 
     Coordinates that are not controlled follow the reference.
     """
-    chains = [_chain(plant, k) for k in plant.controlled_indices]
+    chains = [[name + "'" * s for s in range(order)] for name, order in plant.response_orders.items()]
     gains = [decay_gains(rate, len(chain)) for chain in chains]
     ends_of_steps = np.cumsum([0, *(len(g) ** 2 for g in gains)]).tolist()
 
     def steps_at(values: Values) -> np.ndarray:
         orders = [len(chain) for chain in chains]
         own = (decay_gains(settled(rate, values), order) for order in orders)
-        return np.concatenate([expm(companion(g) * period).ravel(order="F") for g in own])
+        return np.concatenate([step_of(plant, companion(g), period).ravel(order="F") for g in own])
 
     live = following("model_steps", live_numbers(rate), steps_at)
     fixed = steps_at({}) if live is None else np.zeros(0)
@@ -84,8 +85,3 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
     writes = (like(plant.state, "model"), plant.response_signal("nominal"))
     block = Block("reference_model", Layout(reads), Layout(writes), step, memory)
     return block if live is None else replace(block, reads=block.reads + Layout((live.signal,)), derived=live.derived)
-
-
-def _chain(plant: Plant, index: int) -> list[str]:
-    """Names of a coordinate and its derivatives in the state."""
-    return [plant.names[index] + "'" * s for s in range(plant.orders[index])]

@@ -34,6 +34,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block, like, reference_block
 from fpirhc.controllers.face import on_face
+from fpirhc.controllers.form_check import check_derivatives
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.deformation.base import Deformation
@@ -74,6 +75,14 @@ class ResolvedAccelerationRate(Controller):
     def gains(self, degree: int) -> tuple[float, ...]:
         """Return the coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""
         return decay_gains(self.rate, degree)
+
+    def check(self, problem: Problem) -> None:
+        """Raise for a map, or an output of order 0.
+
+        Raises:
+            NotSupported: the response has no derivative.
+        """
+        check_derivatives(problem, "ResolvedAccelerationRate prescribes")
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, rate, increment, invert, limit, judge, running."""

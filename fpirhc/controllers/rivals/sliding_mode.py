@@ -24,6 +24,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
 from fpirhc.controllers.face import on_face
+from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue, Mistakes
@@ -34,7 +35,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import error_chains
+from fpirhc.tracking.error import check_modes, error_chains
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,8 @@ class SlidingMode(Controller):
         """Raise if the loop chatters even with an exact model.
 
         Raises:
-            InvalidProblem: K period / w is 2 or more.
+            InvalidProblem: K period / w is 2 or more; an output of order 0, which has no surface.
+            InvalidValue: an error on the surface that does not decay in the steps of a map.
         """
         mistakes, product = Mistakes("SlidingMode"), self.gain * problem.period / self.width
         if product >= 2:
@@ -78,7 +80,14 @@ class SlidingMode(Controller):
                 f"take a width above {0.5 * self.gain * problem.period:.3g} "
                 f"or a gain below {2 * self.width / problem.period:.3g}"
             )
+        for name, order in problem.plant.response_orders.items():
+            if not order:
+                mistakes.add(
+                    f"the command moves '{name}' at once (order 0), so there is no surface to slide on; use ComputedTorque"
+                )
         mistakes.raise_if_any()
+        for order in problem.plant.response_orders.values():
+            check_modes(self, problem.plant, decay_gains(self.rate, order - 1))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, surface, deform, invert, limit, judge, running."""
@@ -94,7 +103,7 @@ class SlidingMode(Controller):
 
     def _surface_block(self, plant: Plant) -> Block:
         """Block (state, reference, nominal) -> (S, desired)."""
-        units = [f"{plant.response_units[k]} {plant.time_unit}" for k in plant.controlled_indices]
+        units = [f"{unit} {plant.time_unit}" for unit in plant.response_signal("desired").units]
 
         def step(s: Signals) -> dict[str, Expression]:
             surfaces, drifts = [], []

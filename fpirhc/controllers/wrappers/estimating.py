@@ -17,12 +17,12 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, command_before, compose_controller, embedded, like
 from fpirhc.controllers.contract import Planner, with_setting
-from fpirhc.controllers.form_check import MAPS
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import Estimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
+from fpirhc.plant.maps import response_age
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.gap import GAP
@@ -83,11 +83,6 @@ class Estimating(Controller):
         planner, at_once = self.controller.planner, self.at_once or self.estimator.acts_at_once
         return replace(planner, follows_model=True) if planner is not None and at_once else planner
 
-    @property
-    def covers(self) -> frozenset[str]:
-        """No maps: the estimators add what they learn to derivatives."""
-        return self.controller.covers - {MAPS}
-
     def check(self, problem: Problem) -> None:
         """Raise if the estimator or the wrapped controller does not fit the problem.
 
@@ -118,7 +113,8 @@ class Estimating(Controller):
         controller = following or self.controller
         inner = compose_controller(modelled, controller)
         outputs = self.estimator.reads_outputs(modelled.plant)
-        pairs = ResponsePairs(problem, self.dead_time or problem.dead_time, outputs)
+        age = response_age(problem.plant) if self.estimator.reads_response(modelled.plant) else 0
+        pairs = ResponsePairs(problem, self.dead_time or problem.dead_time, outputs, age)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
         acted = replace(command_before(problem), name="_acted")
         blocks = [

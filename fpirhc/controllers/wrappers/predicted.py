@@ -35,8 +35,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
-from fpirhc.plant.integrators import RungeKutta4
-from fpirhc.plant.map_steps import motion_of
+from fpirhc.plant.map_steps import one_step
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
@@ -109,7 +108,7 @@ class ByModel(Predictor):
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
         """Return one Runge-Kutta step of the model, or one cycle of a map, as a Function."""
-        step = motion_of(plant, RungeKutta4(), RungeKutta4()).step(plant, period)
+        step = one_step(plant, period)
         x, u, p = plant.symbols()
         w = ca.SX.sym("w", len(plant.names))
         return ca.Function("fpirhc_predict", [x, u, p, w], [step(x, u, p, w)])

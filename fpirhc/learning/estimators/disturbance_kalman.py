@@ -32,7 +32,8 @@ from fpirhc.errors import InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, Estimator, Seen, Wait
 from fpirhc.learning.estimators.disturbed import disturbance_name, disturbed
-from fpirhc.plant.integrators import RungeKutta4
+from fpirhc.plant.map_steps import one_step
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import quantities, response_names
 from fpirhc.symbolic.expression import expression
@@ -108,7 +109,7 @@ class DisturbanceKalman(Estimator):
         mistakes.unknown(f"measured: {what}", self.measured, quantities(plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
         mistakes.raise_if_any()
-        late = problem.sensing.delay(plant.face, problem.period)
+        late = problem.sensing.delay(plant.face, problem.period) + response_age(plant)
         if self._responses(plant) and late > 0:
             raise NotSupported(
                 f"DisturbanceKalman: {', '.join(self._responses(plant))} is estimated {late:.4g} cycles late, and the filter needs "
@@ -172,7 +173,7 @@ class DisturbanceKalman(Estimator):
     def step(self, problem: Problem) -> Correct:
         """Prediction by the model, and the correction by the gain."""
         model = problem.plant
-        advance, no_forcing = RungeKutta4().step(model, problem.period), ca.DM.zeros(len(model.names))
+        advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
         fixed = None if is_live(self) else ca.DM(self.gain(problem))
         shown = self._shown_function(model)
         places = [model.parameter.elements.index(n) for n in self.learned()]
@@ -195,7 +196,7 @@ class DisturbanceKalman(Estimator):
     def waiting(self, problem: Problem) -> Wait:
         """Prediction by the model alone; the disturbances stay."""
         model = problem.plant
-        advance, no_forcing = RungeKutta4().step(model, problem.period), ca.DM.zeros(len(model.names))
+        advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
         places = [model.parameter.elements.index(n) for n in self.learned()]
 
         def wait(
@@ -239,7 +240,7 @@ class DisturbanceKalman(Estimator):
         model = problem.plant
         x, u, p = model.symbols()
         w = ca.SX.sym("w", len(model.names))
-        x_next = RungeKutta4().step(model, problem.period)(x, u, p, w)
+        x_next = one_step(model, problem.period)(x, u, p, w)
         function = ca.Function("fpirhc_linear", [x, u, p, w], [ca.jacobian(x_next, x), ca.jacobian(x_next, w)])
         a, b = (np.asarray(m.full()) for m in function(*_operating_point(problem), np.zeros(len(model.names))))
         effects = dict(zip(model.names, b.T, strict=True))  # that of an output is on what is measured alone

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
-from fpirhc.controllers.form_check import MAPS, ORDER_ZERO
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError
@@ -50,11 +49,6 @@ class _HeldInput(Controller):
     def deformation(self) -> Deformation:
         """Identity(): no request is iterated."""
         return Identity()
-
-    @property
-    def covers(self) -> frozenset[str]:
-        """Everything: it follows nothing."""
-        return frozenset({MAPS, ORDER_ZERO})
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, hold, limit, judge, running."""
