@@ -1,0 +1,110 @@
+"""A body that MuJoCo moves, from its MJCF file, as the reality of a problem.
+
+    problem = fp.Problem(plant=model, reality=mujoco_body("arm.xml", model, period=2e-3), ...)
+
+Positions, velocities and accelerations are those of the joints at the end of the cycle, under the command of the cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fpirhc.adapters.names import base_and_order, counterparts, package, steps_per_cycle
+from fpirhc.errors import Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.task.foreign import Foreign, quantities
+
+
+def mujoco_body(
+    mjcf: str | Path,
+    model: Plant,
+    *,
+    period: float,
+    joints: Mapping[str, str] | None = None,
+    actuators: Mapping[str, str] | None = None,
+    start: Mapping[str, float] | None = None,
+) -> Foreign:
+    """Return a body of MuJoCo as a reality.
+
+    Args:
+        mjcf: path of an MJCF or URDF file, or its text, which begins with "<".
+        model: the controller's model, with hinges in rad and slides in m.
+        period: of the problem, s; a whole number of the body's time steps.
+        joints: coordinate -> joint of one degree of freedom, where the names differ.
+        actuators: input -> actuator, where the names differ.
+        start: position or velocity at the start, "q1" or "q1'", where it is not that of the file.
+
+    Raises:
+        NotSupported: MuJoCo is not installed.
+        InvalidProblem: a name that the body or the model does not have, or a period that is no whole number of time steps.
+    """
+    mujoco = package("mujoco")
+    body = (
+        mujoco.MjModel.from_xml_string(mjcf)
+        if str(mjcf).lstrip().startswith("<")
+        else mujoco.MjModel.from_xml_path(str(mjcf))
+    )
+    units, mistakes = quantities(model), Mistakes("mujoco_body")
+    free = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+    scalar = [joint for joint in map(body.joint, range(body.njnt)) if int(joint.type[0]) in free]
+    of_joint = {j.name: (j.qposadr[0], j.dofadr[0], j.dofadr[0]) for j in scalar}
+    joint = counterparts(mistakes, "joint", dict.fromkeys(base_and_order(q)[0] for q in units), joints or {}, of_joint)
+    actuator = counterparts(
+        mistakes, "actuator", model.inputs, actuators or {}, (body.actuator(k).name for k in range(body.nu))
+    )
+    mistakes.unknown("start: quantity", start or {}, [q for q in units if base_and_order(q)[1] < 2])
+    mistakes.raise_if_any()
+    count = steps_per_cycle("mujoco_body", period, body.opt.timestep)
+    places = {q: (order, of_joint[joint[name]][order]) for q, (name, order) in ((q, base_and_order(q)) for q in units)}
+    motors = [body.actuator(name).id for name in actuator.values()]
+    return Foreign(_Body(mujoco, body, count, motors, places, start or {}), measures=units)
+
+
+class _Body:
+    """Joints and motors at their places in MuJoCo's vectors.
+
+    Args:
+        mujoco: the package.
+        model: MuJoCo's model.
+        steps: in a cycle.
+        motors: place of every input.
+        places: quantity -> (order of the derivative, place).
+        start: quantity -> value.
+    """
+
+    def __init__(
+        self,
+        mujoco: Any,
+        model: Any,
+        steps: int,
+        motors: list[int],
+        places: Mapping[str, tuple[int, int]],
+        start: Mapping[str, float],
+    ) -> None:
+        self._mujoco, self._model, self._data = mujoco, model, mujoco.MjData(model)
+        self._steps, self._motors, self._places, self._start = steps, motors, places, start
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Go to the start; there is nothing random."""
+        del seed
+        self._mujoco.mj_resetData(self._model, self._data)
+        for quantity, value in self._start.items():
+            order, place = self._places[quantity]
+            (self._data.qpos, self._data.qvel)[order][place] = value
+        return self._measured()
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Hold the command for a cycle."""
+        del time
+        self._data.ctrl[self._motors] = command
+        self._mujoco.mj_step(self._model, self._data, self._steps)
+        return self._measured()
+
+    def _measured(self) -> np.ndarray:
+        self._mujoco.mj_forward(self._model, self._data)
+        d = self._data
+        return np.array([(d.qpos, d.qvel, d.qacc)[order][place] for order, place in self._places.values()])

@@ -1,0 +1,113 @@
+"""The Temperature Control Lab as the reality of a problem: its digital twin, or the board.
+
+    problem = fp.Problem(plant=model, reality=tclab_body(model, period=2.0), ...)             the twin, in simulated time
+    problem = fp.Problem(plant=model, reality=tclab_body(model, period=2.0, board=True), ...)
+
+Measured are the temperatures T1 and T2, degC, with noise and the steps of the converter; inputs are the heaters Q1 and Q2, %.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import random
+import time as wall
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from fpirhc.adapters.names import package
+from fpirhc.errors import Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.task.foreign import Foreign
+
+_SENSORS, _HEATERS = ("T1", "T2"), ("Q1", "Q2")
+
+
+def tclab_body(
+    model: Plant,
+    *,
+    period: float,
+    board: bool = False,
+    clock: Callable[[], float] = wall.monotonic,
+    sleep: Callable[[float], None] = wall.sleep,
+) -> Foreign:
+    """Return the lab as a reality.
+
+    Args:
+        model: the controller's model; its states or outputs are named T1 and T2, its inputs Q1 and Q2, one or both.
+        period: of the problem, s.
+        board: whether it is the board, in real time; False: its digital twin.
+        clock: function that returns the wall time, s; the board alone needs it.
+        sleep: function that waits for some seconds; the board alone needs it.
+
+    Raises:
+        NotSupported: tclab is not installed.
+        InvalidProblem: the model has other names.
+    """
+    tclab, mistakes = package("tclab"), Mistakes("tclab_body")
+    mistakes.unknown("measured", model.output.elements, _SENSORS)
+    mistakes.unknown("input", model.inputs, _HEATERS)
+    mistakes.raise_if_any()
+    body = _Board(tclab, model, period, clock, sleep) if board else _Twin(tclab, model, period)
+    return Foreign(body, measures=dict.fromkeys(model.output.elements, "degC"))
+
+
+class _Twin:
+    """The package's own model of the lab, led by simulated time.
+
+    Args:
+        tclab: the package.
+        model: whose names are measured and sent.
+        period: of a cycle, s.
+    """
+
+    def __init__(self, tclab: Any, model: Plant, period: float) -> None:
+        self._tclab, self._model, self._period = tclab, model, period
+        self._lab: Any = None
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Begin at the temperature of the room; the noise of the sensors has this seed."""
+        random.seed(seed)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._lab = self._begun()
+        return self._measured()
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Hold the heaters for a cycle."""
+        for name, value in zip(self._model.inputs, command, strict=True):
+            getattr(self._lab, name)(float(value))
+        self._wait(time + self._period)
+        return self._measured()
+
+    def _begun(self) -> Any:
+        lab = self._tclab.tclab.TCLabModel(synced=False)
+        lab.tstart = lab.tlast = 0.0
+        return lab
+
+    def _wait(self, time: float) -> None:
+        self._lab.update(time)
+
+    def _measured(self) -> np.ndarray:
+        return np.array([getattr(self._lab, name) for name in self._model.output.elements])
+
+
+class _Board(_Twin):
+    """The board: the next cycle begins when it is time."""
+
+    def __init__(
+        self, tclab: Any, model: Plant, period: float, clock: Callable[[], float], sleep: Callable[[float], None]
+    ) -> None:
+        super().__init__(tclab, model, period)
+        self._clock, self._sleep = clock, sleep
+
+    def _begun(self) -> Any:
+        if self._lab is not None:
+            self._lab.close()
+        lab = self._tclab.TCLab()
+        self._begin = self._clock()
+        return lab
+
+    def _wait(self, time: float) -> None:
+        self._sleep(max(self._begin + time - self._clock(), 0.0))

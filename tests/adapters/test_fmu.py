@@ -1,0 +1,96 @@
+"""A functional mock-up unit, built here from a Python class, behind a model of the same tank."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.adapters.fmu import fmu_body
+from fpirhc.errors import InvalidProblem
+
+pytest.importorskip("fmpy", reason="it needs the extra fpirhc[outside]")
+builder = pytest.importorskip("pythonfmu.builder", reason="it needs the extra fpirhc[outside]")
+
+CODE = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
+
+
+class Tank(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.inflow, self.level, self.outlet = 0.0, 1.0, 0.5
+        self.register_variable(Real("inflow", causality=Fmi2Causality.input))
+        self.register_variable(Real("level", causality=Fmi2Causality.output))
+        self.register_variable(Real("outlet", causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed))
+
+    def do_step(self, time, step):
+        for _ in range(100):
+            self.level += step / 100 * (self.inflow - self.outlet * self.level**0.5)
+        return True
+"""
+TANK = fp.Plant(
+    {"h": "m"},
+    {"q": "m/s"},
+    {"outlet": fp.Parameter(approximate=0.5, exact=0.5, unit="m^0.5/s")},
+    lambda q, u, p: {"h": u.q - p.outlet * q.h**0.5},
+    order=1,
+)
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fmu")
+    (folder / "tank.py").write_text(CODE)
+    return builder.FmuBuilder.build_FMU(folder / "tank.py", dest=folder)
+
+
+def problem(reality: fp.Foreign | None) -> fp.Problem:
+    return fp.Problem(
+        plant=TANK,
+        reality=reality,
+        sensing=fp.Sensing(estimator=fp.PositionDifference()),
+        reference=fp.Trajectory(lambda t: {"h": 1.0 + 0.2 * t}),
+        start={"h": 1.0},
+        period=0.05,
+        duration=2.0,
+        measure_from=1.0,
+    )
+
+
+def test_the_unit_moves_as_the_same_equation_does(unit):
+    law = fp.ComputedTorque(fp.Exponential(rate=2.0))
+    outside = fmu_body(unit, TANK, period=0.05, measures={"h": "level"}, inputs={"q": "inflow"})
+    one, other = (fp.simulate(problem(reality), law, seed=0, compiled=False) for reality in (outside, None))
+    assert one.stop is None
+    assert one["foreign"][:, 0] == pytest.approx(
+        other["plant_state"][:, 0], abs=2e-4
+    )  # Euler's method of 100 steps a cycle
+
+
+def test_a_parameter_is_set_and_a_run_begins_anew(unit):
+    outside = fmu_body(
+        unit, TANK, period=0.05, measures={"h": "level"}, inputs={"q": "inflow"}, parameters={"outlet": 0.8}
+    )
+    answers = []
+    for _ in range(2):
+        outside.body.reset(0)
+        answers.append(outside.body.step(0.0, np.array([0.8])))
+    assert answers == [pytest.approx([1.0]), pytest.approx([1.0])]
+    outside.body.reset(0)
+    assert float(np.ravel(outside.body.step(0.0, np.array([0.5])))[0]) < 0.99
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"measures": {"h": "leve"}}, "variable 'leve' is unknown. Did you mean 'level'?"),
+        ({"measures": {"hh": "level"}}, "measures: quantity 'hh' is unknown. Did you mean 'h'?"),
+        ({"inputs": {}}, "input 'q' is unknown."),
+        ({"parameters": {"inlet": 1.0}}, "parameters: variable 'inlet' is unknown. Did you mean 'outlet'?"),
+    ],
+)
+def test_mistakes_are_named(unit, arguments, message):
+    with pytest.raises(InvalidProblem) as caught:
+        fmu_body(unit, TANK, **{"period": 0.05, "measures": {"h": "level"}, "inputs": {"q": "inflow"}, **arguments})
+    assert message in str(caught.value)
