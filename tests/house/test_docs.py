@@ -16,6 +16,7 @@ from fpirhc.members import FAMILIES, member_classes
 from fpirhc.simulation.loop import close_loop
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
+NEEDED = {"simulators": ("tclab",)}  # page -> packages of an extra
 PAGES = sorted(p for p in DOCS.rglob("*.md") if "_build" not in p.parts)
 
 
@@ -26,6 +27,8 @@ def blocks(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=lambda p: p.stem)
 def test_code_runs(page, tmp_path, monkeypatch):
     """The blocks of a page, one after the other, as a reader would paste them."""
+    for package in NEEDED.get(page.stem, ()):
+        pytest.importorskip(package, reason="it needs the extra fpirhc[outside]")
     monkeypatch.chdir(tmp_path)
     exec(compile("\n".join(blocks(page)), str(page), "exec"), {"__name__": "__main__"})
 
