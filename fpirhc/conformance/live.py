@@ -59,7 +59,8 @@ def check_live(
     short = replace(problem, duration=cycles * problem.period, measure_from=0.0)
     plain = simulator(short, controller, compiled=compiled).run(seed=0)
     tested = list(number_paths(problem, controller)) if paths is None else paths
-    return tuple(_tried(short, controller, path, plain.log, compiled) for path in tested)
+    together = _together(short, controller, tested, plain.log, compiled)
+    return together or tuple(_tried(short, controller, path, plain.log, compiled) for path in tested)
 
 
 def number_paths(problem: Problem, controller: Controller) -> Iterator[str]:
@@ -76,6 +77,50 @@ def _paths(value: Any, start: str) -> Iterator[str]:
         if isinstance(content, int | float) and not isinstance(content, bool):
             yield f"{start}{name}"
         yield from _paths(content, f"{start}{name}.")
+
+
+def _together(
+    problem: Problem, controller: Controller, paths: Sequence[str], plain: np.ndarray, compiled: bool
+) -> tuple[Tried, ...] | None:
+    """Change all numbers at once: two loops for all of them; None where each is to be tried alone, to find the lost one."""
+    tried: dict[str, Tried] = {}
+    ready = None
+    while ready is None and len(tried) < len(paths):
+        try:
+            ready = simulator(problem, controller, compiled=compiled, live=[p for p in paths if p not in tried])
+        except CompileError:
+            raise
+        except FpirhcError as error:
+            named = [p for p in paths if p not in tried and f"'{p}'" in str(error)]
+            if not named:
+                return None
+            tried |= {path: _tried(problem, controller, path, plain, compiled) for path in named}
+    if ready is None:
+        return tuple(tried[path] for path in paths)
+    changes: dict[str, float] = {}
+    for path in (p for p in paths if p not in tried):
+        factor = next((f for f in _FACTORS if _accepted(ready, {**changes, path: f * ready.live.start[path]})), None)
+        if factor is None:
+            tried[path] = _tried(problem, controller, path, plain, compiled)
+        else:
+            tried[path] = Tried(path, factor=factor)
+            changes[path] = factor * ready.live.start[path]
+    try:
+        changed_problem, changed_controller, _ = ready.live.changed(changes)
+        rebuilt = simulator(changed_problem, changed_controller, compiled=compiled).run(seed=0)
+        pairs = ((ready.run(seed=0).log, plain), (ready.run(seed=0, settings=changes).log, rebuilt.log))
+    except FpirhcError:
+        return None
+    alike = all(np.array_equal(one, other, equal_nan=True) for one, other in pairs)
+    return tuple(tried[path] for path in paths) if alike else None
+
+
+def _accepted(ready: Simulator, changes: dict[str, float]) -> bool:
+    try:
+        ready.live.changed(changes)
+    except FpirhcError:
+        return False
+    return True
 
 
 def _tried(problem: Problem, controller: Controller, path: str, plain: np.ndarray, compiled: bool) -> Tried:
