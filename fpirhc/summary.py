@@ -1,4 +1,4 @@
-"""Short forms of results: one line for a terminal, a small table for a notebook.
+"""Short forms of results: one line for a terminal, a small table for a notebook, numbers as people write them.
 
 Names and reasons come from a user's files, so all of them are escaped for the place where they appear.
 """
@@ -7,8 +7,85 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 _LEAST_SHARE = 1e-5
+_LONGEST = 1e6  # from which a number is written with a power of ten
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table.
+
+    Args:
+        head: its heading.
+        short: its heading where there is little room; '': the same one; None: the column is not there.
+        left: whether its texts stand on the left.
+    """
+
+    head: str
+    short: str | None = ""
+    left: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a table.
+
+    Args:
+        cells: a text for every column; '' where there is none.
+        style: of a terminal.
+        best: places of the columns in which it is the best.
+    """
+
+    cells: Sequence[str]
+    style: str = ""
+    best: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts, which pages, terminals and notebooks lay out, each in its way.
+
+    Args:
+        title: above the table.
+        columns: its columns; the first `names` of them name the rows.
+        caption: below the table.
+        names: number of columns that name a row.
+        rows: its rows.
+    """
+
+    title: str
+    columns: Sequence[Column]
+    caption: str = ""
+    names: int = 1
+    rows: list[Row] = field(default_factory=list)
+
+    def add(self, cells: Sequence[str], style: str = "", best: Iterable[int] = ()) -> None:
+        """Add a row with a text for every column."""
+        self.rows.append(Row(cells, style, frozenset(best)))
+
+    @property
+    def filled(self) -> Table:
+        """The table without columns in which no row has a text."""
+        return self._of([k for k, _ in enumerate(self.columns) if k < self.names or any(r.cells[k] for r in self.rows)])
+
+    @property
+    def narrow(self) -> Table:
+        """The table where there is little room: fewer columns, with their short headings."""
+        fewer = self._of([k for k, one in enumerate(self.columns) if one.short is not None])
+        return replace(fewer, columns=[replace(c, head=c.short or c.head) for c in fewer.columns])
+
+    def html(self, notes: Iterable[str] = ()) -> str:
+        """Return the table for a notebook."""
+        return table(self.title, [c.head for c in self.columns], [row.cells for row in self.rows], notes)
+
+    def _of(self, places: Sequence[int]) -> Table:
+        rows = [
+            Row([r.cells[k] for k in places], r.style, frozenset(at for at, k in enumerate(places) if k in r.best))
+            for r in self.rows
+        ]
+        return replace(self, columns=[self.columns[k] for k in places], rows=rows)
 
 
 def line(value: object, *facts: str) -> str:
@@ -42,9 +119,13 @@ def in_percent(share: float) -> str:
     return "below 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{100 * share:.3g} %"
 
 
-def written_out(value: float, digits: int) -> str:
-    """Return a number in so many digits and without a power of ten, its thousands apart: 245 000."""
-    return f"{float(f'{value:.{digits}g}'):,.15g}".replace(",", " ") if abs(value) >= 1 else f"{value:.{digits}g}"
+def written_out(value: float, digits: int = 3) -> str:
+    """Return a number in so many digits as people write it: 4 050 and 245 000, and beyond a million and below 1e-4 4.6e9, 2e-7."""
+    text = f"{value:.{digits}g}"
+    if not 1 <= abs(value) < _LONGEST:
+        mantissa, e, power = text.partition("e")
+        return f"{mantissa}e{int(power)}" if e else text
+    return f"{float(text):,.15g}".replace(",", " ")
 
 
 def _escaped(text: str) -> str:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from rich.console import Console
+from functools import partial
 
 from fpirhc.baselines.bands import FACTOR, Metric
 from fpirhc.baselines.baseline import Baseline
 from fpirhc.baselines.outline import Folded, Outline
 from fpirhc.baselines.words import HEADS, clean, number
-from fpirhc.report.folding import Column, Folding
+from fpirhc.report.terminal import say, show_table
+from fpirhc.summary import Column, Table
 
 _NAMED = 3  # consequences of a setting that are named
 _MOSTLY = 0.9  # share of a band; its digits are rounded
+_say = partial(say, wrap=False)
 _STYLES = {"holds": "", "better": "bold green", "worse": "bold red"}
 
 
@@ -22,24 +24,23 @@ def show_check(outline: Outline, every: bool) -> None:
         outline: the check.
         every: whether to print every metric, and not only those that changed and the rms errors.
     """
-    console = Console()
     for section in outline.sections:
         for cause in section.causes:
-            _say(console, f"{section.problem}: {cause.text}")
+            _say(f"{section.problem}: {cause.text}")
             if cause.lines and not every:
-                _say(console, f"  {_consequences(cause)}")
+                _say(f"  {_consequences(cause)}")
         lines = section.by_size if not every else sorted(section.lines, key=lambda line: -line.size)
         shown = [line for line in lines if every or line.in_summary]
         if shown:
-            table = Folding(section.problem, [Column(head, head == "verdict") for head in HEADS], names=2)
+            table = Table(section.problem, [Column(head, left=head == "verdict") for head in HEADS], names=2)
             for line in shown:
                 table.add(line.cells, _STYLES.get(line.verdict, "bold yellow"))
-            table.show(console)
-        _say(console, section.headline)
+            show_table(table)
+        _say(section.headline)
         for text in section.remarks:
-            _say(console, f"  {text}")
+            _say(f"  {text}")
     for name, reason in outline.unchecked:
-        _say(console, f"{name}: not checked ({reason})")
+        _say(f"{name}: not checked ({reason})")
 
 
 def _consequences(cause: Folded) -> str:
@@ -51,9 +52,8 @@ def _consequences(cause: Folded) -> str:
 
 def show_baseline(baseline: Baseline, path: str) -> None:
     """Print the metrics of an accepted baseline with their bands; only rms errors and metrics with loose bands."""
-    console = Console()
     heads = ("controller", "metric", "value", "band", "made of")
-    table = Folding(f"{clean(baseline.problem)}, baseline", [Column(head, left=True) for head in heads], names=2)
+    table = Table(f"{clean(baseline.problem)}, baseline", [Column(head, left=True) for head in heads], names=2)
     loose = []
     for name, one in baseline.controllers.items():
         if not one.metrics:
@@ -65,11 +65,11 @@ def show_baseline(baseline: Baseline, path: str) -> None:
                 band = f"\u00b1 {value.band:.2g}"
                 table.add([clean(name), clean(metric), number(value.value), band, _source(value)])
         for metric, why in one.not_compared.items():
-            _say(console, f"not compared: {clean(name)}, {clean(metric)} ({clean(why)})")
-    table.show(console)
+            _say(f"not compared: {clean(name)}, {clean(metric)} ({clean(why)})")
+    show_table(table)
     if loose:
-        _say(console, f"{len(loose)} bands are wider than half their value, so that most changes stay inside")
-    _say(console, f"wrote {clean(path)}")
+        _say(f"{len(loose)} bands are wider than half their value, so that most changes stay inside")
+    _say(f"wrote {clean(path)}")
 
 
 def _source(metric: Metric) -> str:
@@ -77,7 +77,3 @@ def _source(metric: Metric) -> str:
     if FACTOR * metric.widest < _MOSTLY * metric.band:
         return "least width"
     return max(metric.spread, key=lambda s: metric.spread[s])
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, markup=False, highlight=False, soft_wrap=True)

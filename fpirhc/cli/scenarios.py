@@ -69,7 +69,10 @@ def run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import save_figure
     from fpirhc.report.page import write_page
-    from fpirhc.report.scenarios import mismatch_figure, scenarios_json, show_scenarios, write_scenarios
+    from fpirhc.report.scenarios import mismatch_figure, write_scenarios
+    from fpirhc.report.terminal import show
+    from fpirhc.studies.scenarios.scenario_view import scenario_view
+    from fpirhc.studies.view import to_json
 
     task = load_problem(options.problem)
     kind = "tuned_scenarios" if options.tuned else "scenarios"
@@ -78,13 +81,14 @@ def run(options: argparse.Namespace) -> ExitCode:
     comparison = _compared(options, task, folder)
     report = folder / "report.html"
     write_scenarios(comparison, report)
-    write_page(f"{scenarios_json(comparison)}\n", folder / RESULTS)
+    view = scenario_view(comparison)
+    write_page(f"{to_json(view.facts)}\n", folder / RESULTS)
     if comparison.summaries:
         save_figure(mismatch_figure(comparison), folder / "mismatch.png")
     if options.json:
-        print(scenarios_json(comparison))
+        print(to_json(view.facts))
     else:
-        show_scenarios(comparison, report)
+        show(view, report)
     return ExitCode.FINISHED if comparison.summaries else ExitCode.BAD_INPUT
 
 

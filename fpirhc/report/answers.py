@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.text import Text
+
+from fpirhc.report.terminal import say
+from fpirhc.studies.view import to_json
 
 if TYPE_CHECKING:
     from fpirhc.review.answer import Answer, Review
@@ -19,17 +20,17 @@ _COLOURS = {"yes": "green", "no": "red", "unknown": "yellow"}
 def show_review(title: str, review: Review) -> None:
     """Print what to do about every no, then every answer under its controller, and the number of answers of each kind."""
     console = Console()
-    console.print(title, style="bold", markup=False, highlight=False)
+    say(title, "bold")
     for about, answer in review.to_do:
         head = Text(f"  no      {about}: {answer.question}", _COLOURS["no"])
         console.print(head + Text(f" -> {answer.advice}", "default"), highlight=False, soft_wrap=True)
     if review.to_do:
-        console.print("\nproblem", style="bold", markup=False, highlight=False)
+        say("\nproblem", "bold")
     _show(console, review.problem)
     for name, answers in review.controllers.items():
-        console.print(f"\n{name}", style="bold", markup=False, highlight=False)
+        say(f"\n{name}", "bold")
         _show(console, answers)
-    console.print(f"\n{_summary(review)}", markup=False, highlight=False)
+    say(f"\n{_summary(review)}")
 
 
 def review_to_json(name: str, review: Review) -> str:
@@ -42,7 +43,7 @@ def review_to_json(name: str, review: Review) -> str:
         "answers": [_facts(a) for a in review.problem],
         "controllers": {c: [_facts(a) for a in answers] for c, answers in review.controllers.items()},
     }
-    return json.dumps(facts, indent=2)
+    return to_json(facts)
 
 
 def _show(console: Console, answers: Iterable[Answer]) -> None:
@@ -64,5 +65,5 @@ def _facts(answer: Answer) -> dict[str, Any]:
         "verdict": str(answer.verdict),
         "evidence": answer.evidence,
         "change": answer.change,
-        "numbers": {name: v if math.isfinite(v) else None for name, v in answer.numbers.items()},
+        "numbers": answer.numbers,
     }

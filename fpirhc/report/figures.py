@@ -29,13 +29,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from fpirhc.contraction.gains import ContractionReport
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.compare import Comparison
-    from fpirhc.studies.comparison.entry import Entry
+    from fpirhc.studies.comparison.entry import Contraction, Entry
     from fpirhc.studies.open_loop import Solved
     from fpirhc.task.problem import Problem
 
     Draw: TypeAlias = Callable[[Axes, Run, Sequence[str]], None]
+
+_WIDE = 16.5  # inches, of a picture as wide as the page
+_CYCLES = 150  # of the decay of a response error
+_BEYOND = 1.2  # of the linear limit, up to which the factor is drawn
+_REFERENCES = ("#111111", "#777777", "#aaaaaa")  # colours of references, which lie on what follows them
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -87,6 +93,7 @@ def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
         groups = by_unit(plain.run, signal, names)
         for unit, same in groups.items():
             name = title if len(groups) == 1 else f"{title} [{unit}]"
+            same = same[:1] if draw is _draw_responses else same  # four lines each
             figures[name] = _pair(draw, quantity_label(plain.run, signal, same), same, (plain, adaptive))
     return figures
 
@@ -101,7 +108,7 @@ def _pictures(run: Run) -> list[tuple[str, Draw, str, list[str]]]:
         *phases,
         ("Tracking error", _draw_error, "error", judged),
         ("Command", _draw_command, "command", inputs),
-        (highest, _draw_responses, "desired", list(run.layout["desired"].elements[:1])),
+        (highest, _draw_responses, "desired", list(run.layout["desired"].elements)),
     ]
 
 
@@ -134,7 +141,7 @@ def lyapunov_figure(comparison: Comparison) -> Figure | None:
     views = [(e, e.lyapunov) for e in comparison.entries if e.lyapunov is not None]
     if not views:
         return None
-    figure = new_figure(11, 3.4, "")
+    figure = new_figure(_WIDE, 4.0, "")
     axis = figure.subplots()
     for k, (entry, view) in enumerate(views):
         color, values = PALETTE[k % len(PALETTE)], np.maximum(view.function, 1e-20)
@@ -174,8 +181,8 @@ def _is_second_order(run: Run) -> bool:
 
 def _draw_trajectory(axis: Axes, run: Run, names: Sequence[str]) -> None:
     for k, name in enumerate(names):
-        draw_line(axis, run, f"reference.{name}", f"{name} nominal", PALETTE[k % len(PALETTE)], "--")
         draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", f"{name} realised", PALETTE[k % len(PALETTE)])
+        draw_line(axis, run, f"reference.{name}", f"{name} nominal", _REFERENCES[k % len(_REFERENCES)], "--")
 
 
 def _phase_names(run: Run) -> list[str]:
@@ -188,9 +195,9 @@ def _phase_names(run: Run) -> list[str]:
 def _draw_phase(axis: Axes, run: Run, names: Sequence[str]) -> None:
     motion = shown_motion(run.layout)
     for k, name in enumerate(names):
-        for signal, style in (("reference", "--"), (motion, "-")):
+        nominal = _REFERENCES[k % len(_REFERENCES)]
+        for signal, style, color in ((motion, "-", PALETTE[k % len(PALETTE)]), ("reference", "--", nominal)):
             x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
-            color = PALETTE[k % len(PALETTE)]
             axis.plot(thinned(x), thinned(y), style, color=color, lw=1, label=literal(f"{name} {signal}"))
     axis.set_xlabel(quantity_label(run, motion, names))
     axis.set_ylabel(quantity_label(run, motion, [f"{name}'" for name in names]))
@@ -209,3 +216,85 @@ def _draw_command(axis: Axes, run: Run, names: Sequence[str]) -> None:
 
 def _draw_responses(axis: Axes, run: Run, names: Sequence[str]) -> None:
     draw_responses(axis, run, names[0])
+
+
+def contraction_figure(comparison: Comparison) -> Figure | None:
+    """Return a panel for every gain by its own name and scale, and one with the response errors; None where nothing contracts."""
+    entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
+    if not entries:
+        return None
+    colours = {e.name: PALETTE[k % len(PALETTE)] for k, e in enumerate(entries)}
+    groups = _by_gain(entries)
+    figure = new_figure(_WIDE, 4.0, "")
+    *panels, last = figure.subplots(1, len(groups) + 1)
+    for axis, ((name, scale), same) in zip(panels, groups.items(), strict=True):
+        _draw_factor(axis, name, scale, same, colours)
+    for entry in entries:
+        size = np.linalg.norm(entry.run["realised"][1:] - entry.run["desired"][:-1], axis=1)[:_CYCLES]
+        cycles = np.arange(1, size.size + 1)
+        last.semilogy(cycles, np.maximum(size, 1e-12), color=colours[entry.name], label=literal(entry.name), lw=1)
+    last.set_xlabel("control cycle")
+    last.set_ylabel("|realised - desired|, response units")
+    last.set_title("The response error in the first cycles", fontsize=10)
+    draw_legend(last)
+    return figure
+
+
+def _by_gain(entries: Sequence[Entry]) -> dict[tuple[str, float], list[Entry]]:
+    """Entries by the name of their gain and its size per unit of the effective gain, in their order."""
+    groups: dict[tuple[str, float], list[Entry]] = {}
+    for entry in entries:
+        groups.setdefault(_own_gain(_of(entry).report), []).append(entry)
+    return groups
+
+
+def _of(entry: Entry) -> Contraction:
+    assert entry.contraction is not None
+    return entry.contraction
+
+
+def _own_gain(report: ContractionReport) -> tuple[str, float]:
+    """Name of the user's gain and its size per unit of the effective gain; the effective gain where no gain converges."""
+    own, effective = (max(limit, key=abs) for limit in (report.own_linear_limit, report.linear_limit))
+    # An interval in the user's gain is mirrored where the sign differs, so its far end belongs to the far end.
+    return (report.gain_name, float(f"{own / effective:.9g}")) if effective else ("effective gain", 1.0)
+
+
+def _draw_factor(axis: Axes, name: str, scale: float, entries: Sequence[Entry], colours: dict[str, str]) -> None:
+    first = _of(entries[0])
+    limit = max(first.report.linear_limit, key=abs) or 1.0
+    gains = np.linspace(0, _BEYOND * limit, 300)
+    eigenvalues = first.spectrum.eigenvalues.ravel()
+    factors = np.abs(1 - gains[:, None] * eigenvalues[None, :]).max(axis=1)
+    axis.plot(scale * gains, factors, color="#444444", lw=1.2)
+    axis.axhline(1.0, color="#aa0000", lw=0.8)
+    axis.axvline(scale * limit, color="#aa0000", lw=0.8, ls="--", label="linear limit")
+    sectors: dict[float, str] = {}
+    for entry in entries:
+        one, colour = _of(entry), colours[entry.name]
+        own = scale * one.report.effective_gain
+        axis.plot(
+            own,
+            one.report.predicted,
+            "o",
+            color=colour,
+            ms=9,
+            mfc="none",
+            mew=1.5,
+            label=literal(f"{entry.name}, predicted"),
+        )
+        if np.isfinite(one.measured):
+            axis.plot(own, one.measured, "x", color=colour, ms=7, mew=1.5, zorder=5)
+        sector: float = max(one.report.sector_limit, key=abs)
+        sectors.setdefault(round(sector, 3), colour)
+    for sector, colour in sectors.items():
+        if sector and abs(sector) < 0.999 * abs(limit):
+            axis.axvline(scale * sector, color=colour, lw=0.8, ls=":", label="sector limit")
+    axis.set_ylim(0, 1.6)
+    axis.locator_params(axis="x", nbins=7)
+    axis.ticklabel_format(axis="x", scilimits=(-3, 4))
+    axis.set_xlabel(literal(name))
+    axis.set_ylabel("contraction factor max|1 - a lambda|")
+    axis.set_title("Predicted factor; o predicted, x measured", fontsize=10)
+    axis.grid(visible=True, alpha=0.25)
+    draw_legend(axis)

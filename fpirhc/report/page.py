@@ -1,44 +1,71 @@
-"""The parts of every HTML report: one self-contained file with its styles, scripts and pictures inside."""
+"""HTML reports: one self-contained file with its styles, scripts and pictures inside, from a template and a view."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-import html
+import json
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fpirhc.errors import OutputError
 from fpirhc.simulation.picture import png
+from fpirhc.studies.comparison.outcome import Outcome
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.figure import Figure
 
+    from fpirhc.studies.view import View
 
-def page(title: str, styles: Sequence[str], body: str, scripts: Sequence[str] = ()) -> str:
+
+@dataclass(frozen=True)
+class Image:
+    """A picture inside a page; one that cannot be drawn has no source, and its caption says why."""
+
+    source: str
+    alt: str
+    caption: str
+
+
+def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:
     """Return a page's text.
 
     The page loads nothing from anywhere, and a browser that reads its content security policy also refuses to: it runs the
     page's own scripts alone, which are named by their hashes, and shows pictures that are inside the page.
 
     Args:
-        title: title of the page.
-        styles: names of assets with styles.
-        body: body of the page, HTML.
+        name: of the template.
+        view: what the page says.
         scripts: texts of the page's scripts, which run in this order after those of every page.
+        context: further values for the template.
     """
-    head = "\n".join(f"<style>{asset(name)}</style>" for name in styles)
-    every = [asset("table.js"), *scripts]
-    code = "\n".join(f"<script>{script}</script>" for script in every)
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_policy(every)}">'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(title)}</title>\n{head}</head>\n<body><main>{body}</main>\n{code}</body></html>\n"
-    )
+    from markupsafe import Markup
+
+    every = [Markup(script) for script in (asset("table.js"), *scripts)]
+    styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")]
+    template = _environment().get_template(name)
+    return template.render(view=view, policy=Markup(_policy(every)), styles=styles, scripts=every, **context)
+
+
+@cache
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader(__package__)
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.filters |= {"css_class": css_class, "indented": lambda value: json.dumps(value, indent=1)}
+    return environment
+
+
+def css_class(outcome: Outcome | None) -> str:
+    """Return the class of a sentence: green is better, red worse, amber mixed or doubtful."""
+    return "remark" if outcome is None else f"outcome-{outcome.value.replace(' ', '-')}"
 
 
 def _policy(scripts: Sequence[str]) -> str:
@@ -51,20 +78,9 @@ def _policy(scripts: Sequence[str]) -> str:
     )
 
 
-def wide_table(head: Sequence[str], rows: str, label: str) -> str:
-    """Return a table that scrolls sideways inside the page, with a hint that is shown where it does not fit.
-
-    Args:
-        head: headings, text.
-        rows: rows of the body, HTML.
-        label: what the table holds, for screen readers.
-    """
-    top = "".join(f"<th scope='col'>{text(h)}</th>" for h in head)
-    return (
-        "<p class='more' hidden>The table goes on to the right: scroll it sideways. &rarr;</p>"
-        f"<div class='scroll' tabindex='0' role='region' aria-label='{text(label)}'>"
-        f"<table><thead><tr>{top}</tr></thead><tbody>{rows}</tbody></table></div>"
-    )
+def picture(figure: Figure, alt: str, caption: str = "") -> Image:
+    """Return a figure as a picture inside the page."""
+    return Image(f"data:image/png;base64,{base64.b64encode(png(figure)).decode('ascii')}", alt, caption)
 
 
 def write_page(content: str, path: Path) -> None:
@@ -85,15 +101,3 @@ def write_page(content: str, path: Path) -> None:
 def asset(name: str) -> str:
     """Return the text of a style or script."""
     return files("fpirhc.report").joinpath("assets", name).read_text(encoding="utf-8")
-
-
-def text(value: object) -> str:
-    """Return a value as text for a page."""
-    return html.escape(str(value), quote=True)
-
-
-def picture(figure: Figure, alt: str, caption: str) -> str:
-    """Return a figure as a picture inside the page."""
-    code = base64.b64encode(png(figure)).decode("ascii")
-    note = f"<figcaption>{text(caption)}</figcaption>" if caption else ""
-    return f"<figure><img alt='{text(alt)}' src='data:image/png;base64,{code}'>{note}</figure>"

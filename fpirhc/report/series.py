@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fpirhc.report.reality_series import reality_charts
 from fpirhc.simulation.common_columns import shown_motion
 
 if TYPE_CHECKING:
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.entry import Entry
 
 INTERVALS = 300
+_REALITY = "reality_state"
 _RESPONSES = ("nominal", "desired", "deformed", "realised")
 
 
@@ -30,23 +30,23 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
     first = entries[0].run
     names = first.layout["error"].elements
     charts = [
-        _chart(f"error of {c}", first.unit(f"error.{c}"), [(e.name, e.run, f"error.{c}") for e in entries], edges)
+        _chart(f"error of {c}", first.unit(f"error.{c}"), [(e.name, e.run[f"error.{c}"]) for e in entries], edges)
         for c in names
     ]
     for c in names:
-        aims = [("set-point", longest, f"setpoint.{c}")] if "setpoint" in longest.layout else []
-        own = [(e.name, e.run, f"{shown_motion(e.run.layout)}.{c}") for e in entries]
-        lines = [*aims, ("reference", longest, f"reference.{c}"), *own]
+        aims = [("set-point", longest[f"setpoint.{c}"])] if "setpoint" in longest.layout else []
+        own = [(e.name, e.run[f"{shown_motion(e.run.layout)}.{c}"]) for e in entries]
+        lines = [*aims, ("reference", longest[f"reference.{c}"]), *own]
         charts.append(_chart(c, first.unit(f"reference.{c}"), lines, edges))
     for i in first.layout["command"].elements:
-        lines = [(e.name, e.run, f"command.{i}") for e in entries]
+        lines = [(e.name, e.run[f"command.{i}"]) for e in entries]
         charts.append(_chart(f"command {i}", first.unit(f"command.{i}"), lines, edges))
     for e in entries:
         for c in e.run.layout["desired"].elements:
-            lines = [(signal, e.run, f"{signal}.{c}") for signal in _RESPONSES]
+            lines = [(signal, e.run[f"{signal}.{c}"]) for signal in _RESPONSES]
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
-    charts += reality_charts(entries, lambda values: _extremes(values, edges))
+    charts += _reality_charts(entries, edges)
     charts += [chart for e in entries for chart in _tubes(e, edges)]
     return {
         "controllers": [
@@ -60,6 +60,31 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
     }
 
 
+def _reality_charts(entries: Sequence[Entry], edges: np.ndarray) -> list[dict[str, Any]]:
+    """Charts of realities that are plants: states that the model does not have, and the response that the model expected."""
+    real = [e for e in entries if _REALITY in e.run.layout]
+    if not real:
+        return []
+    first, charts = real[0].run, []
+    for name in (n for n in first.layout[_REALITY].elements if n not in first.layout["state"].elements):
+        column = f"{_REALITY}.{name}"
+        charts.append(_chart(f"reality: {name}", first.unit(column), [(e.name, e.run[column]) for e in real], edges))
+    return charts + [chart for e in real for chart in _responses(e.name, e.run, edges)]
+
+
+def _responses(name: str, run: Run, edges: np.ndarray) -> list[dict[str, Any]]:
+    """The response that the model expected of the last command, and the real one, by coordinate."""
+    if not {"deformed", "plant_realised"} <= set(run.layout.names):
+        return []
+    charts = []
+    for c in run.layout["deformed"].elements:
+        requested, real = run[f"deformed.{c}"], run[f"plant_realised.{c}"]
+        lines = [("the model expected", np.concatenate([real[:1], requested[:-1]])), ("the reality did", real)]
+        title = f"{name}: response of {c}, belief and reality"
+        charts.append({**_chart(title, run.unit(f"deformed.{c}"), lines, edges), "only": name})
+    return charts
+
+
 def _tubes(entry: Entry, edges: np.ndarray) -> list[dict[str, Any]]:
     """Charts of every coordinate's distance from the model's own run inside the band that was predicted; none without a tube."""
     prediction, run = entry.prediction, entry.run
@@ -71,11 +96,9 @@ def _tubes(entry: Entry, edges: np.ndarray) -> list[dict[str, Any]]:
     for c in (c for c in run.layout["error"].elements if c in places):
         half = prediction.tube[:count, places[c]]
         apart = run[f"{state}.{c}"][:count] - prediction.nominal.states[:count, places[c]]
-        lines = {"distance": apart, "predicted at most": half, "predicted at least": -half}
-        series = [{"name": name, "values": _extremes(values, edges)} for name, values in lines.items()]
+        lines = [("distance", apart), ("predicted at most", half), ("predicted at least", -half)]
         title = f"{entry.name}: {c}, distance from the model's own run"
-        unit = run.unit(f"error.{c}")
-        charts.append({"title": title, "unit": unit, "series": series, "only": entry.name, "band": [2, 3]})
+        charts.append(_chart(title, run.unit(f"error.{c}"), lines, edges) | {"only": entry.name, "band": [2, 3]})
     return charts
 
 
@@ -100,9 +123,8 @@ def _halves(run: Run, edges: np.ndarray) -> np.ndarray:
     return np.column_stack([np.zeros_like(middle), middle]).ravel()
 
 
-def _chart(title: str, unit: str, lines: Sequence[tuple[str, Run, str]], edges: np.ndarray) -> dict[str, Any]:
-    series = [{"name": name, "values": _extremes(run[column], edges)} for name, run, column in lines]
-    return {"title": title, "unit": unit, "series": series}
+def _chart(title: str, unit: str, lines: Sequence[tuple[str, np.ndarray]], edges: np.ndarray) -> dict[str, Any]:
+    return {"title": title, "unit": unit, "series": [{"name": n, "values": _extremes(v, edges)} for n, v in lines]}
 
 
 def _extremes(values: np.ndarray, edges: np.ndarray) -> list[float | None]:

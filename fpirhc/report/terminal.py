@@ -1,36 +1,139 @@
-"""The output on the terminal: progress bars, the table, the verdict."""
+"""The output on the terminal: progress bars, sentences, and tables that fold.
+
+Columns that do not fit beside each other go on below, and no column is cut or lost. Every part begins with the columns that name
+the rows.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from rich.console import Console
+from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
+from rich.console import Console, JustifyMethod
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table as Grid
 from rich.text import Text
 
-from fpirhc.report.folding import Column, Folding
-from fpirhc.report.outcomes import terminal_style
-from fpirhc.simulation.metrics.columns import Column as Metric
 from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
-from fpirhc.studies.comparison.optimality import gap
 from fpirhc.studies.comparison.outcome import Outcome
-from fpirhc.summary import in_percent, printable
+from fpirhc.summary import Column, Table, printable
 
 if TYPE_CHECKING:
     from fpirhc.simulation.metrics import Metrics
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison
     from fpirhc.studies.comparison.compare import Progress as Report
-    from fpirhc.studies.comparison.entry import Entry
     from fpirhc.studies.open_loop import Solved
+    from fpirhc.studies.view import View
 
+STYLES = {
+    Outcome.BETTER: "green",
+    Outcome.WORSE: "bold red",
+    Outcome.MIXED: "yellow",
+    Outcome.DOUBTFUL: "yellow",
+    Outcome.NO_DIFFERENCE: "",
+    Outcome.NOT_COMPARABLE: "dim",
+    None: "",  # a remark
+}
 _MOST_STEPS = 6  # of the set-points of one coordinate in a text
+_NAMED = 24  # characters of a name that stand on one line where there is little room
+_BETWEEN = 2  # between two columns: a space of each and the box between them
+_EDGES = 2  # columns left and right of a table
+
+
+def say(text: str, style: str = "", *, wrap: bool = True) -> None:
+    """Print text in which nothing is markup; without `wrap` it stays on one line."""
+    Console().print(Text(printable(text)), style=style, highlight=False, soft_wrap=not wrap)
+
+
+def show(view: View, report: Path) -> None:
+    """Print the verdict, the tables, everything else that is said of a study, and the path of its report."""
+    say(view.title, "bold")
+    show_sentences(view.sentences)
+    for table in view.tables:
+        if table.rows:
+            show_table(table.narrow)
+    for texts in view.lists.values():
+        for text in texts:
+            say(text)
+    for name, why in view.skipped.items():
+        say(f"skipped {name}: {why}")
+    say(f"report: {report}", wrap=False)
+
+
+def show_sentences(sentences: Iterable[tuple[str, Outcome | None]]) -> None:
+    """Print sentences in the colours of the outcomes that they state."""
+    for text, outcome in sentences:
+        say(f"- {text}", STYLES[outcome])
+
+
+def show_harm(harm: Iterable[str]) -> None:
+    """Print what speaks against a controller's adaptation, in red."""
+    show_sentences((sentence, Outcome.WORSE) for sentence in harm)
+
+
+def show_table(table: Table, console: Console | None = None) -> None:
+    """Print a table in as many parts as the width of the console needs."""
+    console = console or Console()
+    parts = _parts(table, console.width)
+    for k, part in enumerate(parts):
+        title = printable(table.title) + (" (continued)" if k else "")
+        caption = printable(table.caption) if k == len(parts) - 1 else ""
+        console.print(_grid(table, part, title, caption, console.width))
+
+
+def _parts(table: Table, width: int) -> list[list[int]]:
+    """Places of the columns of every part, without those that name the rows."""
+    room = width - _EDGES - sum(_least(table, k) + _BETWEEN for k in range(table.names))
+    parts: list[list[int]] = [[]]
+    used = 0
+    for k in range(table.names, len(table.columns)):
+        need = _least(table, k) + _BETWEEN
+        if parts[-1] and used + need > room:
+            parts.append([])
+            used = 0
+        parts[-1].append(k)
+        used += need
+    return parts
+
+
+def _least(table: Table, place: int) -> int:
+    """The least width of a column: of the longest word of its heading and its longest text; names may wrap."""
+    texts = [cell_len(printable(row.cells[place])) for row in table.rows]
+    if place < table.names:
+        texts = [min(length, _NAMED) for length in texts]
+    return max([*texts, *(cell_len(word) for word in printable(table.columns[place].head).split())], default=1)
+
+
+def _grid(table: Table, part: Sequence[int], title: str, caption: str, width: int) -> Grid:
+    grid = Grid(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(title), caption=Text(caption) or None)
+    places = [*range(table.names), *part]
+    for k, own in zip(places, _widths(table, places, width), strict=True):
+        justify: JustifyMethod = "left" if k < table.names or table.columns[k].left else "right"
+        grid.add_column(Text(printable(table.columns[k].head)), justify=justify, width=own, overflow="fold")
+    for row in table.rows:
+        cells = (Text(printable(row.cells[k]), "bold" if k in row.best else "") for k in places)
+        grid.add_row(*cells, style=row.style)
+    return grid
+
+
+def _widths(table: Table, places: Sequence[int], width: int) -> list[int]:
+    """Widths of columns: the least, and then as much as names and headings need on one line, from left to right."""
+    widths = [_least(table, k) for k in places]
+    rest = width - _EDGES - sum(widths) - _BETWEEN * len(widths)
+    for k, place in enumerate(places):
+        names = [cell_len(printable(row.cells[place])) for row in table.rows] if place < table.names else []
+        wanted = max([cell_len(printable(table.columns[place].head)), *names])
+        more = min(max(wanted - widths[k], 0), max(rest, 0))
+        widths[k] += more
+        rest -= more
+    return widths
 
 
 @contextmanager
@@ -56,47 +159,18 @@ def announce_backend(runs: Iterable[Run]) -> None:
         print(f"fpirhc: loops ran in CasADi's virtual machine, more slowly, because {why}", file=sys.stderr)
 
 
-def show(comparison: Comparison, report: Path) -> None:
-    """Print the verdict, the table and the path of the report."""
-    console = Console()
-    say(console, comparison.title, style="bold")
-    for sentence, outcome in comparison.sentences:
-        say(console, f"- {sentence}", style=terminal_style(outcome))
-    _table(comparison).show(console)
-    if sum(e.optimality is not None for e in comparison.entries) > 1:
-        _plans(comparison).show(console)
-    for entry in comparison.entries:
-        if entry.run.stop:
-            say(console, f"{entry.name} ended early: {entry.run.stop}")
-    for line in comparison.information:
-        say(console, line)
-    for entry in comparison.entries:
-        for note in entry.notes:
-            say(console, f"{entry.name}: {note}")
-    for name, why in comparison.skipped.items():
-        say(console, f"skipped {name}: {why}")
-    say(console, f"report: {report}", wrap=False)
-
-
 def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Path) -> None:
     """Print what speaks against its adaptation, one run's metrics and the path of its file."""
-    console = Console()
-    show_harm(console, harm)
+    show_harm(harm)
     for text in (*settings_in_force(run), *set_points_in_force(run)):
-        say(console, text)
+        say(text)
     for column in columns([metrics]):
-        say(console, f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
+        say(f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
-        say(console, f"ended early: {run.stop}")
+        say(f"ended early: {run.stop}")
     if run.depends_on_rounding:
-        say(console, run.depends_on_rounding)
-    say(console, f"saved: {saved}", wrap=False)
-
-
-def show_harm(console: Console, harm: Iterable[str]) -> None:
-    """Print what speaks against a controller's adaptation, in red."""
-    for sentence in harm:
-        say(console, f"- {sentence}", style=terminal_style(Outcome.WORSE))
+        say(run.depends_on_rounding)
+    say(f"saved: {saved}", wrap=False)
 
 
 def settings_in_force(run: Run) -> list[str]:
@@ -122,27 +196,26 @@ def _steps_text(run: Run, steps: list[list[float]] | str) -> str:
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
     """Print the plans of open-loop solves."""
-    console = Console()
     caption = (
         "K: contraction factor; du <: bound of the error of every input; dV <: bound of the cost above the optimum"
     )
     heads = ("optimiser", "cost", "residual", "iter", "K", "du <", "dV <", "status")
-    table = Folding(f"{task}, first horizon", [Column(head) for head in heads], caption)
+    table = Table(f"{task}, first horizon", [Column(head) for head in heads], caption)
     for one in solved:
         table.add(_plan_row(one))
-    table.show(console)
+    show_table(table)
     for one in solved:
         for text in one.plan.violations():
-            say(console, f"{one.name}: {text}")
+            say(f"{one.name}: {text}")
         for text in one.plan.reasons():
-            say(console, f"{one.name}: {text}")
+            say(f"{one.name}: {text}")
         for name, price in one.plan.slacks().items():
-            say(console, f"{one.name}: soft limit '{name}' costs {price:.4g}")
+            say(f"{one.name}: soft limit '{name}' costs {price:.4g}")
         if one.plan.overflow():
-            say(console, f"{one.name}: {one.plan.overflow()}")
+            say(f"{one.name}: {one.plan.overflow()}")
         if one.plan.status != Status.OK:
-            say(console, f"{one.name}: {one.plan.status.remedy}")
-    say(console, f"picture: {picture}", wrap=False)
+            say(f"{one.name}: {one.plan.status.remedy}")
+    say(f"picture: {picture}", wrap=False)
 
 
 def _plan_row(solved: Solved) -> list[str]:
@@ -156,58 +229,3 @@ def _plan_row(solved: Solved) -> list[str]:
         *bounds,
         plan.status.name.lower().replace("_", " "),
     ]
-
-
-def _table(comparison: Comparison) -> Folding:
-    """Table of the controllers: their headline metrics, time of a cycle, and how they ended."""
-    shown = columns([e.metrics for e in comparison.entries], headline=True)
-    table = Folding(
-        f"{comparison.problem}, from t = {comparison.measure_from:g} {comparison.time_unit}, seed {comparison.seed}",
-        [Column("controller"), *(Column(c.short) for c in shown), Column("cycle us"), Column("status", left=True)],
-    )
-    for entry in comparison.entries:
-        table.add(_row(entry, shown))
-    return table
-
-
-def _row(entry: Entry, shown: Sequence[Metric]) -> list[str]:
-    metrics, cycle = entry.metrics, entry.cycle
-    numbers = [c.text(c.number(metrics), missing="", none="-") for c in shown]
-    status = "ended early" if entry.run.stop else status_shares(metrics.statuses)
-    return [entry.name, *numbers, f"{cycle.median:.2g}" if cycle else "", status]
-
-
-def status_shares(statuses: Mapping[str, int]) -> str:
-    """The shares of cycles whose status is not ok, such as 'not converged 1.67 %'; 'ok' where there are none."""
-    cycles = sum(statuses.values())
-    other = {name: count for name, count in statuses.items() if count and name != "OK"}
-    return ", ".join(f"{k.lower().replace('_', ' ')} {in_percent(v / cycles)}" for k, v in other.items()) or "ok"
-
-
-def _plans(comparison: Comparison) -> Folding:
-    """Table of the optimisers: cost above the converged optimum, iterations, time of the cycles that plan."""
-    heads = ("controller", "iter", "residual", "gap", "plan us", "p99 us", "max us", "first us")
-    caption = "gap: cost above the converged optimum, relative; plan us: the cycles that plan"
-    table = Folding("plans", [Column(head) for head in heads], caption)
-    for entry in comparison.entries:
-        metrics, cycle, excess = entry.metrics, entry.cycle, entry.optimality
-        if not metrics.solve:
-            continue
-        times = [_micro(v) for v in (cycle.planning, cycle.p99, cycle.maximum, cycle.first)] if cycle else [""] * 4
-        solves = [metrics.text(f"solve.{name}") for name in ("median_iterations", "median_stationarity")]
-        table.add([entry.name, *solves, gap(excess.median, 1) if excess else "-", *times])
-    return table
-
-
-def literal(text: str) -> Text:
-    """Return text in which nothing is markup, an emoji code or an escape code."""
-    return Text(printable(text))
-
-
-def say(console: Console, text: str, *, style: str = "", wrap: bool = True) -> None:
-    """Print text in which nothing is markup; without `wrap` it stays on one line."""
-    console.print(literal(text), style=style, highlight=False, soft_wrap=not wrap)
-
-
-def _micro(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

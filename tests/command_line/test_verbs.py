@@ -178,7 +178,7 @@ def test_help_names_every_optimiser(name, capsys):
     assert f"{', '.join(optimiser_choices())}, or all" in words
 
 
-HEAVY = ("casadi", "numpy", "scipy", "rich", "matplotlib", "control", "pandas", "osqp")
+HEAVY = ("casadi", "numpy", "scipy", "rich", "jinja2", "matplotlib", "control", "pandas", "osqp")
 
 
 @pytest.mark.parametrize(

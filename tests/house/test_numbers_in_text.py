@@ -32,15 +32,19 @@ def test_shares(share, text):
         (12.34, 3, "12.3"),
         (0.0042, 2, "0.0042"),
         (-1600.0, 2, "-1 600"),
+        (4.05e3, 3, "4 050"),
+        (1.234e-5, 3, "1.23e-5"),
+        (4.6e275, 2, "4.6e275"),
+        (0.0, 3, "0"),
     ],
 )
-def test_numbers_without_powers_of_ten(value, digits, text):
-    """Thousands stand apart."""
+def test_numbers_as_people_write_them(value, digits, text):
+    """Thousands stand apart; what is too large or too small to be written out has a power as people write it."""
     assert written_out(value, digits) == text
 
 
 @pytest.mark.parametrize(
-    ("excess", "text"), [(-0.6, "other optimum"), (-3e-9, "0"), (0.0, "0"), (0.0123, "0.012"), (2e-7, "2e-07")]
+    ("excess", "text"), [(-0.6, "other optimum"), (-3e-9, "0"), (0.0, "0"), (0.0123, "0.012"), (2e-7, "2e-7")]
 )
 def test_a_plan_is_not_better_than_the_optimum(excess, text):
     """A negative gap is another optimum, or the accuracy of the solves."""

@@ -29,7 +29,18 @@ def test_bill_of_materials_names_what_is_needed():
     document = bill()
     assert (document["bomFormat"], document["specVersion"]) == ("CycloneDX", "1.6")
     versions = {c["name"].lower().replace("_", "-"): c["version"] for c in document["components"]}
-    for name in ("casadi", "numpy", "scipy", "osqp", "control", "matplotlib", "pandas", "rich", "lazy-loader"):
+    for name in (
+        "casadi",
+        "numpy",
+        "scipy",
+        "osqp",
+        "control",
+        "matplotlib",
+        "pandas",
+        "rich",
+        "jinja2",
+        "lazy-loader",
+    ):
         assert versions[name] == distribution(name).version
     assert "sphinx" not in versions
     references = {c["bom-ref"] for c in (*document["components"], document["metadata"]["component"])}

@@ -7,10 +7,11 @@ import pytest
 from hand_made_runs import CYCLES, SOLVE, problem, run
 
 import fpirhc as fp
-from fpirhc.report.terminal import show_plans, status_shares
+from fpirhc.report.terminal import show_plans
 from fpirhc.simulation.metrics import measure
 from fpirhc.status import Status
 from fpirhc.studies.open_loop import Solved
+from fpirhc.studies.view import status_shares
 from fpirhc.symbolic.layout import Signal
 
 

@@ -161,7 +161,7 @@ def test_a_wide_window_is_used(reports, visit):
     """At 1900 px tables, charts and pairs are as wide as the window but for a margin, and lines of text stay readable."""
     page = visit(reports["many"], 1900).page
     widths = page.evaluate(
-        "['#charts', '.scroll', '.pictures'].map((s) => document.querySelector(s).getBoundingClientRect().width)"
+        "['#charts', '.scroll', '.pictures', '.wide img'].map((s) => document.querySelector(s).getBoundingClientRect().width)"
     )
     assert min(widths) > 1800
     assert page.evaluate("document.querySelector('.headline').getBoundingClientRect().width") <= 1860

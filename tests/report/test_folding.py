@@ -8,7 +8,8 @@ import re
 import pytest
 from rich.console import Console
 
-from fpirhc.report.folding import Column, Folding
+from fpirhc.report.terminal import show_table
+from fpirhc.summary import Column, Table
 
 HEADS = ("controller", "rms concentration [mg/l]", "max error [mg/l]", "clipped", "factor", "cycle us", "status")
 ROWS = (
@@ -21,10 +22,10 @@ ROWS = (
 def shown(width: int, names: int = 1, caption: str = "") -> list[str]:
     """The lines of the table on a terminal of this width."""
     console = Console(file=io.StringIO(), width=width, color_system=None)
-    table = Folding("a title", [Column(h) for h in HEADS], caption, names)
+    table = Table("a title", [Column(h) for h in HEADS], caption, names)
     for row in ROWS:
         table.add(row)
-    table.show(console)
+    show_table(table, console)
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue().splitlines()
 
@@ -62,9 +63,9 @@ def test_the_names_of_rows_may_be_two_columns():
 def test_texts_are_literal():
     """No markup, no escape codes."""
     console = Console(file=io.StringIO(), width=80, color_system=None)
-    table = Folding("[bold]t[/bold]", [Column("[red]head"), Column("x")])
+    table = Table("[bold]t[/bold]", [Column("[red]head"), Column("x")])
     table.add(["[i]name\x1b[31m", ":bomb:"])
-    table.show(console)
+    show_table(table, console)
     assert isinstance(console.file, io.StringIO)
     text = console.file.getvalue()
     for literal in ("[bold]t[/bold]", "[red]head", "[i]name\\x1b[31m", ":bomb:"):

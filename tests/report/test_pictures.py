@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, ProblemFileError
-from fpirhc.report.wanted import wanted_pictures
+from fpirhc.report.html import own_pictures, render
 from fpirhc.simulation.pictures.base import extremes
 from fpirhc.simulation.pictures.raster import passages
 
@@ -130,10 +130,13 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path, monkey
         FILE % "fp.Portrait('good', x='state.q', y='error.q'), fp.Portrait('bad', x='state.p', y='state.q')"
     )
     comparison = fp.compare(fp.load_problem(str(path)), seed=0, compiled=False)
-    page = wanted_pictures(comparison)
+    good, bad = own_pictures(comparison)
+    assert good.source.startswith("data:image/png")
+    assert not bad.source
+    page = render(comparison).partition("Pictures of this problem")[2].partition("</section>")[0]
     assert page.count("<img") == 1
     assert "bad is not drawn" in page
     first: Any = comparison.pictures[0]
     absent = replace(first, controllers=("RHC",))
-    assert wanted_pictures(replace(comparison, pictures=(absent,))) == ""
-    assert wanted_pictures(replace(comparison, pictures=())) == ""
+    assert own_pictures(replace(comparison, pictures=(absent,))) == []
+    assert "Pictures of this problem" not in render(replace(comparison, pictures=()))

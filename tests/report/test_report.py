@@ -20,7 +20,11 @@ from fpirhc.errors import OutputError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render, write_report
 from fpirhc.report.series import INTERVALS, chart_data
+from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.comparison_view import comparison_view
+from fpirhc.studies.view import to_json
+from fpirhc.summary import written_out
 
 HOSTILE = "<script>alert('x')</script> \"& </script>"
 
@@ -133,8 +137,44 @@ def test_run_that_ended_early_is_told_in_words(comparison):
     short = replace(entry.run, log=entry.run.log[:300], stop="signal 'x' is not finite at t = 0.3 s")
     ended = replace(entry, run=short, metrics=fp.measure(problem(), short))
     page = render(replace(comparison, entries=(ended, *comparison.entries[1:])))
-    assert "ended early: signal &#x27;x&#x27; is not finite" in page
-    assert "<span class='none'>none</span>" in page
+    assert "ended early: signal &#39;x&#39; is not finite" in page
+    assert "<td class='none'>none</td>" in page
+
+
+def test_a_row_is_as_high_as_its_numbers(comparison):
+    """A name stands alone in its cell; what is noted of it stands in a list below the table."""
+    page = render(comparison)
+    assert "<th scope='row'>plain</th>" in page
+    note = next(note for note in comparison["plain"].notes if "Lyapunov" in note)
+    assert f"<li>plain: {note}</li>" in page
+
+
+def test_no_column_is_empty(comparison):
+    """Where nobody plans there is no table of plans, and every column of the other has a number in some row."""
+    controllers, plans = comparison_view(comparison).tables
+    assert plans.rows == []
+    assert "gap" not in [column.head for column in controllers.columns]
+    assert all(any(row.cells[k] for row in controllers.rows) for k in range(len(controllers.columns)))
+    assert "<h3>Plans" not in render(comparison)
+
+
+def test_page_terminal_notebook_and_json_say_the_same(comparison, capsys, monkeypatch):
+    """Every text of the short table is on the terminal, on the page and in a notebook; JSON has the number behind it."""
+    monkeypatch.setenv("COLUMNS", "2000")
+    view = comparison_view(comparison)
+    show(view, Path("report.html"))
+    printed, page, notebook = capsys.readouterr().out, render(comparison), comparison._repr_html_()
+    for row in view.tables[0].narrow.rows:
+        for cell in filter(None, row.cells[1:]):
+            assert cell in printed
+            assert f">{cell}</td>" in page
+            assert f"<td>{cell}</td>" in notebook
+    facts = json.loads(to_json(view.facts))["controllers"]["plain"]
+    assert facts["rms_error"]["y"] == comparison["plain"].metrics.rms_error["y"]
+    assert f"<td>{written_out(facts['rms_error']['y'])}</td>" in notebook
+    slow = replace(comparison["plain"].cycle, median=4050.0)
+    busy = replace(comparison, entries=(replace(comparison["plain"], cycle=slow),))
+    assert ">4 050</td>" in render(busy)
 
 
 def test_comparison_without_a_pair_has_no_pair_pictures(comparison):

@@ -15,8 +15,7 @@ from plants import chain
 import fpirhc as fp
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.contraction_figure import contraction_figure
-from fpirhc.report.figures import pair_figures
+from fpirhc.report.figures import contraction_figure, pair_figures
 from fpirhc.report.html import headline_pair
 from fpirhc.report.page import asset
 from fpirhc.studies.comparison.compare import compare
@@ -125,6 +124,23 @@ def test_a_chart_has_one_unit(reacted):
     ]
 
 
+def test_every_unit_has_its_responses(reacted):
+    """A mole and a kelvin have a picture each, of the first quantity with this unit."""
+    figures = pair_figures(reacted["plain"], reacted["affine"])
+    labels = [figure.axes[0].get_ylabel() for name, figure in figures.items() if name.startswith("Highest")]
+    assert labels == ["c [mol/l/s]", "T [K/s]"]
+
+
+def test_a_reference_has_a_colour_of_its_own(reacted):
+    """Where what follows lies on it, both are seen: the reference is drawn later, dashed, and in another colour."""
+    figures = pair_figures(reacted["plain"], reacted["affine"])
+    for name in ("Trajectory tracking [K]", "Trajectory tracking [mol/l]"):
+        motion, reference = figures[name].axes[0].lines
+        assert "nominal" in str(reference.get_label())
+        assert reference.get_color() != motion.get_color()
+        assert (motion.get_linestyle(), reference.get_linestyle()) == ("-", "--")
+
+
 def test_both_sides_of_a_pair_have_the_same_axes(reacted):
     """A smaller error looks smaller; nothing of either side is cut."""
     for name, figure in pair_figures(reacted["plain"], reacted["affine"]).items():
@@ -154,6 +170,10 @@ def test_the_contraction_is_drawn_against_the_gain_that_the_user_sets(reacted):
     assert points["affine, predicted"] == pytest.approx((-1.0, abs(1 - 0.5 * 1.5)))
     assert points["gentle, predicted"] == pytest.approx((-0.5, abs(1 - 0.25 * 1.5)))
     assert points["rotation, predicted"][0] == pytest.approx(0.4)
+    rings = [line for axis in panels for line in axis.lines if line.get_marker() == "o"]
+    crosses = [line for axis in panels for line in axis.lines if line.get_marker() == "x"]
+    assert {str(line.get_markerfacecolor()) for line in rings} == {"none"}
+    assert min(line.get_zorder() for line in crosses) > max(line.get_zorder() for line in rings)
     [limit] = [np.asarray(line.get_xydata())[0, 0] for line in panels[0].lines if line.get_label() == "linear limit"]
     assert limit == pytest.approx(-2 / (0.5 * 1.5))
 

@@ -64,7 +64,7 @@ def test_columns_of_a_report(adaptive):
         "iterations",
         "worst residual",
     ]
-    assert [c.short for c in columns(metrics, headline=True)] == ["rms y [m]", "moves u [N/s]", "at limit", "factor"]
+    assert [c.short for c in columns(metrics, lambda m: m.headline)] == ["rms y [m]", "moves u [N/s]", "at limit", "factor"]
 
 
 def test_order_of_a_file():

@@ -215,7 +215,7 @@ def test_a_metric_is_one_value():
     """Measured, with its unit, in the order of its column, and as it writes itself."""
     metrics = fp.measure(problem(), run(np.linspace(1.0, -0.25, CYCLES)), with_own_metrics([OVERSHOOT]))
     assert metrics["overshoot"] == {"y": 0.25}
-    headings = [c.heading for c in columns([metrics], headline=True)]
+    headings = [c.heading for c in columns([metrics], lambda m: m.headline)]
     assert headings == ["rms error y [m]", "overshoot y [m]", "moves u [N/s]", "at limit"]
     assert metrics.text("overshoot", "y") == "0.25"
     with pytest.raises(InvalidName, match="Did you mean 'overshoot'"):

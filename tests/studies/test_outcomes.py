@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from fpirhc.report.outcomes import css_class, terminal_style
-from fpirhc.report.page import asset
+from fpirhc.report.page import asset, css_class
+from fpirhc.report.terminal import STYLES
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.scenarios.bootstrap import ConfidenceInterval
 from fpirhc.studies.scenarios.paired import Summary, verdict
@@ -50,6 +50,6 @@ def test_green_is_for_better_alone():
         ".headline.outcome-better",
         "li.outcome-better",
     }
-    assert [o for o in Outcome if "green" in terminal_style(o)] == [Outcome.BETTER]
+    assert [o for o in Outcome if "green" in STYLES[o]] == [Outcome.BETTER]
     assert css_class(None) == "remark"
-    assert terminal_style(None) == ""
+    assert STYLES[None] == ""

@@ -8,11 +8,13 @@ import abroad
 import pytest
 
 import fpirhc as fp
-from fpirhc.report.as_json import to_json
 from fpirhc.report.html import render
-from fpirhc.report.outcomes import css_class, terminal_style
+from fpirhc.report.page import css_class
+from fpirhc.report.terminal import STYLES
 from fpirhc.studies.comparison.compare import Comparison, compare
+from fpirhc.studies.comparison.comparison_view import comparison_view
 from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.view import to_json
 
 
 def compared(name: str, *controllers: str, variant: str = "problem", **changes) -> Comparison:
@@ -52,14 +54,14 @@ def test_reactor_fails_the_null_test(cstr):
 
 def test_what_does_not_help_is_never_green(cstr):
     """One outcome decides the words, the terminal's colour, the page's class and the JSON."""
-    assert terminal_style(cstr.outcome) == "bold red"
+    assert STYLES[cstr.outcome] == "bold red"
     page = render(cstr)
     assert "class='headline outcome-worse'>RHC+FPI does not help" in page
     assert "outcome-better" not in page.partition("<section id='verdict'>")[2].partition("</section>")[0]
-    facts = to_json(cstr)
+    facts = to_json(comparison_view(cstr).facts)
     assert '"outcome": "worse"' in facts
     assert '"harmful": true' in facts
-    green = [outcome for outcome in Outcome if "green" in terminal_style(outcome)]
+    green = [outcome for outcome in Outcome if "green" in STYLES[outcome]]
     assert green == [Outcome.BETTER]
     assert len({css_class(outcome) for outcome in Outcome}) == len(Outcome)
 
@@ -86,7 +88,7 @@ def test_servo_does_not_change():
     assert servo.findings[0].text.startswith(
         "RHC+FPI makes no clear difference: it changes the rms error of load from 0.0066"
     )
-    assert terminal_style(servo.outcome) == ""
+    assert STYLES[servo.outcome] == ""
     assert servo["RHC exact model"].metrics.rms_error["load"] < 1e-4
 
 

@@ -160,6 +160,7 @@ def test_an_error_that_is_no_number_is_not_compared():
         (Price("RHC", 0.4, 0.5), "; the time per cycle differs by less than can be measured here (0.5 microseconds)."),
         (Price("RHC", 9.94, 0.1), " at 9.9 more microseconds per cycle."),
         (Price("RHC", -1.6e3, 0.1), "."),
+        (Price("RHC", 2.0, 140.0), "."),
         (Price("another", 2.5, 0.1), "."),
         (None, "."),
     ],
@@ -167,7 +168,7 @@ def test_an_error_that_is_no_number_is_not_compared():
 def test_price(price, words):
     """Only a difference beyond the noise has a sign; nothing where both were not timed in turn.
 
-    Both cycles take 5 microseconds, so a difference of more than 10 was not theirs.
+    Both cycles take 5 microseconds, so a difference of more than 10 was not theirs, and one that needs to be as large is not told.
     """
     plain, adaptive = entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, facts={"price": price})
     assert said(plain, adaptive) == (f"FPI lowers the rms error of y from 1 to 0.5 m (2 times less){words}",)

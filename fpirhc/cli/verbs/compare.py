@@ -38,13 +38,14 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
-    from fpirhc.report.as_json import to_json
     from fpirhc.report.html import write_report
     from fpirhc.report.page import write_page
     from fpirhc.report.terminal import announce_backend, progress_bars, show
     from fpirhc.studies.comparison.compare import compare, select
+    from fpirhc.studies.comparison.comparison_view import comparison_view
     from fpirhc.studies.comparison.optimiser_choices import with_optimisers
     from fpirhc.studies.tuning.tuned_file import noted, read_tuned, with_tuned
+    from fpirhc.studies.view import to_json
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     task = with_tuned(task, tuned.values) if tuned else task
@@ -65,12 +66,13 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     comparison = noted(comparison, tuned.notes) if tuned else comparison
     report = folder / "report.html"
     write_report(comparison, report)
-    write_page(f"{to_json(comparison)}\n", folder / RESULTS)
+    view = comparison_view(comparison)
+    write_page(f"{to_json(view.facts)}\n", folder / RESULTS)
     announce_backend(entry.run for entry in comparison.entries)
     if options.json:
-        print(to_json(comparison))
+        print(to_json(view.facts))
     else:
-        show(comparison, report)
+        show(view, report)
     return _code(comparison)
 
 

@@ -63,27 +63,24 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
 
 def _show(tuning: Tuning, saved: Path) -> None:
-    from rich.console import Console
+    from fpirhc.report.terminal import say, show_harm, show_table
+    from fpirhc.summary import Column, Table
 
-    from fpirhc.report.folding import Column, Folding
-    from fpirhc.report.terminal import say, show_harm
-
-    console = Console()
     title = (
         f"{tuning.problem}: {tuning.trials} trials each, seed {tuning.seed}, {tuning.conditions}, cost: {tuning.metric}"
     )
     for entry in tuning.entries:
-        show_harm(console, entry.harm)
-    table = Folding(title, [Column(head) for head in ("controller, setting", "before", "after", "failed")])
+        show_harm(entry.harm)
+    table = Table(title, [Column(head) for head in ("controller, setting", "before", "after", "failed")])
     for entry in tuning.entries:
         table.add([f"{entry.name}: cost", f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed)])
         for path, value in entry.settings.items():
             table.add([f"  {path}", f"{entry.before[path]:.4g}", f"{value:.4g}", ""])
-    table.show(console)
+    show_table(table)
     if tuning.untouched:
-        say(console, f"not tuned: {', '.join(tuning.untouched)}")
+        say(f"not tuned: {', '.join(tuning.untouched)}")
     print(f"for the problem file, below its controllers:\n\n{tuning.python()}\n")
-    say(console, f"saved: {saved}", wrap=False)
+    say(f"saved: {saved}", wrap=False)
 
 
 VERB = Verb(

@@ -11,6 +11,7 @@ from typing import Literal, get_args
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.simulation.run import Run
+from fpirhc.summary import written_out
 from fpirhc.task.problem import Problem
 
 Better = Literal["smaller", "larger", "neither"]
@@ -18,11 +19,6 @@ Compared = Literal["banded", "tight", "exact", "not"]
 Function = Callable[[Problem, Run], float | Mapping[str, float] | None]
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
-
-
-def digits(value: float) -> str:
-    """Return a number in three digits."""
-    return f"{value:.3g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +58,7 @@ class Metric(Checked):
     better: Better = "smaller"
     title: str = ""
     short: str = ""
-    text: Callable[[float], str] = digits
+    text: Callable[[float], str] = written_out
     headline: bool = False
     report: bool = True
     shown: tuple[str, ...] | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from fpirhc.simulation.metrics.base import Metric
@@ -56,12 +56,16 @@ class Column:
         return named if self.unit in ("", "1") else f"{named} [{self.unit}]"
 
 
-def columns(runs: Sequence[Metrics], *, headline: bool = False) -> list[Column]:
-    """Return the columns of a report on these runs, or with `headline` those of short tables, without numbers that no run has."""
+def in_report(metric: Metric) -> bool:
+    """Whether a metric stands in a report's table or in a short one."""
+    return metric.report or metric.headline
+
+
+def columns(runs: Sequence[Metrics], wanted: Callable[[Metric], bool] = in_report) -> list[Column]:
+    """Return the columns of a table of these runs and of the wanted metrics, without numbers that no run has."""
     shown: dict[tuple[str, str], Column] = {}
     for metrics in runs:
         for metric, element, _ in metrics:
-            in_table = metric.headline if headline else metric.report
-            if in_table and (metric.shown is None or element in metric.shown):
+            if wanted(metric) and (metric.shown is None or element in metric.shown):
                 shown.setdefault((metric.name, element), Column(metric, element, metrics.units[metric.name][element]))
     return sorted(shown.values(), key=lambda column: column.metric.order)

@@ -25,7 +25,6 @@ from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
-from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
@@ -34,6 +33,7 @@ from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.caveats import yardstick_of
 from fpirhc.studies.comparison.changes import scales
+from fpirhc.studies.comparison.comparison_view import comparison_view
 from fpirhc.studies.comparison.entry import Contraction, Entry
 from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every
 from fpirhc.studies.comparison.harm import partners
@@ -44,7 +44,7 @@ from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.side_by_side import Built, beside_each_other, null_tests, with_reviewed_gains
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
-from fpirhc.summary import line, number, table
+from fpirhc.summary import line
 from fpirhc.task.problem import Problem
 
 Progress = Callable[[str, int, int], None]
@@ -120,19 +120,7 @@ class Comparison(FoundByName):
 
     def _repr_html_(self) -> str:
         """Verdict and errors as a table, for notebooks."""
-        shown = columns([e.metrics for e in self.entries], headline=True)
-        rows = [
-            (
-                e.name,
-                *(c.text(c.number(e.metrics), missing="", none="none") for c in shown),
-                number(e.cycle.median) if e.cycle else "",
-                f"ended early: {e.run.stop}" if e.run.stop else e.metrics.worst_status,
-            )
-            for e in self.entries
-        ]
-        head = ("controller", *(c.heading for c in shown), "cycle [us]", "worst status")
-        notes = (*(text for text, _ in self.sentences), *self.information)
-        return table(self.title, head, rows, notes)
+        return comparison_view(self).html()
 
     def __getitem__(self, name: str) -> Entry:
         for entry in self.entries:

@@ -17,6 +17,7 @@ from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
+from fpirhc.summary import written_out
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.native import native
@@ -107,7 +108,7 @@ def measure_optimality(
 
 def gap(excess: float, digits: int) -> str:
     """Return an excess as text; a plan that is clearly cheaper than the solve from rest has found another optimum."""
-    return "other optimum" if excess < -_OTHER else f"{max(excess, 0.0):.{digits}g}"
+    return "other optimum" if excess < -_OTHER else written_out(max(excess, 0.0), digits)
 
 
 class _Solver:

@@ -205,11 +205,12 @@ def _worst_rms(entry: Entry) -> float:
 def _price(plain: Entry, adaptive: Entry) -> str:
     """The difference of both times, from cycles that were timed in turn; nothing where they were not."""
     price = adaptive.price
-    if price is None or plain.cycle is None or price.beside != plain.name:
+    if price is None or plain.cycle is None or adaptive.cycle is None or price.beside != plain.name:
         return ""
-    if abs(price.difference) <= price.noise or adaptive.cycle is None:
+    # Something else kept the machine busy: neither a difference nor a smallest one can be larger than both times.
+    if max(abs(price.difference), price.noise) > plain.cycle.median + adaptive.cycle.median:
+        return ""
+    if abs(price.difference) <= price.noise:
         return f"; the time per cycle differs by less than can be measured here ({written_out(price.noise, 2)} microseconds)"
-    if abs(price.difference) > plain.cycle.median + adaptive.cycle.median:  # something else kept the machine busy
-        return ""
     more = "more" if price.difference > 0 else "fewer"
     return f" at {written_out(abs(price.difference), 2)} {more} microseconds per cycle"

@@ -22,10 +22,11 @@ from fpirhc.studies.comparison.compare import check_gains, select, versions
 from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
-from fpirhc.studies.scenarios.paired import Record, Summary, percent, signed, summarise, verdict
+from fpirhc.studies.scenarios.paired import Record, Summary, summarise, verdict
 from fpirhc.studies.scenarios.processes import Workers
+from fpirhc.studies.scenarios.scenario_view import scenario_view
 from fpirhc.studies.tuning.tuned_file import with_tuned
-from fpirhc.summary import line, table
+from fpirhc.summary import line
 
 LEDGER = "scenarios.jsonl"
 Progress = Callable[[str, int, int], None]
@@ -81,25 +82,13 @@ class ScenarioComparison(FoundByName):
 
     def _repr_html_(self) -> str:
         """Verdict and errors as a table, for notebooks."""
-        rows = [
-            (one.name, percent(one.median), _apart(one), f"{one.ratio:.3g}", percent(one.worst), str(one.failures))
-            for one in self.summaries
-        ]
-        head = ("controller", "median error", "difference (95 %)", "ratio", "worst", "failures")
-        return table(f"{self.title}: {self.count} scenarios", head, rows, self.verdict)
+        return scenario_view(self).html()
 
     def __getitem__(self, name: str) -> Summary:
         for summary in self.summaries:
             if summary.name == name:
                 return summary
         raise InvalidName(f"controller '{name}' is not here.{nearest(name, [s.name for s in self.summaries])}")
-
-
-def _apart(one: Summary) -> str:
-    """The difference to the baseline with its interval; a word for the baseline itself."""
-    if one.difference is None:
-        return "baseline"
-    return f"{signed(one.difference.median)} ({signed(one.difference.low)} to {signed(one.difference.high)})"
 
 
 @checked_call

@@ -9,6 +9,7 @@ import numpy as np
 from fpirhc.simulation.metrics.base import Function, Metric
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
+from fpirhc.summary import written_out
 from fpirhc.task.problem import Problem
 
 
@@ -48,8 +49,8 @@ def second_plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- e
 
 
 def residual(value: float) -> str:
-    """Return a residual by its power of ten."""
-    return f"{value:.0e}"
+    """Return a residual in one digit."""
+    return written_out(value, 1)
 
 
 METRICS = (
@@ -57,6 +58,7 @@ METRICS = (
         "solve.median_iterations",
         _over("iterations", np.median),
         title="iterations",
+        short="iter",
         text=iterations,
         finite=True,
         order=90,
@@ -66,6 +68,8 @@ METRICS = (
         "solve.median_stationarity",
         _over("stationarity", np.median),
         text=residual,
+        title="residual",
+        short="residual",
         report=False,
         compared="not",
         order=92,

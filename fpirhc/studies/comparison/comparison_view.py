@@ -1,0 +1,186 @@
+"""The view of a comparison: its sentences, its tables of controllers and of plans, its remarks, and its facts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from fpirhc.simulation.metrics.columns import Column as Number
+from fpirhc.simulation.metrics.columns import columns, in_report
+from fpirhc.studies.comparison.optimality import gap
+from fpirhc.studies.view import View, status_shares
+from fpirhc.summary import Column, Table, written_out
+
+if TYPE_CHECKING:
+    from fpirhc.simulation.metrics import Metric, Metrics
+    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.entry import Entry
+    from fpirhc.studies.comparison.null_test import NullTest
+    from fpirhc.studies.comparison.outcome import Finding
+
+_SOLVES = "solve."  # metrics of plans, which have a table of their own
+
+
+def comparison_view(comparison: Comparison) -> View:
+    """Return what is said of a comparison."""
+    entries = comparison.entries
+    ended = [f"{e.name} ended early: {e.run.stop}" for e in entries if e.run.stop]
+    notes = [f"{e.name}: {note}" for e in entries for note in e.notes]
+    own = {e.name: {k: v for k, v in e.run.settings.items() if k != "problem"} for e in entries}
+    since, marked = _since(comparison), _marked(comparison)
+    return View(
+        title=comparison.title,
+        about=comparison.description,
+        sentences=comparison.sentences,
+        conditions=f"Errors, effort and cost from t = {since} on; seed {comparison.seed}. Marked are the best of: {marked}.",
+        tables=(_controllers(comparison), _plans(comparison)),
+        lists={"Ended early": ended, "What they measure, and how often": comparison.information, "Notes": notes},
+        skipped=comparison.skipped,
+        settings={"problem": comparison.settings, **own},
+        versions=comparison.versions,
+        command=comparison.command,
+        elapsed=comparison.elapsed,
+        facts=_facts(comparison),
+    )
+
+
+def _since(comparison: Comparison) -> str:
+    return f"{comparison.measure_from:g} {comparison.time_unit}"
+
+
+def _marked(comparison: Comparison) -> str:
+    """Headings of the metrics whose best numbers are marked."""
+    shown = columns([e.metrics for e in comparison.entries], lambda m: m.headline and m.better != "neither")
+    return ", ".join(dict.fromkeys(c.metric.heading for c in shown))
+
+
+def _controllers(comparison: Comparison) -> Table:
+    """Metrics, time of a cycle, and how the runs ended; the best numbers are those of runs that did not end early."""
+    entries = comparison.entries
+    shown = columns([e.metrics for e in entries], lambda m: in_report(m) and not m.name.startswith(_SOLVES))
+    finished = [e for e in entries if e.run.stop is None]
+    best = {c: c.best([c.number(e.metrics) for e in finished]) for c in shown if c.metric.headline}
+    heads = [Column(c.heading, c.short if c.metric.headline else None) for c in shown]
+    table = Table(
+        f"{comparison.problem}, from t = {_since(comparison)}, seed {comparison.seed}",
+        [Column("controller"), *heads, Column("cycle [us]", "cycle us"), Column("status", left=True)],
+    )
+    for e in entries:
+        time = _micro(e.cycle.median) if e.cycle else ""
+        status = "ended early" if e.run.stop else status_shares(e.metrics.statuses)
+        marked = [k for k, c in enumerate(shown, 1) if best.get(c) is not None and c.number(e.metrics) == best[c]]
+        table.add([e.name, *(_text(c, e) for c in shown), time, status], best=marked)
+    return table.filled
+
+
+def _text(column: Number, entry: Entry) -> str:
+    return column.text(column.number(entry.metrics), missing="", none="none")
+
+
+def _plans(comparison: Comparison) -> Table:
+    """Iterations and residuals of controllers that plan, cost above the converged optimum, times of their cycles."""
+    planners = [e for e in comparison.entries if e.metrics.solve]
+    solves = columns([e.metrics for e in planners], _of_plans)
+    table = Table(
+        "plans",
+        [
+            Column("controller"),
+            *(Column(c.heading, c.metric.short or None) for c in solves),
+            Column("gap"),
+            Column("worst gap", None),
+            Column("plan [us]", "plan us"),
+            Column("p99 [us]", "p99 us"),
+            Column("max [us]", "max us"),
+            Column("first [us]", "first us"),
+        ],
+        "gap: cost above the converged optimum, relative; plan: the cycles that plan",
+    )
+    for e in planners:
+        gaps = [gap(v, 1) for v in (e.optimality.median, e.optimality.worst)] if e.optimality else ["", ""]
+        cycle = e.cycle
+        times = [_micro(v) for v in (cycle.planning, cycle.p99, cycle.maximum, cycle.first)] if cycle else [""] * 4
+        table.add([e.name, *(_text(c, e) for c in solves), *gaps, *times])
+    return table.filled
+
+
+def _of_plans(metric: Metric) -> bool:
+    return metric.name.startswith(_SOLVES) and (metric.report or bool(metric.short))
+
+
+def _micro(value: float) -> str:
+    return f"{value:,.0f}".replace(",", " ") if value >= 100 else written_out(value)
+
+
+def _facts(comparison: Comparison) -> dict[str, Any]:
+    return {
+        "problem": comparison.problem,
+        "seed": comparison.seed,
+        "versions": comparison.versions,
+        "verdict": comparison.verdict,
+        "outcome": str(comparison.outcome),
+        "information": comparison.information,
+        "findings": [_finding(f) for f in comparison.findings],
+        "null_test": None if comparison.null is None else _null_test(comparison.null),
+        "null_tests": [_null_test(test) for test in comparison.nulls],
+        "controllers": {e.name: _entry(e) for e in comparison.entries},
+        "skipped": comparison.skipped,
+    }
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    return {
+        "text": finding.text,
+        "outcome": None if finding.outcome is None else str(finding.outcome),
+        "pair": finding.pair,
+        "ratios": finding.ratios,
+    }
+
+
+def _null_test(null: NullTest) -> dict[str, Any]:
+    return {
+        "passed": null.passed,
+        "harmful": null.harmful,
+        "outcome": str(null.outcome),
+        "pair": null.pair,
+        "rms_error": {"before": null.before, "after": null.after},
+        "cycles": null.cycles,
+        "elapsed_s": null.elapsed,
+        "text": null.text,
+    }
+
+
+def _entry(entry: Entry) -> dict[str, Any]:
+    times = {"median": "median", "p99": "p99", "max": "maximum", "first": "first", "planning": "planning"}
+    return {
+        **_numbers(entry.metrics),
+        "cycle_us": _fields(entry.cycle, times),
+        "statuses": dict(entry.metrics.statuses),
+        "optimality": _fields(entry.optimality, ("median", "worst", "plans")),
+        "price_us": _fields(entry.price, ("beside", "difference", "noise")),
+        "notes": entry.notes,
+        "measures": entry.information.uses if entry.information else None,
+        "acts": entry.information.rate if entry.information else None,
+        "stop": entry.run.stop,
+        "compiled": entry.run.compiled,
+    }
+
+
+def _fields(value: object, names: Sequence[str] | dict[str, str]) -> dict[str, Any] | None:
+    """Attributes by name, or by the name that the file has for them; None where there is no value."""
+    own = names if isinstance(names, dict) else {name: name for name in names}
+    return None if value is None else {name: getattr(value, attribute) for name, attribute in own.items()}
+
+
+def _numbers(metrics: Metrics) -> dict[str, Any]:
+    """Every metric by name, null or empty where the run has no such number; metrics of a group stand inside it."""
+    facts: dict[str, Any] = {}
+    for name, metric in metrics.entries.items():
+        numbers: Any = dict(metrics[name]) if metric.by else metrics[name].get("")
+        group, _, rest = name.partition(".")
+        if not rest:
+            facts[name] = numbers
+        elif numbers is not None:
+            facts[group] = {**(facts.get(group) or {}), rest: numbers}
+        else:
+            facts.setdefault(group, None)
+    return facts
