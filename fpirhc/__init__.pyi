@@ -82,8 +82,7 @@ from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
 from .plant.spread import LogNormal, Normal, Spread, Uniform
 from .problem_files.problem_file import load_problem
-from .problem_files.settings import with_settings
-from .problem_files.tuning_spans import LogSpan, Span
+from .problem_files.settings import LogSpan, Span, with_settings
 from .report.html import write_report
 from .review.answer import Answer, Review
 from .review.response_prediction import Prediction, predict_response
@@ -123,11 +122,10 @@ from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.foreign import Foreign
 from .task.limits import Limits, PathConstraint
-from .task.outside import Believed, Known, Unknown
+from .task.outside import Believed, Known, Samples, Unknown
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
-from .task.samples import Samples
 from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional

@@ -18,7 +18,7 @@ from fpirhc.baselines.reading import read_baseline
 from fpirhc.baselines.settings import settings_of
 from fpirhc.baselines.variants import names_by_source, nominal, variants
 from fpirhc.errors import BaselineError, FpirhcError, InvalidValue
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.studies.comparison.compare import select, versions

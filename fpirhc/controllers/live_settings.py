@@ -20,7 +20,7 @@ from fpirhc.controllers.contract import Controller, checked, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.given import described
-from fpirhc.fields.real_number import real_number
+from fpirhc.fields.kinds import real_number
 from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.constants import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar

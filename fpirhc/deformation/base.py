@@ -19,7 +19,7 @@ from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked, unnamed_inner
 from fpirhc.fields.given import described
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.layout import Expression, Layout
 
 Wrapping = TypeVar("Wrapping")

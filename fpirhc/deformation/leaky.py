@@ -22,7 +22,7 @@ import math
 
 from fpirhc.deformation.queue import Cycles, every
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.functions import ceil, entry_at
 from fpirhc.symbolic.layout import Expression

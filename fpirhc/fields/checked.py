@@ -11,13 +11,14 @@ import sys
 from abc import ABCMeta
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, wraps
+from typing import ParamSpec, TypeVar
 
 from fpirhc.by_name import find_by_name
 from fpirhc.errors import InvalidField
 from fpirhc.fields.arguments import Arguments, arguments_of, read_annotation
 from fpirhc.fields.expected import Expected, Number
-from fpirhc.fields.place import users_place
+from fpirhc.fields.user_code import users_place
 
 
 class _CheckedWhenCalled(ABCMeta):
@@ -109,3 +110,34 @@ def _expected(owner: type, parameter: inspect.Parameter) -> Expected:
 
 def _read(annotation: object, owner: type) -> Expected:
     return read_annotation(annotation, vars(sys.modules.get(owner.__module__, sys)), vars(owner))
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def checked_call(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function with a check of its arguments: a decorator for the verbs of the library.
+
+    An annotation whose name the module imports for type checkers only checks nothing.
+
+    Raises:
+        InvalidField: all wrong arguments together, when the function is called.
+    """
+
+    @wraps(function)
+    def checked(*arguments: P.args, **named: P.kwargs) -> R:
+        mistakes = tuple(checks_of(function).mistakes(arguments, named))
+        if mistakes:
+            raise InvalidField(mistakes, users_place())
+        return function(*arguments, **named)
+
+    return checked
+
+
+@cache
+def checks_of(function: Callable[..., object]) -> Arguments:
+    """Return what is checked of a function's arguments; they are read at its first call, when every module is loaded."""
+    names = getattr(inspect.unwrap(function), "__globals__", {})
+    parameters = tuple(inspect.signature(function).parameters.values())
+    return arguments_of(function, "argument", parameters, lambda one: read_annotation(one.annotation, names, {}))

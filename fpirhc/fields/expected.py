@@ -16,8 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.fields.given import shortened
-from fpirhc.fields.kinds import Range
-from fpirhc.fields.real_number import real_number
+from fpirhc.fields.kinds import Range, real_number
 from fpirhc.symbolic.number import SymbolicNumber
 
 

@@ -1,10 +1,20 @@
-"""Numbers with a range, for the annotations of fields: `rate: Positive`. A type checker reads them as float or int."""
+"""Numbers: kinds with a range for the annotations of fields, `rate: Positive`; what counts as one; numbers by name.
+
+A type checker reads a kind as float or int.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from numbers import Real
+from typing import Annotated, TypeAlias, TypeVar
+
+import numpy as np
+
+from fpirhc.errors import InvalidField
+from fpirhc.fields.given import described
 
 
 @dataclass(frozen=True)
@@ -46,3 +56,46 @@ Count: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000000", low=
 Few: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000", low=1, high=1000)]
 Seed: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]  # of random numbers
 CountOrZero: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]
+
+
+def real_number(value: object) -> float | None:
+    """Return one real number as a float, which may be NaN or infinite; None for everything else.
+
+    Arrays with one entry count. No numbers are texts, truth values, None, complex numbers, durations (numpy makes integers of
+    them), expressions, and whole numbers beyond the largest float, 1.8e308.
+    """
+    if type(value) is float:
+        return value
+    if isinstance(value, np.ndarray):
+        if isinstance(value, np.ma.MaskedArray) or value.size != 1:
+            return None
+        value = value.ravel()[0]
+    if isinstance(value, bool | np.bool_ | np.timedelta64) or not isinstance(value, Real):
+        return None
+    try:
+        return float(value)
+    except (OverflowError, TypeError, ValueError):  # 10**400; a class of somebody's that only says that it is a number
+        return None
+
+
+def finite_number(value: object) -> bool:
+    """Return whether it is one real number that is finite."""
+    number = real_number(value)
+    return number is not None and math.isfinite(number)
+
+
+Value = TypeVar("Value")
+
+
+def named_entries(what: str, entries: Mapping[str, Value]) -> Mapping[str, Value]:
+    """Return the entries as they are, by name; `what` names them: "settings".
+
+    Raises:
+        InvalidField: no mapping, or names that are no texts.
+    """
+    if not isinstance(entries, Mapping):
+        raise InvalidField([f"{what}: expected a mapping {{name: number}}, got {described(entries)}"])
+    strange = [name for name in entries if not isinstance(name, str)]
+    if strange:
+        raise InvalidField([f"{what}: expected names as texts, got the name {described(one)}" for one in strange])
+    return entries

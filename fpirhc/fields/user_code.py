@@ -6,11 +6,13 @@ import inspect
 import linecache
 import math
 import re
+import sys
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from types import FrameType
 from typing import TypeVar
 
 import casadi as ca
@@ -18,7 +20,6 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidProblem, nearest
 from fpirhc.fields.given import described
-from fpirhc.fields.place import is_users
 from fpirhc.symbolic.expression import Expression, expression
 
 Result = TypeVar("Result")
@@ -113,7 +114,7 @@ def explained(error: BaseException) -> str:
 
 def place_in_users_code(error: BaseException) -> str:
     """Return "file.py, line 12: source" of the innermost line of a user's file; empty where there is none."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if is_users(f.filename)]
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if _is_users(f.filename)]
     if not frames:
         return ""
     return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}"
@@ -149,7 +150,7 @@ def _at(error: BaseException) -> str:
 
 
 def _line_of(error: BaseException) -> str:
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if is_users(f.filename)]
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if _is_users(f.filename)]
     return "" if not frames else linecache.getline(frames[-1].filename, frames[-1].lineno or 0)
 
 
@@ -215,3 +216,37 @@ _EQUIVALENTS = {
     "mod": "fmod",
     "square": "power(x, 2)",
 }
+
+
+_PACKAGE = str(Path(__file__).resolve().parents[1])
+_PROBLEMS = str(Path(_PACKAGE) / "_problems")  # shipped problems of an installed package are read as a user's files
+
+
+def users_place() -> str:
+    """Return "file.py, line 12" of the innermost call from outside the package; empty where there is none."""
+    _, frame = _users_frame(sys._getframe(1))
+    return f"{Path(frame.f_code.co_filename).name}, line {frame.f_lineno}" if frame else ""
+
+
+def users_level() -> int:
+    """Return the `stacklevel` with which a warning by the caller of this function stands at the user's line."""
+    depth, frame = _users_frame(sys._getframe(1))
+    return depth + 1 if frame else 1
+
+
+def _users_frame(frame: FrameType | None) -> tuple[int, FrameType | None]:
+    """The innermost frame of a user's code from this one on, and how many calls it is away."""
+    depth = 0
+    while frame is not None and not _is_users(frame.f_code.co_filename):
+        frame, depth = frame.f_back, depth + 1
+    return depth, frame
+
+
+def _is_users(filename: str) -> bool:
+    """Whether a file of code belongs neither to the package nor to the libraries around it."""
+    if filename.startswith(_PACKAGE) and not filename.startswith(_PROBLEMS):
+        return False
+    return filename.endswith(".py") and not filename.startswith(_LIBRARIES)
+
+
+_LIBRARIES = (str(Path(sys.prefix) / "lib"), str(Path(sys.base_prefix) / "lib"), "<")

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.by_name import ByName
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.optimisers.base import FEASIBLE, Optimiser, improved, judge

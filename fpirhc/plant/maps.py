@@ -31,7 +31,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from fpirhc.errors import InvalidValue, Mistakes
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.motion import Motion
 from fpirhc.symbolic.layout import Expression, Named
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.spread import Spread
 
 

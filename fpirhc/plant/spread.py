@@ -14,7 +14,7 @@ from statistics import NormalDist
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.real_number import real_number
+from fpirhc.fields.kinds import real_number
 
 TAILS = 2.0  # standard deviations at which normal distributions are cut off; 95 % of the uncut one lie inside
 _NORMAL = NormalDist()

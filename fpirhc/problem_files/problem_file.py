@@ -20,12 +20,12 @@ from fpirhc.by_name import FoundByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import named_in_task
 from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.fields.given import call_of, described
 from fpirhc.problem_files.importing import imported
 from fpirhc.problem_files.importing import line_of as _at
+from fpirhc.problem_files.settings import TuningSpans, check_tuning
 from fpirhc.problem_files.shipped import find_problem
-from fpirhc.problem_files.tuning_spans import TuningSpans, check_tuning
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.summary import line, table

@@ -1,17 +1,20 @@
-"""Settings of a controller by dotted path."""
+"""Settings of a controller by dotted path, and the ranges in which tuning searches for them, linear or logarithmic."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import is_dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import expects_whole_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
 
 Values = Mapping[str, float]
+_DIGITS = 4  # of every number that is tried, so that a written number is exactly the tried one
 
 
 def with_settings(controller: Controller, values: Values) -> Controller:
@@ -61,3 +64,93 @@ def is_whole(controller: Controller, path: str) -> bool:
     parent, _, name = path.rpartition(".")
     owner: Any = content_at(controller, parent) if parent else controller
     return is_dataclass(owner) and expects_whole_number(type(owner), name)
+
+
+@dataclass(frozen=True)
+class Span:
+    """Numbers from `low` to `high`, all equally likely at first.
+
+    Args:
+        low: the smallest number.
+        high: the largest number.
+
+    Raises:
+        InvalidValue: an end that is not finite, or a low end that is not below the high end.
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        _check(self, "Span")
+
+    def number(self, share: float) -> float:
+        """Return the number at `share` (0 to 1) of the way from low to high."""
+        return _rounded(self.low + share * (self.high - self.low), self.low, self.high)
+
+
+@dataclass(frozen=True)
+class LogSpan:
+    """Numbers of one sign whose logarithms are equally likely at first, for settings such as 0.01, 0.1 or 1.
+
+    Args:
+        low: the smallest number.
+        high: the largest number.
+
+    Raises:
+        InvalidValue: an end that is not finite, a low end that is not below the high end, or ends of different sign.
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        _check(self, "LogSpan")
+        if self.low * self.high <= 0:
+            raise InvalidValue(
+                f"LogSpan({self.low!r}, {self.high!r}): both ends must have the same sign; use Span across zero"
+            )
+
+    def number(self, share: float) -> float:
+        """Return the number at `share` (0 to 1) of the way from low to high."""
+        value = math.copysign(
+            math.exp(math.log(abs(self.low)) * (1 - share) + math.log(abs(self.high)) * share), self.low
+        )
+        return _rounded(value, self.low, self.high)
+
+
+TuningSpans = Mapping[str, Span | LogSpan]
+
+
+def check_tuning(tuning: Any, controllers: Mapping[str, Controller]) -> None:
+    """Raise if a problem file's `tuning` is not {controller: {path: Span or LogSpan}} of controllers and settings that exist.
+
+    Raises:
+        InvalidProblem: all mistakes together, with the nearest valid names.
+    """
+    mistakes = Mistakes("tuning")
+    if not isinstance(tuning, Mapping) or not all(isinstance(spans, Mapping) for spans in tuning.values()):
+        mistakes.add("expected {'controller': {'deformation.gain': fpirhc.Span(low, high)}}")
+        mistakes.raise_if_any()
+    mistakes.unknown("controller", tuning, controllers)
+    for name in (n for n in tuning if n in controllers):
+        for path, span in tuning[name].items():
+            if not isinstance(span, Span | LogSpan):
+                mistakes.add(
+                    f"controller '{name}', '{path}': expected Span(low, high) or LogSpan(low, high), got {span!r}"
+                )
+            try:
+                current_setting(controllers[name], str(path))
+            except FpirhcError as error:
+                mistakes.add(f"controller '{name}': {error}")
+    mistakes.raise_if_any()
+
+
+def _check(span: Span | LogSpan, kind: str) -> None:
+    numbers = all(finite_number(v) for v in (span.low, span.high))
+    if not numbers or not span.low < span.high:
+        raise InvalidValue(f"{kind}({span.low!r}, {span.high!r}): expected two finite numbers, the smaller one first")
+
+
+def _rounded(value: float, low: float, high: float) -> float:
+    return min(max(float(f"{value:.{_DIGITS}g}"), low), high)

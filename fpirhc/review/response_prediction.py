@@ -11,7 +11,7 @@ from fpirhc.by_name import ByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.mismatch import check_mismatch
 from fpirhc.review.grid import review_grid

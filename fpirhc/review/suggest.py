@@ -22,7 +22,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.review.grid import review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import loops_along

@@ -31,7 +31,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, with_margins
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.review.grid import each, review_grid
 from fpirhc.review.linear import LinearLoop

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.real_number import real_number
+from fpirhc.fields.kinds import real_number
 from fpirhc.task.disturbance import Disturbance
 
 

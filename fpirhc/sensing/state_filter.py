@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, known_by_positions, spline_weights
 from fpirhc.symbolic.block import Block

@@ -11,8 +11,7 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.errors import InvalidField, InvalidValue
 from fpirhc.fields.given import described
-from fpirhc.fields.named_entries import named_entries
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number, named_entries
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.task.problem import Problem

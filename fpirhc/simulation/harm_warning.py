@@ -16,7 +16,7 @@ from importlib import import_module
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task, without_deformation
 from fpirhc.errors import FpirhcError, HarmfulAdaptation, NotContractive
-from fpirhc.fields.place import users_level
+from fpirhc.fields.user_code import users_level
 from fpirhc.simulation.trials import Trials
 from fpirhc.symbolic.latest import Latest
 from fpirhc.task.problem import Problem

@@ -27,7 +27,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.plant.units import derivative_unit, with_space
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem

@@ -9,7 +9,7 @@ import numpy as np
 from fpirhc.by_name import ByName
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue
-from fpirhc.fields.named_entries import named_entries
+from fpirhc.fields.kinds import named_entries
 from fpirhc.simulation.set_points import SetpointsNow, set_points_now
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.live import PREFIX

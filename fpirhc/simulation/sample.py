@@ -6,7 +6,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue
 from fpirhc.fields.given import described
-from fpirhc.fields.real_number import real_number
+from fpirhc.fields.kinds import real_number
 from fpirhc.simulation.run import Run
 
 

@@ -10,8 +10,7 @@ import numpy as np
 from fpirhc.controllers.own_reference import given_signals
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.fields.given import described
-from fpirhc.fields.named_entries import named_entries
-from fpirhc.fields.real_number import real_number
+from fpirhc.fields.kinds import named_entries, real_number
 from fpirhc.fields.user_code import called
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps

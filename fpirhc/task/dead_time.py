@@ -21,7 +21,7 @@ import casadi as ca
 
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals

@@ -1,7 +1,13 @@
-"""One filter with equal poles per coordinate, and the motion of a plant's reference that follows from them."""
+"""One filter with equal poles per coordinate, (d/dt + a)^m y = a^m w, and the motion of a plant's reference that follows from them.
+
+With z = (y, y', ..., y^(m-1)), b = (1, 0, ..., 0) and w held, z(t + h) = w b + Phi(h) (z(t) - w b) with Phi(h) =
+e^(-a h) sum_{k<m} (h N)^k / k!; N = A + a I, A the companion matrix of (s + a)^m, is nilpotent. Products and sums round alike
+for numbers, live numbers and expressions. Source: Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998, 4.3.3.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,12 +18,12 @@ import numpy as np
 
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import exp, power
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.live import is_live
-from fpirhc.task.equal_poles import Entry, after_motion, differences, highest, transition
 
-GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
-OWN = "_reference_own"  # the filters' state, what is given, and a live rate
+_GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
+_OWN = "_reference_own"  # the filters' state, what is given, and a live rate
 FILTER = "reference_filter"  # remembered: the filters' state
 
 
@@ -48,25 +54,25 @@ class FilterBank:
         names = self.plant.names
         later = tuple(f"{name}@{k}" for k in range(1, self.nodes) for name in names)
         units = tuple(self.plant.coordinates[name] for name in names)
-        return Signal(GIVEN, (*names, *later), units * self.nodes)
+        return Signal(_GIVEN, (*names, *later), units * self.nodes)
 
     @property
     def own(self) -> Signal:
         """The signal from which the motion follows: the filters' state, the set-points, and the rate where it is live."""
         rate = ("rate",) if is_live(self.rate) else ()
-        return Signal(OWN, (*self.elements, *(f"{GIVEN}.{name}" for name in self.given.elements), *rate))
+        return Signal(_OWN, (*self.elements, *(f"{_GIVEN}.{name}" for name in self.given.elements), *rate))
 
     def gathered(self, s: Signals) -> Expression:
         """Return the own signal inside a step."""
         rate = [cast(Expression, self.rate)] if is_live(self.rate) else []
-        return ca.vertcat(getattr(s, FILTER), getattr(s, GIVEN), *rate)
+        return ca.vertcat(getattr(s, FILTER), getattr(s, _GIVEN), *rate)
 
     def advanced(self, s: Signals, period: float) -> Expression:
         """Return the filters' state one cycle later inside a step, with the set-points held."""
-        parts, points = self._split(getattr(s, FILTER)), getattr(s, GIVEN)
+        parts, points = self._split(getattr(s, FILTER)), getattr(s, _GIVEN)
         phis = [transition(self.rate, period, order) for order in self.orders.values()]
         return ca.vertcat(
-            *(after_motion(phi, z, points[k]) for k, (phi, z) in enumerate(zip(phis, parts, strict=True)))
+            *(_after_motion(phi, z, points[k]) for k, (phi, z) in enumerate(zip(phis, parts, strict=True)))
         )
 
     def motion(self, ahead: float) -> ca.Function:
@@ -75,7 +81,7 @@ class FilterBank:
         z, points, rate = self._parts(own)
         if ahead:
             phis = [transition(rate, ahead, order) for order in self.orders.values()]
-            z = [after_motion(phi, z[k], points[k, 0]) for k, phi in enumerate(phis)]
+            z = [_after_motion(phi, z[k], points[k, 0]) for k, phi in enumerate(phis)]
         state, response = arranged(self.plant, self._chains(z, points[:, 0], rate))
         results = [ca.densify(state), ca.densify(response)]
         return ca.Function("fpirhc_reference_now", [ca.SX.sym("t"), own], results, ["t", "own"], ["state", "response"])
@@ -96,20 +102,20 @@ class FilterBank:
         for node in range(stages + 1):
             held = points[:, min(node, self.nodes - 1)]
             columns.append(arranged(self.plant, self._chains(z, held, rate)))
-            z = [after_motion(phi, z[k], held[k]) for k, phi in enumerate(phis)]
+            z = [_after_motion(phi, z[k], held[k]) for k, phi in enumerate(phis)]
         tables = [ca.densify(ca.horzcat(*parts)) for parts in zip(*columns, strict=True)]
         return ca.Function("fpirhc_reference_preview", [own], tables, ["own"], ["states", "responses"])
 
     def _split(self, column: Expression) -> list[Expression]:
         return ca.vertsplit(column, [0, *np.cumsum(list(self.orders.values())).tolist()])
 
-    def _parts(self, own: Expression) -> tuple[list[Expression], Expression, Entry]:
+    def _parts(self, own: Expression) -> tuple[list[Expression], Expression, _Entry]:
         """State of every filter, set-points (n, nodes), and rate, of the own signal."""
         size, count = len(self.elements), self.given.size
         points = ca.reshape(own[size : size + count], len(self.orders), self.nodes)
         return self._split(own[:size]), points, own[size + count] if is_live(self.rate) else self.rate
 
-    def _chains(self, z: Sequence[Expression], held: Expression, rate: Entry) -> list[Expression]:
+    def _chains(self, z: Sequence[Expression], held: Expression, rate: _Entry) -> list[Expression]:
         """(y, y', ..., y^(m)) of every coordinate; of a map the divided differences."""
         orders = enumerate(self.orders.values())
         if self.plant.step is not None:
@@ -124,3 +130,72 @@ def arranged(plant: Plant, chains: Sequence[Expression]) -> tuple[Expression, Ex
     state = [by_name[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
     response = [by_name[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
     return ca.vertcat(*state), ca.vertcat(*response)
+
+
+_Entry = float | Expression  # a number, a live number or an expression
+
+
+def transition(rate: _Entry, time: _Entry, order: int) -> list[list[_Entry]]:
+    """Return Phi(time) row by row, shape (order, order)."""
+    nilpotent = _nilpotent(rate, order)
+    term, terms = _identity(order), _identity(order)
+    for k in range(1, order):
+        term = [[entry * time / k for entry in row] for row in _product(term, nilpotent)]
+        terms = [[a + b for a, b in zip(*rows, strict=True)] for rows in zip(terms, term, strict=True)]
+    decay = _exp(-(rate * time))
+    return [[decay * entry for entry in row] for row in terms]
+
+
+def _after_motion(phi: Sequence[Sequence[_Entry]], z: Expression, held: Expression) -> Expression:
+    """Return z after the motion with the transition Phi while w = `held`."""
+    apart = [z[0] - held, *(z[k] for k in range(1, len(phi)))]
+    # At rest every difference is exactly zero, and so z stays exactly where it is.
+    rows = [sum(entry * a for entry, a in zip(row, apart, strict=True)) for row in phi]
+    return ca.vertcat(held + rows[0], *rows[1:])
+
+
+def highest(rate: _Entry, z: Expression, held: Expression, order: int) -> Expression:
+    """Return y^(m) for w = `held`."""
+    value = power(rate, order) * (held - z[0])
+    for j in range(1, order):
+        value = value - math.comb(order, j) * power(rate, order - j) * z[j]
+    return value
+
+
+def differences(rate: _Entry, step: float, z: Expression, held: Expression, order: int) -> list[Expression]:
+    """Return y and its divided forward differences over steps of a map, up to the order m, for w = `held`.
+
+    With the distance d = z - w b they are the first entries of ((Phi(T) - I) / T)^j d.
+    """
+    phi = transition(rate, step, order)
+    apart, values = [z[0] - held, *(z[k] for k in range(1, order))], [z[0]]
+    for _ in range(order):
+        later = [sum(entry * a for entry, a in zip(row, apart, strict=True)) for row in phi]
+        apart = [(after - before) / step for after, before in zip(later, apart, strict=True)]
+        values.append(apart[0])
+    return values
+
+
+def _nilpotent(rate: _Entry, order: int) -> list[list[_Entry]]:
+    """N = A + a I."""
+    rows: list[list[_Entry]] = [[0.0] * order for _ in range(order)]
+    for k in range(order):
+        if k + 1 < order:
+            rows[k][k + 1] = 1.0
+        rows[k][k] = rows[k][k] + rate
+    for j in range(order):
+        rows[-1][j] = rows[-1][j] - math.comb(order, j) * power(rate, order - j)
+    return rows
+
+
+def _identity(order: int) -> list[list[_Entry]]:
+    return [[1.0 if j == k else 0.0 for j in range(order)] for k in range(order)]
+
+
+def _product(left: list[list[_Entry]], right: list[list[_Entry]]) -> list[list[_Entry]]:
+    columns = list(zip(*right, strict=True))
+    return [[sum(a * b for a, b in zip(row, column, strict=True)) for column in columns] for row in left]
+
+
+def _exp(value: _Entry) -> _Entry:
+    return ca.exp(value) if isinstance(value, ca.SX | ca.MX) else exp(value)

@@ -9,11 +9,13 @@ shape, a number that is not finite, an answer after the deadline - is held or en
 
 from __future__ import annotations
 
+import queue
+import threading
 import time as wall
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +24,6 @@ from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Positive
 from fpirhc.plant.plant import Plant
-from fpirhc.task.giving_up import Caller, GaveUp
 
 _LONGEST = 60  # characters of an answer that are shown
 
@@ -108,7 +109,7 @@ class Foreign(Checked):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("reality")
-        units = quantities(model)
+        units = _quantities(model)
         mistakes.unknown("measures: quantity", self.measures, units)
         for name in needed:
             if name not in self.measures:
@@ -137,9 +138,9 @@ class Foreign(Checked):
         return self._answer(lambda: self.body.step(time, command), "step", self.deadline)
 
     @cached_property
-    def _caller(self) -> Caller:
+    def _caller(self) -> _Caller:
         """The thread that calls the body; there is one, because a body that is given up is still inside its call."""
-        return Caller()
+        return _Caller()
 
     def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, deadline: float | None) -> Reading:
         if self.deadline is None:
@@ -147,7 +148,7 @@ class Foreign(Checked):
         who = f"{method} of {type(self.body).__name__}"
         try:
             return self._caller.call(lambda: self._judged(ask, method, deadline), deadline, free_within=self.deadline)
-        except GaveUp as end:
+        except _GaveUp as end:
             what = "did not return" if end.begun else "was not called, because its last call has not returned"
             return Reading(None, f"{who} {what} within {self.deadline:.3g} s, its deadline; it was given up")
 
@@ -203,10 +204,78 @@ def _short(answer: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
-def quantities(model: Plant) -> dict[str, str]:
+def _quantities(model: Plant) -> dict[str, str]:
     """Return the unit of every quantity of a model that can be measured: state elements, outputs, and controlled responses."""
     signals, orders = (model.state, model.output), model.response_orders
     shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
     units = model.response_signal("realised").entry_units
     responses = {name + "'" * order: unit for (name, order), unit in zip(orders.items(), units, strict=True)}
     return {**shown, **responses}
+
+
+Result = TypeVar("Result")
+
+
+class _GaveUp(Exception):
+    """The time is over; `begun` says whether the call itself was begun."""
+
+    def __init__(self, *, begun: bool) -> None:
+        super().__init__(begun)
+        self.begun = begun
+
+
+class _Caller:
+    """Calls functions in one thread of its own, one after another; who waits can give up, and nothing is interrupted.
+
+    An object that belongs to a thread is safe so. The thread begins with the first call and does not keep the program from ending.
+    """
+
+    def __init__(self) -> None:
+        self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._last = threading.Event()  # set when the last call has returned
+        self._last.set()
+
+    def call(self, function: Callable[[], Result], patience: float | None, *, free_within: float) -> Result:
+        """Return what a function returns, or raise what it raises.
+
+        Args:
+            function: without arguments.
+            patience: longest time that is waited for it, s; None: any.
+            free_within: longest time in which an earlier call that was given up has to return, s.
+
+        Raises:
+            GaveUp: it has not returned by then.
+        """
+        end = None if patience is None else wall.monotonic() + patience
+        if not self._last.wait(free_within):
+            raise _GaveUp(begun=False)
+        returned: list[Result] = []
+        raised: list[BaseException] = []
+        done = self._last = threading.Event()
+
+        def run() -> None:
+            try:
+                returned.append(function())
+            except BaseException as error:  # noqa: BLE001 -- it is raised where the result is waited for
+                raised.append(error)
+            finally:
+                done.set()
+
+        self._start()
+        self._calls.put(run)
+        if not done.wait(None if end is None else max(end - wall.monotonic(), 0.0)):
+            raise _GaveUp(begun=True)
+        if raised:
+            raise raised[0]
+        return returned[0]
+
+    def _start(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=_work, args=(self._calls,), name="fpirhc body", daemon=True)
+            self._thread.start()
+
+
+def _work(calls: queue.SimpleQueue[Callable[[], None]]) -> None:
+    while True:
+        calls.get()()

@@ -11,7 +11,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Expression, Value

@@ -13,8 +13,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Duration
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import Duration, finite_number
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.regular_gain import Bounds, nominal_run, singular_gain

@@ -21,12 +21,13 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.algebraic_check import unsolved
-from fpirhc.plant.chain import derivatives_function
+from fpirhc.plant.chain import derivatives_function, input_reaches_at
 from fpirhc.plant.integrators import Integrator
+from fpirhc.plant.outputs import output_order
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
-from fpirhc.task.reality_check import check_coordinate, check_expression, check_inputs, other_unit, quantities_of
+from fpirhc.plant.structural_order import structural_order
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ class Reality(Checked):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("reality")
-        check_inputs(self.plant, model, mistakes)
+        _check_inputs(self.plant, model, mistakes)
         mistakes.unknown("seen: coordinate of the model", self.seen, model.coordinates)
         mistakes.unknown("seen: coordinate of the reality", self.seen.values(), self.plant.coordinates)
         mistakes.unknown("start: state", self.start, self.plant.state.elements)
@@ -94,21 +95,21 @@ class Reality(Checked):
             )
         for name, unit in model.coordinates.items():
             if needed is None or name in needed:
-                check_coordinate(self.plant, self.seen, model, name, mistakes)
+                _check_coordinate(self.plant, self.seen, model, name, mistakes)
             elif self.plant.coordinates.get(name, unit) != unit:
-                mistakes.add(other_unit(self.plant, name, name, unit))
+                mistakes.add(_other_unit(self.plant, name, name, unit))
         if model.outputs and self.seen:
             mistakes.add(
                 "seen: what is measured of a model with outputs are the outputs of the same names; write the sensor there"
             )
         for name in model.outputs:
-            check_expression(self.plant, model, name, mistakes)
+            _check_expression(self.plant, model, name, mistakes)
         mistakes.raise_if_any()
 
     def shown(self, model: Plant) -> tuple[str, ...]:
         """Return the names of the model's states that it has, in the model's order."""
         own = dict(zip(model.names, self._names(model, seen=True), strict=True))
-        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in quantities_of(self.plant))
+        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in _quantities_of(self.plant))
 
     def state_function(self, model: Plant, *, seen: bool) -> ca.Function:
         """Function (state, input, parameters, forcing) of the reality -> the model's states that it has, in the order of `shown`.
@@ -190,11 +191,11 @@ class Reality(Checked):
 
     def shows(self, coordinate: str) -> bool:
         """Whether it has a coordinate or an output at which one of the model is judged."""
-        return self.true_name(coordinate) in quantities_of(self.plant)
+        return self.true_name(coordinate) in _quantities_of(self.plant)
 
     def true_name(self, coordinate: str) -> str:
         """Return its coordinate at which a coordinate of the model is judged."""
-        return coordinate if coordinate in quantities_of(self.plant) else self.seen.get(coordinate, coordinate)
+        return coordinate if coordinate in _quantities_of(self.plant) else self.seen.get(coordinate, coordinate)
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
         """Raise if the reality cannot move from its start, or the integrator cannot follow it there.
@@ -258,3 +259,89 @@ class Reality(Checked):
         if seen:
             return tuple(self.seen.get(c, c) for c in model.names)
         return tuple(self.true_name(c) for c in model.names)
+
+
+def _quantities_of(plant: Plant) -> dict[str, str]:
+    """Return the units of what a reality can show: its coordinates and its outputs."""
+    return {**plant.coordinates, **{name: one.unit for name, one in plant.outputs.items()}}
+
+
+def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
+    """Add what is wrong with the reality's inputs, which are the model's."""
+    own, expected = ", ".join(plant.inputs), ", ".join(model.inputs)
+    if own != expected:
+        mistakes.add(
+            f"its inputs are {own}, the model's are {expected}; both take the same commands, so name them alike, in order"
+        )
+    for name, unit in plant.inputs.items():
+        other = model.inputs.get(name, unit)
+        if unit != other:
+            mistakes.add(f"its input '{name}' is in {unit}, the model's in {other}; write both in one unit")
+
+
+def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name: str, mistakes: Mistakes) -> None:
+    """Add what is wrong with the coordinate of a reality that stands for a coordinate of the model.
+
+    Args:
+        plant: the reality's.
+        seen: name of the model's coordinate -> name of what is measured in its place.
+        model: of the problem.
+        name: of the model's coordinate.
+        mistakes: to which it is added.
+    """
+    own, units, unit = seen.get(name, name), _quantities_of(plant), model.coordinates[name]
+    if own not in units:
+        if name not in seen:
+            followed = not model.outputs and name in (model.controlled or model.names)
+            believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
+            mistakes.add(
+                f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
+                f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"
+            )
+        return
+    for one in sorted({own, name} & set(units)):
+        if units[one] != unit:
+            mistakes.add(_other_unit(plant, one, name, unit))
+    order = model.orders[model.names.index(name)]
+    at_once = input_reaches_at(plant, own, order - 1)
+    if at_once is not None:
+        mistakes.add(
+            f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
+            f"the order {order}; give the model this order, or the reality a coordinate of its own"
+        )
+    elif not model.outputs and name in (model.controlled or model.names) and _order(plant, own) is None:
+        mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
+
+
+def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
+    """Return the sentence about a coordinate in another unit."""
+    units = f"in {_quantities_of(plant)[own]}, the model's '{name}' in {unit}"
+    return f"its coordinate '{own}' is {units}; write both in one unit"
+
+
+def _check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes) -> None:
+    """Add what is wrong with the output, or coordinate, of a reality of the name of an output of the model."""
+    unit = model.outputs[name].unit
+    units = _quantities_of(plant)
+    if name not in units:
+        mistakes.add(
+            f"it has no output '{name}', which the model has and which is judged; give its plant this output too. Its coordinates "
+            f"and outputs: {', '.join(units)}"
+        )
+        return
+    if units[name] != unit:
+        mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
+    if name in model.instant_names:
+        return
+    order = model.face.orders[model.face.names.index(name)]
+    at_once = input_reaches_at(plant, name, order - 1)
+    if at_once is not None:
+        mistakes.add(
+            f"its derivative {name}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
+            "model; give the model this order, or the reality an actuator"
+        )
+
+
+def _order(plant: Plant, name: str) -> int | None:
+    """The relative order of a coordinate or an output; None where no input reaches it."""
+    return structural_order(plant, name) if name in plant.coordinates else output_order(plant, name)

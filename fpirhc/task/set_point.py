@@ -23,8 +23,7 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
-from fpirhc.task.equal_poles import differences, highest, transition
-from fpirhc.task.filter_bank import FILTER, FilterBank, arranged
+from fpirhc.task.filter_bank import FILTER, FilterBank, arranged, differences, highest, transition
 from fpirhc.task.reference import Reference, Steps
 from fpirhc.task.steps import pairs
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.given import described
-from fpirhc.fields.real_number import real_number
+from fpirhc.fields.kinds import real_number
 from fpirhc.plant.plant import Plant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Steps

@@ -11,7 +11,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField
-from fpirhc.fields.checked_call import checks_of
+from fpirhc.fields.checked import checks_of
 from fpirhc.fields.expected import Anything
 
 TASK = fp.load_problem("two_mass")

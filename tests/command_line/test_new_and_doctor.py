@@ -11,10 +11,9 @@ import casadi as ca
 import pytest
 
 import fpirhc as fp
+from fpirhc import doctor as machine
 from fpirhc.cli.main import main
-from fpirhc.doctor import machine
-from fpirhc.doctor.examine import Diagnosis
-from fpirhc.doctor.finding import Finding, Outcome, ask
+from fpirhc.doctor import Diagnosis, Finding, Outcome, ask
 from fpirhc.scaffold.create import create_problem
 from fpirhc.symbolic.native import Native, cache_folder
 from fpirhc.symbolic.private_folder import own_name
@@ -217,7 +216,7 @@ def test_a_check_that_raises_has_failed_and_the_rest_goes_on(capsys, monkeypatch
     assert findings[0].name == "broken-library"
     assert findings[0].evidence == "OSError: libfoo.so: cannot open"
     assert findings[1].outcome == Outcome.OK
-    monkeypatch.setattr("fpirhc.doctor.examine.examine", lambda: Diagnosis({"fpirhc": "0"}, findings))
+    monkeypatch.setattr("fpirhc.doctor.examine", lambda: Diagnosis({"fpirhc": "0"}, findings))
     assert main(["doctor"]) == 7
     printed = capsys.readouterr().out
     assert "fail  broken-library" in printed
@@ -227,6 +226,6 @@ def test_a_check_that_raises_has_failed_and_the_rest_goes_on(capsys, monkeypatch
 
 def test_warnings_alone_exit_with_zero(monkeypatch, capsys):
     findings = [Finding("slow", Outcome.WARN, "slow", "be patient")]
-    monkeypatch.setattr("fpirhc.doctor.examine.examine", lambda: Diagnosis({}, findings))
+    monkeypatch.setattr("fpirhc.doctor.examine", lambda: Diagnosis({}, findings))
     assert main(["doctor", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["outcome"] == "warn"

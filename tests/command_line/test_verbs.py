@@ -325,13 +325,12 @@ def test_doctor_and_readme_say_the_same_about_a_faulty_installation(capsys):
 @pytest.mark.parametrize("verb", VERBS, ids=lambda v: v.name)
 def test_exit_codes_are_those_of_the_help(verb, folder, monkeypatch, capsys):
     """With right and wrong input every code that the help lists is met, and no other one."""
-    from fpirhc.doctor.examine import Diagnosis
-    from fpirhc.doctor.finding import Finding, Outcome
+    from fpirhc.doctor import Diagnosis, Finding, Outcome
 
     # The baseline of a new problem is measured in a test of its own.
     monkeypatch.setattr("fpirhc.scaffold.create.first_baseline", lambda path: path.with_suffix(".json"))
     monkeypatch.setattr(
-        "fpirhc.doctor.examine.examine",
+        "fpirhc.doctor.examine",
         lambda: Diagnosis({}, [Finding("a check", Outcome.FAIL if FAULTY else Outcome.OK, "found")]),
     )
     FAULTY.clear()

@@ -12,7 +12,7 @@ import pytest
 from scipy.special import betainc
 
 import fpirhc as fp
-from fpirhc.deformation.noise_signs import expected_sign
+from fpirhc.deformation.wrappers.tuned import expected_sign
 from fpirhc.errors import InvalidValue
 
 SEEDS = (11, 12, 13)

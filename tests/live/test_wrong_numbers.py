@@ -10,7 +10,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidShape, InvalidValue
-from fpirhc.fields.real_number import real_number
+from fpirhc.fields.kinds import real_number
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.simulation.simulate import simulator
 

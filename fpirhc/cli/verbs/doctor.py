@@ -14,8 +14,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
-    from fpirhc.doctor.examine import examine
-    from fpirhc.doctor.finding import Outcome
+    from fpirhc.doctor import Outcome, examine
 
     diagnosis = examine()
     print(diagnosis.json() if options.json else diagnosis.text())

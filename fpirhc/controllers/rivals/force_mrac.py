@@ -29,7 +29,7 @@ from fpirhc.controllers.face import on_face
 from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation, Mirror
 from fpirhc.errors import Mistakes, NotSupported
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay

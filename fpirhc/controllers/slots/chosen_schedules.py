@@ -21,7 +21,7 @@ from fpirhc.controllers.slots.schedules import Schedule, check_stretch
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.controllers.slots.slot_modes import linear_modes
 from fpirhc.errors import Mistakes, NotSupported
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.horizon.nominal import reference_state
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals

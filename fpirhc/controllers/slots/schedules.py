@@ -18,7 +18,7 @@ import casadi as ca
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.real_number import finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar

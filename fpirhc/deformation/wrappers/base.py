@@ -13,6 +13,9 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression
 
+_FORGETTING = 0.1  # share of the newest sign
+_RETURNED = 0.3  # relative distance below which an error counts as equal to the error of two cycles before
+
 
 @dataclass(frozen=True)
 class Wrapper(Deformation, ABC):
@@ -65,3 +68,24 @@ def start_of_map(wrapper: Wrapper, size: int) -> dict[str, Expression]:
     """Return what the map remembers at the start; `size` is the number of coordinates."""
     own = wrapper.map.memory(tuple(f"q{k}" for k in range(size)))
     return own.split(expression(ca.DM(own.start())))
+
+
+def forget(before: Expression, sign: Expression) -> Expression:
+    """Return (1 - eta) before + eta sign, and zero where this is not a number."""
+    mean = (1 - _FORGETTING) * before + _FORGETTING * sign
+    return ca.if_else(ca.fabs(mean) <= 1, mean, 0)
+
+
+def growing_in_a_row(count: Expression, error: Expression, before: Expression) -> Expression:
+    """Return how many errors in a row alternated in sign and grew; zero when the newest did not."""
+    grows = ca.logic_and(ca.dot(error, before) < 0, ca.sumsqr(error) > ca.sumsqr(before))
+    return ca.if_else(grows, count + 1, 0)
+
+
+def returning_in_a_row(count: Expression, error: Expression, before: Expression, earlier: Expression) -> Expression:
+    """Return how many errors in a row alternated in sign and were equal to the error of two cycles before: a two-cycle.
+
+    Saturated two-cycles neither grow nor die out. Errors of white noise are not equal in this way eight times in a row.
+    """
+    back = ca.sumsqr(error - earlier) < _RETURNED**2 * ca.sumsqr(error)
+    return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, back), count + 1, 0)

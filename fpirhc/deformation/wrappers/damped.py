@@ -23,8 +23,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.wrappers.base import Wrapper, of_map
-from fpirhc.deformation.wrappers.forgetting import forget, growing_in_a_row
+from fpirhc.deformation.wrappers.base import Wrapper, forget, growing_in_a_row, of_map
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _OSCILLATES = -0.9

@@ -23,8 +23,7 @@ from typing import ClassVar
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, smooth_norm
-from fpirhc.deformation.wrappers.base import Wrapper, of_map, start_of_map
-from fpirhc.deformation.wrappers.forgetting import forget
+from fpirhc.deformation.wrappers.base import Wrapper, forget, of_map, start_of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar

@@ -7,7 +7,7 @@
                    desired response, because no adaptation is better than a wrong pair.
 
 A request that moves smoothly shows no dead time. A task with steps, noise in the measurement, or a plan that starts anew shows it.
-Signals: `dead_time_cycles` and `dead_time_confidence` (see `delay_estimate`); `paired_cycles` is the dead time that `SelfPaired`
+Signals: `dead_time_cycles` and `dead_time_confidence`; `paired_cycles` is the dead time that `SelfPaired`
 uses, -1 before the first estimate.
 """
 
@@ -20,12 +20,16 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Pairing
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
-from fpirhc.deformation.wrappers.delay_estimate import SIGNALS, estimate_held, estimate_memory, estimated
 from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
-MOST = 200  # cycles: the estimate costs as many multiplications, twice, in every control cycle
+_MOST = 200  # cycles: the estimate costs as many multiplications, twice, in every control cycle
 _PATIENCE = 100
+_MEAN = 0.05  # share of a new value in the running means
+_STEP = 0.2  # mu
+_ROUGH = 0.1  # R from which requests are rough enough to distinguish a cycle from the next
+_FLOOR = 1e-12  # of |r~|^2 relative to the running mean's square
 
 
 @dataclass(frozen=True)
@@ -52,15 +56,15 @@ class DelayWatched(Wrapper):
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The memory of the estimate and of the map."""
-        return estimate_memory(elements, self.most) + self.map.memory(elements)
+        return _estimate_memory(elements, self.most) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
         """The estimate, its confidence, and the signals of the map."""
-        return {**SIGNALS, **self.map.shown()}
+        return {**_SIGNALS, **self.map.shown()}
 
     def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
         """Return the past requests of the estimate with the held one once more."""
-        return {**estimate_held(request, memory), **self.map.held(request, memory)}
+        return {**_estimate_held(request, memory), **self.map.held(request, memory)}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
@@ -68,7 +72,7 @@ class DelayWatched(Wrapper):
         """Return the next request of the map, unchanged."""
         inner = of_map(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
-        return next_request, {**estimated(request, response, memory, self.most), **next_memory}
+        return next_request, {**_estimated(request, response, memory, self.most), **next_memory}
 
 
 @dataclass(frozen=True)
@@ -102,18 +106,18 @@ class SelfPaired(Wrapper):
         past = tuple(f"{e}@{k}" for k in range(self.most + 1) for e in elements)
         counts = (scalar("pair_filled"), scalar("pair_stood"), scalar("pair_candidate"))
         own = Layout((Signal("pair_requests", past), scalar("pair_cycles", start=-1.0), *counts))
-        return own + estimate_memory(elements, self.most) + self.map.memory(elements)
+        return own + _estimate_memory(elements, self.most) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
         """The dead time in use, the estimate, its confidence, and the signals of the map."""
-        return {"paired_cycles": "pair_cycles", **SIGNALS, **self.map.shown()}
+        return {"paired_cycles": "pair_cycles", **_SIGNALS, **self.map.shown()}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the map's next request from the pair of the dead time in use."""
         inner = of_map(self, memory, request.numel())
-        estimate = estimated(request, response, memory, self.most)
+        estimate = _estimated(request, response, memory, self.most)
         stood, candidate, cycles = self._adopted(estimate, memory)
         size = request.numel()
         pushed: Expression = ca.vertcat(request, memory["pair_requests"])
@@ -135,7 +139,7 @@ class SelfPaired(Wrapper):
         return {
             "pair_requests": requests[: request.numel() * (self.most + 1)],
             "pair_filled": ca.fmin(memory["pair_filled"] + 1, self.most + 1),
-            **estimate_held(request, memory),
+            **_estimate_held(request, memory),
             **self.map.held(request, memory),
         }
 
@@ -152,10 +156,76 @@ class SelfPaired(Wrapper):
 
 
 def _check_most(owner: str, most: int) -> None:
-    if not 1 <= most <= MOST:
-        raise InvalidValue(f"{owner}(most={most!r}): expected a longest dead time between 1 and {MOST} cycles")
+    if not 1 <= most <= _MOST:
+        raise InvalidValue(f"{owner}(most={most!r}): expected a longest dead time between 1 and {_MOST} cycles")
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:
     """Values for the laws, around any map."""
     return (SelfPaired(inner, most=5), DelayWatched(inner, most=5))
+
+
+_SIGNALS = {"dead_time_cycles": "delay_cycles", "dead_time_confidence": "delay_confidence"}
+
+
+def _estimate_memory(elements: tuple[str, ...], most: int) -> Layout:
+    """Running means, past requests, weights, and the estimate with its confidence."""
+    past = tuple(f"{e}@{k}" for k in range(most + 1) for e in elements)
+    means = Signal("delay_mean_request", elements), Signal("delay_mean_response", elements)
+    weights = Signal("delay_weights", tuple(f"w{k}" for k in range(most + 1)))
+    results = scalar("delay_cycles"), scalar("delay_confidence")
+    return Layout((*means, Signal("delay_past", past), weights, *results))
+
+
+def _estimated(
+    request: Expression, response: Expression, memory: Mapping[str, Expression], most: int
+) -> dict[str, Expression]:
+    """Return the memory one cycle later, which includes 'delay_cycles' and 'delay_confidence'.
+
+    With r~ and f~ the deviations of request and response from their running means, normalised least mean squares estimates the
+    impulse response w of the loop, and the dead time is the place of the largest |w|:
+
+        e = f~_k - sum_j w_j r~_{k-1-j},      w_j <- w_j + mu g e' r~_{k-1-j} / |r~|^2,      j = 0 .. most.
+
+    A smooth request correlates with its own neighbours, so changes are not correlated. g = min(1, R / 0.1) is small while the
+    requests are too smooth, R = sum |r~_k - r~_{k-1}|^2 / sum |r~_k|^2 (2 for white noise, omega^2 for a sine). The confidence is g
+    times the share of sum w^2 that lies within one cycle of the peak.
+    """
+    size = request.numel()
+    mean_request = memory["delay_mean_request"] + _MEAN * (request - memory["delay_mean_request"])
+    mean_response = memory["delay_mean_response"] + _MEAN * (response - memory["delay_mean_response"])
+    past = ca.vertcat(request - mean_request, memory["delay_past"])[: size * (most + 1)]
+    columns = ca.reshape(past, size, most + 1)
+    error = response - mean_response - ca.mtimes(columns, memory["delay_weights"])
+    energy = ca.sumsqr(past) + _FLOOR * (1 + ca.sumsqr(mean_request))
+    roughness = ca.fmin(1, ca.sumsqr(past[size:] - past[: size * most]) / energy / _ROUGH)
+    weights = memory["delay_weights"] + _STEP * roughness / energy * ca.mtimes(columns.T, error)
+    cycles, near = _peak(weights, most)
+    squares = ca.sumsqr(weights)
+    clean = ca.if_else(squares > 0, near / ca.if_else(squares > 0, squares, 1), 0)
+    return {
+        "delay_mean_request": mean_request,
+        "delay_mean_response": mean_response,
+        "delay_past": past,
+        "delay_weights": weights,
+        "delay_cycles": cycles,
+        "delay_confidence": roughness * clean,
+    }
+
+
+def _estimate_held(request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
+    """Return what changes in a cycle whose request was held and whose response is not known: the past requests."""
+    past = ca.vertcat(request - memory["delay_mean_request"], memory["delay_past"])
+    return {"delay_past": past[: memory["delay_past"].numel()]}
+
+
+def _peak(weights: Expression, most: int) -> tuple[Expression, Expression]:
+    """Place of the largest weight by size, and the sum of squares within one cycle of it."""
+    sizes: list[Expression] = [w * w for w in ca.vertsplit(weights)]
+    place, largest, near = 0 * sizes[0], sizes[0], total(sizes[:2])
+    for k in range(1, most + 1):
+        above = sizes[k] > largest
+        place = ca.if_else(above, k, place)
+        near = ca.if_else(above, total(sizes[k - 1 : k + 2]), near)
+        largest = ca.fmax(sizes[k], largest)
+    return place, near

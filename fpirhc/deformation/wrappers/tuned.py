@@ -31,9 +31,7 @@ from typing import Self
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.noise_signs import expected_sign
-from fpirhc.deformation.wrappers.base import Wrapper, of_map
-from fpirhc.deformation.wrappers.forgetting import growing_in_a_row, returning_in_a_row
+from fpirhc.deformation.wrappers.base import Wrapper, growing_in_a_row, of_map, returning_in_a_row
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -128,3 +126,31 @@ class Tuned(Wrapper):
 def examples(inner: Deformation) -> tuple[Deformation, ...]:
     """Values for the laws, around any map."""
     return (Tuned(inner, largest_gain=1.2 * inner.effective_gain()),)
+
+
+def expected_sign(product: float, components: int) -> float:
+    """Return the mean of sgn(h_k' h_{k-1}) in white noise, 2 I_{(1+rho)/2}(m/2, m/2) - 1 with rho = -g / 2.
+
+    I is the regularised incomplete beta function; the proof stands in docs/theory-robust.md.
+
+    Args:
+        product: g = a lambda, effective gain times eigenvalue, 0 to 2.
+        components: m of the response.
+
+    Raises:
+        InvalidValue: a product outside [0, 2], fewer than one component.
+    """
+    if not (0 <= product <= 2 and components >= 1):
+        raise InvalidValue(
+            f"expected_sign(product={product!r}, components={components!r}): expected a product from 0 to 2, at least one component"
+        )
+    correlation = -0.5 * product
+    # Integration by parts: the mean for m + 2 components is the mean for m plus one term.
+    size = 1 if components % 2 else 2
+    mean = 2 / math.pi * math.asin(correlation) if size == 1 else correlation
+    whole = math.pi / 2 if size == 1 else 1.0  # int_0^1 (1 - x^2)^(m/2-1) dx
+    while size < components:
+        mean += correlation * (1 - correlation**2) ** (size / 2) / (size * whole)
+        whole *= size / (size + 1)
+        size += 2
+    return mean

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fpirhc.broken import attempted
 from fpirhc.by_name import ByName, FoundByName
 from fpirhc.errors import InvalidName, nearest
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.metrics.discovery import known_metrics
 from fpirhc.simulation.run import Run

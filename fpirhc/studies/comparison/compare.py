@@ -17,7 +17,7 @@ from fpirhc.controllers.contract import checked, resolved, without_deformation
 from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.gain_advice import recommended_for

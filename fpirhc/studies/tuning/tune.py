@@ -23,12 +23,10 @@ import numpy as np
 
 from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
-from fpirhc.fields.checked import Checked
-from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
-from fpirhc.problem_files.tuning_spans import TuningSpans
+from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.harm import harm_of_adaptation
 from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint

@@ -1,23 +1,78 @@
-"""Checks of installed parts and of folders that must be writable."""
+"""The examination of an installation: checks of installed parts and of folders that must be writable, and their findings."""
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 from importlib.metadata import version
 from pathlib import Path
 
 import casadi as ca
 
-from fpirhc.doctor.finding import Check, Outcome, fine, judged
 from fpirhc.symbolic.native import cache_folder, find_compiler, native
 
 _LARGE_CACHE = 2e9  # bytes
 _SOLVERS = ("ipopt", "fatrop", "sqpmethod")  # of nonlinear programs, that optimisers here call
 _QUADRATIC = ("qrqp", "osqp")
 _OTHERS = ("alpaqa", "bonmin", "knitro", "madnlp", "snopt", "worhp")
+
+
+class Outcome(IntEnum):
+    """Outcomes of a check, from best to worst."""
+
+    OK = 0
+    WARN = 1
+    FAIL = 2
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one check.
+
+    Args:
+        name: name of the check.
+        outcome: its outcome.
+        evidence: the facts in a sentence.
+        remedy: what to do; empty: nothing.
+    """
+
+    name: str
+    outcome: Outcome
+    evidence: str
+    remedy: str = ""
+
+
+_Check = Callable[[], tuple[Outcome, str, str]]
+
+
+def ask(checks: Sequence[_Check]) -> list[Finding]:
+    """Run checks one by one; a check that raises has failed."""
+    findings = []
+    for check in checks:
+        name = check.__name__.replace("_", "-")
+        try:
+            findings.append(Finding(name, *check()))
+        except Exception as error:  # noqa: BLE001 -- a broken installation may raise anything, and the other checks count
+            lines = str(error).strip().splitlines() or [""]
+            remedy = "install fpirhc and its dependencies again in a fresh environment"
+            findings.append(Finding(name, Outcome.FAIL, f"{type(error).__name__}: {lines[0]}", remedy))
+    return findings
+
+
+def _fine(text: str) -> tuple[Outcome, str, str]:
+    """Return OK, with nothing to do."""
+    return Outcome.OK, text, ""
+
+
+def judged(holds: bool, text: str, remedy: str, otherwise: Outcome = Outcome.FAIL) -> tuple[Outcome, str, str]:
+    """Return OK where a condition holds, else `otherwise` with the remedy."""
+    return (Outcome.OK, text, "") if holds else (otherwise, text, remedy)
 
 
 def versions() -> dict[str, str]:
@@ -75,7 +130,7 @@ def results_folder() -> tuple[Outcome, str, str]:
     folder = next(f for f in (Path("results"), Path()) if f.is_dir())
     try:
         with tempfile.TemporaryFile(dir=folder):
-            return fine(f"'{folder.absolute()}' can be written")
+            return _fine(f"'{folder.absolute()}' can be written")
     except OSError as error:
         text = f"'{folder.absolute()}' cannot be written: {error.strerror}"
         return Outcome.WARN, text, "go to a folder of your own, or give --out to run, compare and solve"
@@ -90,4 +145,45 @@ def python_threads() -> tuple[Outcome, str, str]:
     )
 
 
-CHECKS: tuple[Check, ...] = (solver_plugins, c_compiler, cache, results_folder, python_threads)
+CHECKS: tuple[_Check, ...] = (solver_plugins, c_compiler, cache, results_folder, python_threads)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The results of all checks.
+
+    Args:
+        versions: versions of fpirhc and of what its numbers depend on.
+        findings: findings in the order of the checks.
+    """
+
+    versions: dict[str, str]
+    findings: Sequence[Finding]
+
+    @property
+    def outcome(self) -> Outcome:
+        """The worst of all findings."""
+        return max((f.outcome for f in self.findings), default=Outcome.OK)
+
+    def text(self) -> str:
+        """Return one line per finding, with the remedy under each that is not OK."""
+        lines = [", ".join(f"{name} {number}" for name, number in self.versions.items())]
+        for finding in self.findings:
+            lines.append(f"{finding.outcome.name.lower():4s}  {finding.name}: {finding.evidence}")
+            if finding.remedy:
+                lines.append(f"      to do: {finding.remedy}")
+        counts = [sum(f.outcome == outcome for f in self.findings) for outcome in Outcome]
+        return "\n".join([*lines, f"{counts[0]} ok, {counts[1]} to look at, {counts[2]} failed"])
+
+    def json(self) -> str:
+        """Return one JSON object."""
+        checks = [
+            {"name": f.name, "outcome": f.outcome.name.lower(), "evidence": f.evidence, "remedy": f.remedy}
+            for f in self.findings
+        ]
+        return json.dumps({"outcome": self.outcome.name.lower(), "versions": self.versions, "checks": checks}, indent=2)
+
+
+def examine() -> Diagnosis:
+    """Return the versions of the installation and the results of all checks."""
+    return Diagnosis(versions(), ask(CHECKS))

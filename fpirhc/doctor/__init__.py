@@ -1,1 +1,0 @@
-"""The parts of an installation, and whether they work."""
