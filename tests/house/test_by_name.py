@@ -22,6 +22,7 @@ from fpirhc.problem_files.problem_file import load_problem
 TASK = load_problem("two_mass")
 SHORT = replace(TASK, problem=replace(TASK.problem, duration=0.05, measure_from=0.0))
 HEADLINE = TASK.headline or ("", "")
+QUICK = ["CTC", "CTC+FPI (eq 6)"]
 
 
 def mappings(value: Any, path: str, seen: set[int]) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -59,14 +60,14 @@ def stepped() -> Any:
 
 def compared() -> Any:
     """A comparison with its null test and its prediction."""
-    comparison = fp.compare(SHORT, controllers=list(HEADLINE), seed=0, compiled=False)
-    prediction = fp.predict_response(SHORT.problem, SHORT.controllers[HEADLINE[1]], mismatch=5.0, compiled=False)
+    comparison = fp.compare(SHORT, controllers=QUICK, seed=0, compiled=False)
+    prediction = fp.predict_response(SHORT.problem, SHORT.controllers[QUICK[1]], mismatch=5.0, compiled=False)
     return comparison, prediction.half_width, prediction.rms(prediction.without)
 
 
 def reviewed() -> Any:
     """A review."""
-    return fp.review(SHORT.problem, {HEADLINE[1]: SHORT.controllers[HEADLINE[1]]}, mismatch=5.0, seed=0)
+    return fp.review(SHORT.problem, {QUICK[1]: SHORT.controllers[QUICK[1]]}, mismatch=5.0, seed=0)
 
 
 def studied(folder: Path) -> Any:
