@@ -29,7 +29,8 @@ from scipy.optimize import root
 
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.comparison.compare import Comparison, compare
+from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.comparison import Comparison
 
 State = Mapping[str, float]
 Chain = Callable[[State, Any, Any], dict[str, tuple[float, ...]]]

@@ -114,8 +114,10 @@ from .simulation.run import Run, load_run
 from .simulation.simulate import simulate, simulator
 from .simulation.stepper import Stepper
 from .status import Status
-from .studies.comparison.compare import Comparison, compare
-from .studies.scenarios.scenario_study import ScenarioComparison, compare_scenarios
+from .studies.comparison.compare import compare
+from .studies.comparison.comparison import Comparison
+from .studies.scenarios.scenario_comparison import ScenarioComparison
+from .studies.scenarios.scenario_study import compare_scenarios
 from .studies.tuning.tune import Tuning, tune
 from .symbolic.functions import signed_power
 from .task.dead_time import DeadTime

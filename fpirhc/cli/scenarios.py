@@ -13,7 +13,7 @@ from fpirhc.cli.output import RESULTS, results_folder, resumable
 
 if TYPE_CHECKING:
     from fpirhc.problem_files.problem_file import Task
-    from fpirhc.studies.scenarios.scenario_study import ScenarioComparison
+    from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 
 EXAMPLES = (
     ("fpirhc compare two_mass --scenarios 100 --mismatch 20", "exact parameters within 20 % of the problem's"),
@@ -71,7 +71,6 @@ def run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.page import write_page
     from fpirhc.report.scenarios import mismatch_figure, write_scenarios
     from fpirhc.report.terminal import show
-    from fpirhc.studies.scenarios.scenario_view import scenario_view
     from fpirhc.studies.view import to_json
 
     task = load_problem(options.problem)
@@ -81,7 +80,7 @@ def run(options: argparse.Namespace) -> ExitCode:
     comparison = _compared(options, task, folder)
     report = folder / "report.html"
     write_scenarios(comparison, report)
-    view = scenario_view(comparison)
+    view = comparison.view
     write_page(f"{to_json(view.facts)}\n", folder / RESULTS)
     if comparison.summaries:
         save_figure(mismatch_figure(comparison), folder / "mismatch.png")

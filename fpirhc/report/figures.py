@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from fpirhc.contraction.gains import ContractionReport
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Contraction, Entry
     from fpirhc.studies.open_loop import Solved
     from fpirhc.task.problem import Problem

@@ -13,13 +13,12 @@ from fpirhc.report.page import Image, asset, picture, render_page, write_page
 from fpirhc.report.series import chart_data
 from fpirhc.simulation.drawing import BANDS, PALETTE
 from fpirhc.simulation.picture import Drawing
-from fpirhc.studies.comparison.comparison_view import comparison_view
 from fpirhc.summary import Column, Table
 
 if TYPE_CHECKING:
     from fpirhc.simulation.pictures.base import Picture
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Entry
 
 _CAPTIONS = {
@@ -54,7 +53,7 @@ def render(comparison: Comparison) -> str:
     contraction, lyapunov = contraction_figure(comparison), lyapunov_figure(comparison)
     return render_page(
         "comparison.html",
-        comparison_view(comparison),
+        comparison.view,
         (asset("uPlot.iife.min.js"), f"const DATA={data};\n{asset('report.js')}"),
         predicted=any(e.prediction is not None and e.prediction.tube is not None for e in entries),
         slots=_slots(comparison),

@@ -9,12 +9,11 @@ import numpy as np
 
 from fpirhc.report.page import picture, render_page, write_page
 from fpirhc.simulation.drawing import PALETTE
-from fpirhc.studies.scenarios.scenario_view import scenario_view
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fpirhc.studies.scenarios.scenario_study import ScenarioComparison
+    from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 
 _GROUPS = 6  # of scenarios with similar mismatch, whose medians are joined by a line
 _CAPTION = (
@@ -65,4 +64,4 @@ def render_scenarios(comparison: ScenarioComparison) -> str:
     """Return the page's text."""
     figure = mismatch_figure(comparison) if comparison.summaries else None
     chart = picture(figure, "Error against mismatch", _CAPTION) if figure else None
-    return render_page("scenarios.html", scenario_view(comparison), chart=chart)
+    return render_page("scenarios.html", comparison.view, chart=chart)

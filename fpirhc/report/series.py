@@ -12,7 +12,7 @@ from fpirhc.simulation.common_columns import shown_motion
 
 if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Entry
 
 INTERVALS = 300

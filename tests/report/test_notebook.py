@@ -20,7 +20,6 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run
 from fpirhc.review.answer import Answer, Review, Verdict
-from fpirhc.studies.comparison.comparison_view import comparison_view
 from fpirhc.studies.scenarios.paired import percent
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 from fpirhc.summary import printable, table
@@ -246,7 +245,7 @@ def test_figures_show_names_literally(comparison):
 def test_terminal_shows_names_literally(comparison, capsys, monkeypatch):
     """No markup, no emoji, no escape codes: what was written is what is read."""
     monkeypatch.setenv("COLUMNS", "4000")
-    show(comparison_view(comparison), Path("[bold]report.html"))
+    show(comparison.view, Path("[bold]report.html"))
     printed = capsys.readouterr().out
     for name in (
         MARKED,

@@ -22,7 +22,6 @@ from fpirhc.report.html import render, write_report
 from fpirhc.report.series import INTERVALS, chart_data
 from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare
-from fpirhc.studies.comparison.comparison_view import comparison_view
 from fpirhc.studies.view import to_json
 from fpirhc.summary import written_out
 
@@ -151,7 +150,7 @@ def test_a_row_is_as_high_as_its_numbers(comparison):
 
 def test_no_column_is_empty(comparison):
     """Where nobody plans there is no table of plans, and every column of the other has a number in some row."""
-    controllers, plans = comparison_view(comparison).tables
+    controllers, plans = comparison.view.tables
     assert plans.rows == []
     assert "gap" not in [column.head for column in controllers.columns]
     assert all(any(row.cells[k] for row in controllers.rows) for k in range(len(controllers.columns)))
@@ -161,7 +160,7 @@ def test_no_column_is_empty(comparison):
 def test_page_terminal_notebook_and_json_say_the_same(comparison, capsys, monkeypatch):
     """Every text of the short table is on the terminal, on the page and in a notebook; JSON has the number behind it."""
     monkeypatch.setenv("COLUMNS", "2000")
-    view = comparison_view(comparison)
+    view = comparison.view
     show(view, Path("report.html"))
     printed, page, notebook = capsys.readouterr().out, render(comparison), comparison._repr_html_()
     for row in view.tables[0].narrow.rows:

@@ -15,7 +15,8 @@ from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.report.html import render
 from fpirhc.report.terminal import settings_in_force
 from fpirhc.simulation.run import load_run
-from fpirhc.studies.comparison.compare import Comparison, compare
+from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.comparison import Comparison
 
 NAME, GAIN, SCALE = "CTC+FPI (eq 6)", "deformation.gain", "deformation.scale"
 CHANGES = {0.1: {GAIN: -0.9}, 0.2: {GAIN: -0.9, SCALE: 3.0}}

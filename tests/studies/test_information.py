@@ -15,8 +15,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
-from fpirhc.studies.comparison.compare import Comparison
-from fpirhc.studies.comparison.comparison_view import comparison_view
+from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.view import to_json
 
 PLAN = fp.FixedPoint(iterations=1, tolerance=1e-3)
@@ -82,7 +81,7 @@ def test_lines_stand_in_every_form_of_a_comparison(everything):
     assert "CTC, RHC, offset-free: use y, y'" in others
     assert "CTC+FPI, RHC+FPI, offset-free, at once: use y, y', y''" in others
     assert "CTC, CTC+FPI: act in every cycle" in others
-    document = json.loads(to_json(comparison_view(everything).facts))
+    document = json.loads(to_json(everything.view.facts))
     assert document["information"] == list(everything.information)
     assert document["controllers"]["RHC"]["measures"] == ["y", "y'"]
     page = render(everything)

@@ -11,8 +11,8 @@ import fpirhc as fp
 from fpirhc.report.html import render
 from fpirhc.report.page import css_class
 from fpirhc.report.terminal import STYLES
-from fpirhc.studies.comparison.compare import Comparison, compare
-from fpirhc.studies.comparison.comparison_view import comparison_view
+from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.view import to_json
 
@@ -58,7 +58,7 @@ def test_what_does_not_help_is_never_green(cstr):
     page = render(cstr)
     assert "class='headline outcome-worse'>RHC+FPI does not help" in page
     assert "outcome-better" not in page.partition("<section id='verdict'>")[2].partition("</section>")[0]
-    facts = to_json(comparison_view(cstr).facts)
+    facts = to_json(cstr.view.facts)
     assert '"outcome": "worse"' in facts
     assert '"harmful": true' in facts
     green = [outcome for outcome in Outcome if "green" in STYLES[outcome]]

@@ -18,11 +18,10 @@ from fpirhc.report.html import headline_pair, render
 from fpirhc.report.scenarios import render_scenarios
 from fpirhc.report.series import chart_data
 from fpirhc.report.terminal import show
-from fpirhc.studies.comparison.compare import Comparison, compare
-from fpirhc.studies.comparison.comparison_view import comparison_view
+from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.open_loop import solve_first
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
-from fpirhc.studies.scenarios.scenario_view import scenario_view
 
 GALLERY = Path(__file__).parents[2] / "problems" / "gallery"
 # A short form of each task: (file, unit, changes, unit of the first coordinate's first derivative)
@@ -87,7 +86,7 @@ def test_report_and_terminal_have_it(case, capsys, tmp_path):
     assert data["timeUnit"] == unit
     assert not [c["unit"] for c in data["charts"] if SECONDS.search(f"[{c['unit']}]")]
     assert "t [s]" not in whole
-    show(comparison_view(comparison), tmp_path / "report.html")
+    show(comparison.view, tmp_path / "report.html")
     shown = capsys.readouterr().out
     assert f"t = {task.problem.measure_from:g} {unit}" in shown
     assert not SECONDS.search(shown)
@@ -122,7 +121,7 @@ def test_scenarios_have_it(case, capsys, tmp_path):
     study = compare_scenarios(
         task, count=2, percent=5.0, seed=0, folder=tmp_path, controllers=["RHC", "RHC+FPI"], compiled=False
     )
-    show(scenario_view(study), tmp_path / "report.html")
+    show(study.view, tmp_path / "report.html")
     page = ALLOWED.sub("", without_scripts(render_scenarios(study)))
     for text in (page, " ".join(capsys.readouterr().out.split())):
         assert f"t = {task.problem.measure_from:g} {unit}" in text

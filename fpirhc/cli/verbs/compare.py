@@ -13,7 +13,7 @@ from fpirhc.cli.output import RESULTS, results_folder
 from fpirhc.cli.verb import Verb
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.comparison import Comparison
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +42,6 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.page import write_page
     from fpirhc.report.terminal import announce_backend, progress_bars, show
     from fpirhc.studies.comparison.compare import compare, select
-    from fpirhc.studies.comparison.comparison_view import comparison_view
     from fpirhc.studies.comparison.optimiser_choices import with_optimisers
     from fpirhc.studies.tuning.tuned_file import noted, read_tuned, with_tuned
     from fpirhc.studies.view import to_json
@@ -66,7 +65,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     comparison = noted(comparison, tuned.notes) if tuned else comparison
     report = folder / "report.html"
     write_report(comparison, report)
-    view = comparison_view(comparison)
+    view = comparison.view
     write_page(f"{to_json(view.facts)}\n", folder / RESULTS)
     announce_backend(entry.run for entry in comparison.entries)
     if options.json:

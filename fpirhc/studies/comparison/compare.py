@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
-from typing import Any, cast
+from typing import cast
 
 from fpirhc.broken import attempted
-from fpirhc.by_name import FoundByName
 from fpirhc.contraction.gains import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved, without_deformation
 from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
+from fpirhc.errors import FpirhcError, Mistakes, NotContractive, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
@@ -26,14 +25,13 @@ from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
-from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import judged_run, simulator
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.caveats import yardstick_of
 from fpirhc.studies.comparison.changes import scales
-from fpirhc.studies.comparison.comparison_view import comparison_view
+from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.comparison.entry import Contraction, Entry
 from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every
 from fpirhc.studies.comparison.harm import partners
@@ -44,91 +42,9 @@ from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.side_by_side import Built, beside_each_other, null_tests, with_reviewed_gains
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
-from fpirhc.summary import line
 from fpirhc.task.problem import Problem
 
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison(FoundByName):
-    """The result of `compare`.
-
-    Args:
-        problem: name of the problem.
-        title: its title.
-        description: its description.
-        seed: of the disturbances and the noise.
-        measure_from: time from which errors count.
-        entries: the controllers that ran, in order.
-        skipped: reasons why controllers were skipped, by name.
-        findings: the verdict, sentence by sentence with outcomes; the headline pair is first.
-        command: the command line.
-        versions: versions of fpirhc and of what its numbers depend on.
-        settings: settings of the problem.
-        elapsed: wall time of the comparison, s.
-        pictures: pictures of the problem for the report.
-        nulls: what adaptation does where there is nothing to adapt, for every pair.
-        time_unit: unit of time of the problem.
-        steps: whether the plant is a map, which has no motion between two cycles.
-        information: what the controllers are given, what each uses, and when each acts, in sentences.
-    """
-
-    problem: str
-    title: str
-    description: str
-    seed: int
-    measure_from: float
-    entries: tuple[Entry, ...]
-    skipped: Mapping[str, str]
-    findings: tuple[Finding, ...]
-    command: str
-    versions: Mapping[str, str]
-    settings: Mapping[str, Any]
-    elapsed: float
-    pictures: tuple[Picture, ...] = ()
-    nulls: tuple[NullTest, ...] = ()
-    time_unit: str = "s"
-    steps: bool = False
-    information: tuple[str, ...] = ()
-
-    @property
-    def verdict(self) -> tuple[str, ...]:
-        """The verdict in sentences."""
-        return tuple(finding.text for finding in self.findings)
-
-    @property
-    def outcome(self) -> Outcome:
-        """What the first sentence states."""
-        return self.findings[0].outcome or Outcome.NOT_COMPARABLE
-
-    @property
-    def null(self) -> NullTest | None:
-        """The null test of the pair that the first sentence is about; None without one."""
-        return next((test for test in self.nulls if test.pair == self.findings[0].pair), None)
-
-    @property
-    def sentences(self) -> tuple[tuple[str, Outcome | None], ...]:
-        """The verdict with outcomes: the findings, the null test of the first pair, and every other one that shows harm."""
-        shown = (test for test in self.nulls if test is self.null or test.harmful)
-        tests = ((test.text, Outcome.WORSE if test.harmful else None) for test in shown)
-        return (*((finding.text, finding.outcome) for finding in self.findings), *tests)
-
-    def __repr__(self) -> str:
-        counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
-        return line(self, self.problem, f"seed {self.seed}", counts, self.verdict[0])
-
-    def _repr_html_(self) -> str:
-        """Verdict and errors as a table, for notebooks."""
-        return comparison_view(self).html()
-
-    def __getitem__(self, name: str) -> Entry:
-        for entry in self.entries:
-            if entry.name == name:
-                return entry
-        raise InvalidName(
-            f"controller '{name}' is not in this comparison.{nearest(name, [e.name for e in self.entries])}"
-        )
 
 
 def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:

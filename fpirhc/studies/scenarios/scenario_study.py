@@ -5,13 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fpirhc.by_name import FoundByName
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
+from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
@@ -24,71 +23,11 @@ from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import Record, Summary, summarise, verdict
 from fpirhc.studies.scenarios.processes import Workers
-from fpirhc.studies.scenarios.scenario_view import scenario_view
+from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 from fpirhc.studies.tuning.tuned_file import with_tuned
-from fpirhc.summary import line
 
 LEDGER = "scenarios.jsonl"
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True, eq=False)
-class ScenarioComparison(FoundByName):
-    """The result of `compare_scenarios`.
-
-    Args:
-        problem: name of the problem.
-        title: its title.
-        description: its description.
-        count: number of scenarios.
-        percent: range of the exact parameters' draws, percent.
-        seed: of all draws.
-        measure_from: time from which errors count.
-        columns: columns of the summaries' metrics in a short table.
-        summaries: summaries in the controllers' order, the baseline first.
-        records: records of the scenarios, by controller.
-        skipped: reasons why controllers were not run, by name.
-        verdict: the verdict in sentences.
-        tuning: sentences about the origin of tuned settings, by controller.
-        settings: settings of the problem and the controllers.
-        versions: versions of fpirhc and of what its numbers depend on.
-        command: the command line.
-        elapsed: wall time of the study, s.
-        time_unit: unit of time of the problem.
-    """
-
-    problem: str
-    title: str
-    description: str
-    count: int
-    percent: float
-    seed: int
-    measure_from: float
-    columns: Sequence[Column]
-    summaries: tuple[Summary, ...]
-    records: Mapping[str, Sequence[Record]]
-    skipped: Mapping[str, str]
-    verdict: tuple[str, ...]
-    tuning: Mapping[str, str]
-    settings: Mapping[str, Any]
-    versions: Mapping[str, str]
-    command: str
-    elapsed: float
-    time_unit: str = "s"
-
-    def __repr__(self) -> str:
-        counts = f"{self.count} scenarios", f"{len(self.summaries)} controllers", f"seed {self.seed}"
-        return line(self, self.problem, *counts, self.verdict[0])
-
-    def _repr_html_(self) -> str:
-        """Verdict and errors as a table, for notebooks."""
-        return scenario_view(self).html()
-
-    def __getitem__(self, name: str) -> Summary:
-        for summary in self.summaries:
-            if summary.name == name:
-                return summary
-        raise InvalidName(f"controller '{name}' is not here.{nearest(name, [s.name for s in self.summaries])}")
 
 
 @checked_call

@@ -11,7 +11,7 @@ from typing import Any
 from fpirhc.errors import InvalidName, InvalidValue, Mistakes, OutputError, ProblemFileError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values, with_settings
-from fpirhc.studies.comparison.compare import Comparison
+from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.tuning.objective import RELATIVE_ERROR
 
 FORMAT = 1

@@ -1,18 +1,19 @@
-"""The view of paired scenarios: the verdict, the table of the controllers, the origin of their settings, and the facts."""
+"""The result of paired scenarios, and what every output says of it: the verdict, a table of controllers, facts."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from fpirhc.by_name import FoundByName
+from fpirhc.errors import InvalidName, nearest
 from fpirhc.simulation.metrics.columns import Column as Number
-from fpirhc.studies.scenarios.paired import Summary, percent, signed
+from fpirhc.studies.scenarios.paired import Record, Summary, percent, signed
 from fpirhc.studies.view import View, status_shares
-from fpirhc.summary import Column, Table, written_out
-
-if TYPE_CHECKING:
-    from fpirhc.studies.scenarios.scenario_study import ScenarioComparison
+from fpirhc.summary import Column, Table, line, written_out
 
 _MEANING = (
     "Errors are rms errors divided by the range of the reference, root mean square over the judged coordinates. Every scenario "
@@ -23,7 +24,71 @@ _MEANING = (
 _UNTUNED = "No file of tuned settings was given: all settings are those of the problem file."
 
 
-def scenario_view(comparison: ScenarioComparison) -> View:
+@dataclass(frozen=True, eq=False)
+class ScenarioComparison(FoundByName):
+    """The result of `compare_scenarios`.
+
+    Args:
+        problem: name of the problem.
+        title: its title.
+        description: its description.
+        count: number of scenarios.
+        percent: range of the exact parameters' draws, percent.
+        seed: of all draws.
+        measure_from: time from which errors count.
+        columns: columns of the summaries' metrics in a short table.
+        summaries: summaries in the controllers' order, the baseline first.
+        records: records of the scenarios, by controller.
+        skipped: reasons why controllers were not run, by name.
+        verdict: the verdict in sentences.
+        tuning: sentences about the origin of tuned settings, by controller.
+        settings: settings of the problem and the controllers.
+        versions: versions of fpirhc and of what its numbers depend on.
+        command: the command line.
+        elapsed: wall time of the study, s.
+        time_unit: unit of time of the problem.
+    """
+
+    problem: str
+    title: str
+    description: str
+    count: int
+    percent: float
+    seed: int
+    measure_from: float
+    columns: Sequence[Number]
+    summaries: tuple[Summary, ...]
+    records: Mapping[str, Sequence[Record]]
+    skipped: Mapping[str, str]
+    verdict: tuple[str, ...]
+    tuning: Mapping[str, str]
+    settings: Mapping[str, Any]
+    versions: Mapping[str, str]
+    command: str
+    elapsed: float
+    time_unit: str = "s"
+
+    def __repr__(self) -> str:
+        counts = f"{self.count} scenarios", f"{len(self.summaries)} controllers", f"seed {self.seed}"
+        return line(self, self.problem, *counts, self.verdict[0])
+
+    def _repr_html_(self) -> str:
+        """Verdict and errors as a table, for notebooks."""
+        return self.view.html()
+
+    @property
+    def view(self) -> View:
+        """What every output says of it."""
+        return _view(self)
+
+    def __getitem__(self, name: str) -> Summary:
+        for summary in self.summaries:
+            if summary.name == name:
+                return summary
+        raise InvalidName(f"controller '{name}' is not here.{nearest(name, [s.name for s in self.summaries])}")
+
+
+def _view(comparison: ScenarioComparison) -> View:
     """Return what is said of paired scenarios."""
     conditions = (
         f"{comparison.count} scenarios of seed {comparison.seed}, exact parameters within {comparison.percent:g} % of the "

@@ -1,27 +1,114 @@
-"""The view of a comparison: its sentences, its tables of controllers and of plans, its remarks, and its facts."""
+"""The result of a comparison, and what every output says of it: sentences, tables of controllers and plans, remarks, facts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
+from fpirhc.by_name import FoundByName
+from fpirhc.errors import InvalidName, nearest
+from fpirhc.simulation.metrics import Metric, Metrics
 from fpirhc.simulation.metrics.columns import Column as Number
 from fpirhc.simulation.metrics.columns import columns, in_report
+from fpirhc.simulation.pictures.base import Picture
+from fpirhc.studies.comparison.entry import Entry
+from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import gap
+from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.view import View, status_shares
-from fpirhc.summary import Column, Table, written_out
-
-if TYPE_CHECKING:
-    from fpirhc.simulation.metrics import Metric, Metrics
-    from fpirhc.studies.comparison.compare import Comparison
-    from fpirhc.studies.comparison.entry import Entry
-    from fpirhc.studies.comparison.null_test import NullTest
-    from fpirhc.studies.comparison.outcome import Finding
+from fpirhc.summary import Column, Table, line, written_out
 
 _SOLVES = "solve."  # metrics of plans, which have a table of their own
 
 
-def comparison_view(comparison: Comparison) -> View:
+@dataclass(frozen=True, eq=False)
+class Comparison(FoundByName):
+    """The result of `compare`.
+
+    Args:
+        problem: name of the problem.
+        title: its title.
+        description: its description.
+        seed: of the disturbances and the noise.
+        measure_from: time from which errors count.
+        entries: the controllers that ran, in order.
+        skipped: reasons why controllers were skipped, by name.
+        findings: the verdict, sentence by sentence with outcomes; the headline pair is first.
+        command: the command line.
+        versions: versions of fpirhc and of what its numbers depend on.
+        settings: settings of the problem.
+        elapsed: wall time of the comparison, s.
+        pictures: pictures of the problem for the report.
+        nulls: what adaptation does where there is nothing to adapt, for every pair.
+        time_unit: unit of time of the problem.
+        steps: whether the plant is a map, which has no motion between two cycles.
+        information: what the controllers are given, what each uses, and when each acts, in sentences.
+    """
+
+    problem: str
+    title: str
+    description: str
+    seed: int
+    measure_from: float
+    entries: tuple[Entry, ...]
+    skipped: Mapping[str, str]
+    findings: tuple[Finding, ...]
+    command: str
+    versions: Mapping[str, str]
+    settings: Mapping[str, Any]
+    elapsed: float
+    pictures: tuple[Picture, ...] = ()
+    nulls: tuple[NullTest, ...] = ()
+    time_unit: str = "s"
+    steps: bool = False
+    information: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """The verdict in sentences."""
+        return tuple(finding.text for finding in self.findings)
+
+    @property
+    def outcome(self) -> Outcome:
+        """What the first sentence states."""
+        return self.findings[0].outcome or Outcome.NOT_COMPARABLE
+
+    @property
+    def null(self) -> NullTest | None:
+        """The null test of the pair that the first sentence is about; None without one."""
+        return next((test for test in self.nulls if test.pair == self.findings[0].pair), None)
+
+    @property
+    def sentences(self) -> tuple[tuple[str, Outcome | None], ...]:
+        """The verdict with outcomes: the findings, the null test of the first pair, and every other one that shows harm."""
+        shown = (test for test in self.nulls if test is self.null or test.harmful)
+        tests = ((test.text, Outcome.WORSE if test.harmful else None) for test in shown)
+        return (*((finding.text, finding.outcome) for finding in self.findings), *tests)
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
+        return line(self, self.problem, f"seed {self.seed}", counts, self.verdict[0])
+
+    def _repr_html_(self) -> str:
+        """Verdict and errors as a table, for notebooks."""
+        return self.view.html()
+
+    @property
+    def view(self) -> View:
+        """What every output says of it."""
+        return _view(self)
+
+    def __getitem__(self, name: str) -> Entry:
+        for entry in self.entries:
+            if entry.name == name:
+                return entry
+        raise InvalidName(
+            f"controller '{name}' is not in this comparison.{nearest(name, [e.name for e in self.entries])}"
+        )
+
+
+def _view(comparison: Comparison) -> View:
     """Return what is said of a comparison."""
     entries = comparison.entries
     ended = [f"{e.name} ended early: {e.run.stop}" for e in entries if e.run.stop]
