@@ -109,7 +109,7 @@ class Foreign(Checked):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("reality")
-        units = _quantities(model)
+        units = quantities(model)
         mistakes.unknown("measures: quantity", self.measures, units)
         for name in needed:
             if name not in self.measures:
@@ -204,7 +204,7 @@ def _short(answer: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
-def _quantities(model: Plant) -> dict[str, str]:
+def quantities(model: Plant) -> dict[str, str]:
     """Return the unit of every quantity of a model that can be measured: state elements, outputs, and controlled responses."""
     signals, orders = (model.state, model.output), model.response_orders
     shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
