@@ -15,7 +15,7 @@ from fpirhc.conformance.loops import Trial, anything
 from fpirhc.conformance.loops import two_masses as two_masses
 from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked, resolved, with_optimiser
-from fpirhc.deformation.base import with_inner
+from fpirhc.deformation.base import automatic, with_inner
 from fpirhc.describe import describe
 from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
@@ -61,10 +61,8 @@ def frozen_value(trial: Trial, generator: np.random.Generator) -> None:  # noqa:
 def facts_hold(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """The facts of a controller hold: its inner controller can be exchanged, no automatic setting is left, a planner plans."""
     ready = checked(trial.problem, trial.controller)
-    hold(
-        not ready.deformation.automatic,
-        f"after resolved() its deformation still has the automatic settings {ready.deformation.automatic}",
-    )
+    left = automatic(ready.deformation)
+    hold(not left, f"after resolved() its deformation still has the automatic settings {left}")
     if ready.inner is not None:
         same = with_inner(ready, ready.inner)
         hold(describe(same) == describe(ready), "around its own inner controller it has another description")

@@ -41,7 +41,9 @@ def check_deformation(
         AssertionError: the first law that does not hold, in one sentence.
         FpirhcError: the map is not complete, a Sigmoid without scale for instance.
     """
-    of_a_pair = deformation.mirror is None and deformation.pairing is None and deformation.error_pole == 0
+    of_a_pair = (
+        deformation.mirror is None and deformation.iteration.pairing is None and deformation.iteration.error_pole == 0
+    )
     keep(deformation, _Trial(deformation, tuple(elements), amplitude), LAWS if of_a_pair else ANY, seed)
     check_deformation_facts(deformation, seed=seed, amplitude=amplitude)
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.conformance.laws import hold, keep
-from fpirhc.deformation.base import Deformation, Demand, with_inner
+from fpirhc.deformation.base import Deformation, Demand, automatic, with_inner
 from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
 
@@ -67,7 +67,7 @@ class _Cycles:
     @cached_property
     def wait(self) -> int:
         """Cycles after which every pair is one of this run."""
-        pairing = self.deformation.pairing
+        pairing = self.deformation.iteration.pairing
         return (
             0 if pairing is None or pairing.cycles is None else int(np.ceil(pairing.cycles)) + pairing.uncertainty + 2
         )
@@ -107,14 +107,32 @@ def inner_can_be_exchanged(trial: _Cycles, generator: np.random.Generator) -> No
         hold(describe(same) == describe(deformation), f"around its own inner map it is {same}")
 
 
+def shown_is_remembered(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """Every signal that `shown` logs is a scalar of the memory."""
+    for name, source in trial.deformation.shown().items():
+        scalar = source in trial.layout and trial.layout[source].size == 1
+        hold(scalar, f"it shows '{source}' as '{name}', which is no scalar of its memory {list(trial.layout.names)}")
+
+
+def held_keeps_the_memory(trial: _Cycles, generator: np.random.Generator) -> None:
+    """After a cycle in which the request was held every remembered signal is finite and of its own size."""
+    memory = trial.layout.split(ca.SX(trial.calm_memory()))
+    after = trial.deformation.held(ca.SX(float(generator.normal())), memory)
+    for name, value in after.items():
+        hold(name in trial.layout, f"held() gives '{name}', and it remembers {list(trial.layout.names)}")
+        numbers = np.asarray(ca.evalf(ca.SX(value)).full())
+        fits = numbers.size == trial.layout[name].size and bool(np.isfinite(numbers).all())
+        hold(fits, f"held() gives {numbers.ravel()} for '{name}', which has {trial.layout[name].size} entries")
+
+
 def automatic_settings_are_chosen(trial: _Cycles, generator: np.random.Generator) -> None:
     """`suited` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
     deformation = trial.deformation
     for sudden in (False, True):
         change = float(generator.uniform(2.0, 20.0))
         ready = deformation.suited(Demand(change, sudden))
-        hold(not ready.automatic, f"suited() leaves {ready.automatic} open")
-        if not deformation.automatic:
+        hold(not automatic(ready), f"suited() leaves {automatic(ready)} open")
+        if not automatic(deformation):
             hold(describe(ready) == describe(deformation), f"no setting is automatic, but suited() gives {ready}")
         else:
             step = ready.largest_step()
@@ -122,8 +140,8 @@ def automatic_settings_are_chosen(trial: _Cycles, generator: np.random.Generator
 
 
 def constant_map_keeps_its_gain(trial: _Cycles, generator: np.random.Generator) -> None:
-    """A map whose fact `constant` is true responds to an error in the same way after every history of errors."""
-    if not trial.deformation.constant or not trial.deformation.adapts:
+    """A map whose `iteration` is constant responds to an error in the same way after every history of errors."""
+    if not trial.deformation.iteration.constant or not trial.deformation.adapts:
         return
     cycles = _WARM + 2 * trial.wait
     alternating = (-1.0) ** np.arange(cycles)
@@ -141,10 +159,10 @@ def constant_map_keeps_its_gain(trial: _Cycles, generator: np.random.Generator) 
 def filter_and_pairing_are_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
     """An error changes the request at once and permanently, unless `error_pole` spreads it or `pairing` repeats it."""
     deformation = trial.deformation
-    if not deformation.constant or not deformation.adapts:
+    if not deformation.iteration.constant or not deformation.adapts:
         return
     answer, gain = trial.impulse_response(np.zeros(_WARM + 2 * trial.wait)), deformation.effective_gain()
-    pairing, pole = deformation.pairing, deformation.error_pole
+    pairing, pole = deformation.iteration.pairing, deformation.iteration.error_pole
     if pairing is None:
         expected = -gain * (1 - pole ** np.arange(1, answer.size + 1))
         facts = f"the pole {pole:g} and no pairing"
@@ -164,7 +182,7 @@ def filter_and_pairing_are_told(trial: _Cycles, generator: np.random.Generator) 
 
 def reach_is_told(trial: _Cycles, generator: np.random.Generator) -> None:
     """The gain holds for requests a thousand times smaller than `reach`; without reach, for requests of any size."""
-    deformation, reach = trial.deformation, trial.deformation.reach
+    deformation, reach = trial.deformation, trial.deformation.iteration.reach
     if trial.layout.size or not deformation.adapts:
         return
     gain, error = deformation.effective_gain(), _SMALL * trial.amplitude
@@ -185,7 +203,7 @@ def adaptation_is_told(trial: _Cycles, generator: np.random.Generator) -> None: 
     changed = float(np.abs(trial.impulse_response(np.zeros(_WARM + 2 * trial.wait))).max())
     adapts = trial.deformation.adapts
     hold(
-        changed > 0 if adapts and trial.deformation.constant else adapts or changed == 0,
+        changed > 0 if adapts and trial.deformation.iteration.constant else adapts or changed == 0,
         f"`adapts` is {str(adapts).lower()}, but an error of the response changes the request by {changed:.3g} per unit",
     )
 
@@ -196,25 +214,25 @@ def desired_passes_as_told(trial: _Cycles, generator: np.random.Generator) -> No
     calm = trial.calm_memory()
     before, after = (float(trial.function(0.0, 0.0, d, calm)[0]) for d in (0.0, size))
     passes, share = abs(after - before - size) <= _SAME * size, (after - before) / size
-    if deformation.slows_desired:
-        first = deformation.effective_gain() * (1 - deformation.error_pole)
-        told = not passes or abs(first - 1) <= _SAME or not deformation.constant
+    if deformation.iteration.slows_desired:
+        first = deformation.effective_gain() * (1 - deformation.iteration.error_pole)
+        told = not passes or abs(first - 1) <= _SAME or not deformation.iteration.constant
     else:
         told = passes
     hold(
         told,
-        f"`slows_desired` is {str(deformation.slows_desired).lower()}, but of a change of the desired response the request has the "
-        f"share {share:.4g} one cycle later: the rate of its loop would be judged wrongly",
+        f"`slows_desired` is {str(deformation.iteration.slows_desired).lower()}, but of a change of the desired response the request "
+        f"has the share {share:.4g} one cycle later: the rate of its loop would be judged wrongly",
     )
 
 
 def leak_is_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
     """An error changes the next request by the effective gain times 1 - `leak` times 1 - `error_pole`."""
     deformation = trial.deformation
-    if not deformation.constant or not deformation.adapts:
+    if not deformation.iteration.constant or not deformation.adapts:
         return
     first = float(trial.impulse_response(np.zeros(_WARM + 2 * trial.wait))[0])
-    gain, leak, pole = deformation.effective_gain(), deformation.leak, deformation.error_pole
+    gain, leak, pole = deformation.effective_gain(), deformation.iteration.leak, deformation.iteration.error_pole
     expected = -gain * (1 - leak) * (1 - pole)
     hold(
         abs(first - expected) <= _SAME * abs(gain),
@@ -225,6 +243,8 @@ def leak_is_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noq
 
 LAWS = (
     inner_can_be_exchanged,
+    shown_is_remembered,
+    held_keeps_the_memory,
     automatic_settings_are_chosen,
     adaptation_is_told,
     desired_passes_as_told,

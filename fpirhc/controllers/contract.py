@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.controllers.demands import plan_demand, reference_demand
 from fpirhc.controllers.form_check import check_form, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
-from fpirhc.deformation.base import Deformation, with_inner
+from fpirhc.deformation.base import Deformation, automatic, with_inner
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import replaced
 from fpirhc.errors import NotSupported
@@ -250,7 +250,7 @@ class Controller(Checked, ABC):
     def with_defaults(self, problem: Problem) -> Self:
         """Return the controller with the numbers chosen that it leaves to the problem; what it wraps has its own already."""
         deformation = self.deformation
-        if not deformation.automatic:
+        if not automatic(deformation):
             return self
         where = problem if self.inner is None else self.inner_problem(problem)
         demand = reference_demand(where, tracking_law(self)) if self.planner is None else plan_demand(where)

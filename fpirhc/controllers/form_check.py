@@ -44,7 +44,7 @@ def check_form(problem: Problem, controller: _Controller) -> None:
             model-referenced form inside it compares.
     """
     deformation, plant = controller.deformation, problem.plant
-    channels, controlled = deformation.channels, len(plant.controlled_names)
+    channels, controlled = deformation.iteration.channels, len(plant.controlled_names)
     if channels is not None and channels != controlled:
         raise NotSupported(
             f"{type(deformation).__name__}: {channels} dead times are given, but the plant has {controlled} controlled coordinates "

@@ -67,7 +67,7 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
         NotContractive: the gain is too large; the message names the limit, the gain, and remedies.
     """
     gain, form = deformation.effective_gain(), _form(deformation)
-    if gain == 0 or not deformation.limited or not deformation.constant or not _REFUSES.get():
+    if gain == 0 or not deformation.iteration.limited or not deformation.iteration.constant or not _REFUSES.get():
         return
     spectrum = _at_start(problem)
     if spectrum is None:
@@ -141,9 +141,9 @@ class _Form:
 
 
 def _form(deformation: Deformation) -> _Form:
-    pairing = deformation.pairing
+    pairing = deformation.iteration.pairing
     cycles = (pairing.cycles or 0.0) if pairing else 0.0
-    return _Form(cycles, deformation.leak, deformation.error_pole, deformation.mirror is not None)
+    return _Form(cycles, deformation.iteration.leak, deformation.iteration.error_pole, deformation.mirror is not None)
 
 
 def _late(weights: np.ndarray, cycles: float) -> np.ndarray:

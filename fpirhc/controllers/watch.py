@@ -83,7 +83,9 @@ def watch_block(problem: Problem, controller: Controller, status: str, *, longes
 def _iterates(problem: Problem, controller: Controller) -> bool:
     """Whether the map compares the last request with its response, undelayed."""
     deformation = controller.deformation
-    plain = deformation.mirror is None and deformation.pairing is None and not deformation.error_pole
+    plain = (
+        deformation.mirror is None and deformation.iteration.pairing is None and not deformation.iteration.error_pole
+    )
     direct = not problem.answers_late and controller.response(problem) is None and controller.deforms == "response"
     return deformation.adapts and plain and direct and deformation.effective_gain() != 0
 

@@ -10,18 +10,27 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 import casadi as ca
 
 from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.fields.checked import Checked, unnamed_inner
+from fpirhc.fields.checked import Checked, former_members, unnamed_inner
 from fpirhc.fields.given import described
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.layout import Expression, Layout
 
+FORMER = {  # members of earlier versions
+    "around": "hold the inner map in a field",
+    "automatic": 'mark the field with the metadata {"automatic": True}',
+    **dict.fromkeys(
+        ("channels", "constant", "error_pole", "leak", "limited", "pairing", "reach", "slows_desired"),
+        "write `iteration`, a value of the class Iteration with all of these",
+    ),
+    "settled": "leave it out",
+}
 Wrapping = TypeVar("Wrapping")
 
 
@@ -90,6 +99,32 @@ class Demand:
     recovery: float = 0.0
 
 
+@dataclass(frozen=True)
+class Iteration:
+    """What a map is to first order, beside its effective gain: what a review needs to judge this gain.
+
+    Args:
+        constant: whether gain and pairing stay as they are at the start of a run.
+        slows_desired: whether the form is the plain one, in which a change of the desired response passes through the iteration, a
+            low-pass.
+        error_pole: pole of a low-pass filter on the response error, from 0 (none) to below 1.
+        leak: pole of the leak between the deformation of the last cycle and the next; 0: none.
+        pairing: the earlier request that a response is paired with; None: the last one.
+        reach: the setting that bounds the requests for which the gains hold; None where the gains hold for all requests.
+        channels: number of controlled coordinates that the map is made for; None: any number.
+        limited: whether a gain beyond the limit of the iteration is refused.
+    """
+
+    constant: bool = True
+    slows_desired: bool = True
+    error_pole: float = 0.0
+    leak: float = 0.0
+    pairing: Pairing | None = None
+    reach: Reach | None = None
+    channels: int | None = None
+    limited: bool = True
+
+
 class Deformation(Checked, ABC):
     """Contract: a map from (request, response, desired) to the next request, and facts about it.
 
@@ -98,8 +133,6 @@ class Deformation(Checked, ABC):
     """
 
     gain_name: ClassVar[str] = "gain"  # the field that the effective gain is proportional to
-    # Whether an inner map is given request, response and desired response as they are.
-    passes_pair: ClassVar[bool] = False
 
     if TYPE_CHECKING:
 
@@ -116,6 +149,7 @@ class Deformation(Checked, ABC):
             yield f"{type(self).__name__}: `inner` is the map that it is around, or None, got {described(self.inner)}"
         else:
             yield from unnamed_inner(self, Deformation)
+        yield from former_members(self, FORMER)
 
     @property
     def adapts(self) -> bool:
@@ -123,66 +157,22 @@ class Deformation(Checked, ABC):
         return True if self.inner is None else self.inner.adapts
 
     @property
-    def constant(self) -> bool:
-        """Whether gain and pairing stay as they are at the start of a run.
-
-        By default this is so for a map that remembers nothing of its own.
-        """
+    def iteration(self) -> Iteration:
+        """What the map is to first order; gain and pairing are constant where it remembers nothing of its own."""
         own = self.memory(("q",)).names
-        return not own if self.inner is None else self.inner.constant and own == self.inner.memory(("q",)).names
-
-    @property
-    def limited(self) -> bool:
-        """Whether a gain beyond the limit of the iteration is refused."""
-        return True if self.inner is None else self.inner.limited
-
-    @property
-    def reach(self) -> Reach | None:
-        """The setting that bounds the requests for which the gains hold; None where the gains hold for all requests."""
-        return None if self.inner is None else self.inner.reach
-
-    @property
-    def pairing(self) -> Pairing | None:
-        """The earlier request that a response is paired with; None: the last one."""
-        return None if self.inner is None else self.inner.pairing
-
-    @property
-    def leak(self) -> float:
-        """Pole of the leak between the deformation of the last cycle and the next; 0: none."""
-        return 0.0 if self.inner is None else self.inner.leak
+        if self.inner is None:
+            return Iteration(constant=not own)
+        inner = self.inner.iteration
+        return replace(inner, constant=inner.constant and own == self.inner.memory(("q",)).names)
 
     @property
     def mirror(self) -> Mirror | None:
         """The way of the model's response to `step`, which is given it as `request`; None: `step` is given the last request."""
         return None if self.inner is None else self.inner.mirror
 
-    @property
-    def channels(self) -> int | None:
-        """Number of controlled coordinates that the map is made for; None: any number."""
-        return None if self.inner is None else self.inner.channels
-
-    @property
-    def error_pole(self) -> float:
-        """Pole of a low-pass filter on the response error, from 0 (none) to below 1."""
-        return 0.0 if self.inner is None else self.inner.error_pole
-
-    @property
-    def automatic(self) -> tuple[str, ...]:
-        """Names of the settings that `suited` still has to choose."""
-        return () if self.inner is None else self.inner.automatic
-
     def suited(self, demand: Demand) -> Self:
         """Return the map with its automatic settings chosen for how much the desired response changes."""
         return self if self.inner is None else with_inner(self, self.inner.suited(demand))
-
-    @property
-    def slows_desired(self) -> bool:
-        """Whether the form is the plain one, in which a change of the desired response passes through the iteration, a low-pass."""
-        return True if self.inner is None else self.inner.slows_desired
-
-    def settled(self, request: Expression, response: Expression) -> dict[str, Expression]:
-        """Return what the map remembers where `request` causes the desired `response`, by name; other signals keep their start."""
-        return {} if self.inner is None else self.inner.settled(request, response)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """What the map remembers besides the pair (request, desired); by default nothing."""
@@ -250,6 +240,14 @@ def with_inner(wrapper: Wrapping, inner: object) -> Wrapping:
             f"{type(wrapper).__name__} has no field that holds its `inner`, so the inner one cannot be replaced; hold it in a field"
         )
     return changed
+
+
+def automatic(deformation: Deformation) -> tuple[str, ...]:
+    """Return names of settings that `suited` still has to choose: fields with the metadata {"automatic": True} that are None."""
+    own = innermost(deformation)
+    if not is_dataclass(own):
+        return ()
+    return tuple(f.name for f in fields(own) if f.metadata.get("automatic") and getattr(own, f.name) is None)
 
 
 def innermost(deformation: Deformation) -> Deformation:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, Iteration
 from fpirhc.errors import NotSupported
 from fpirhc.symbolic.layout import Expression
 
@@ -24,9 +24,9 @@ class Identity(Deformation):
         return False
 
     @property
-    def slows_desired(self) -> bool:
-        """False: the request is the desired response."""
-        return False
+    def iteration(self) -> Iteration:
+        """None: the request is the desired response."""
+        return Iteration(slows_desired=False)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

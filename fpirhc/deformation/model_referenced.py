@@ -22,11 +22,11 @@ f^ reaches the iteration the way f does: after the same dead time, through the s
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Mirror, Pairing
+from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing
 from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every, several
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
@@ -80,28 +80,19 @@ class ModelReferenced(Wrapper):
         return Mirror(self.cycles, self.measurement, self.lag)
 
     @property
-    def constant(self) -> bool:
-        """As the map: the wrapper remembers deformations, which change neither gain nor pairing."""
-        return self.map.constant
+    def iteration(self) -> Iteration:
+        """That of the map, on deformations that leak and are paired; the desired response is added after it."""
+        longest, several_channels = max(every(self._delays)), isinstance(self.cycles, tuple)
+        return replace(
+            self.map.iteration,
+            slows_desired=False,
+            leak=self._leak,
+            pairing=Pairing(longest, channels=several(self._delays)) if longest else None,
+            channels=len(every(self.cycles)) if several_channels else self.map.iteration.channels,
+        )
 
     @property
-    def slows_desired(self) -> bool:
-        """False: the desired response is added after the map."""
-        return False
-
-    @property
-    def pairing(self) -> Pairing | None:
-        """The longest dead time, that of the measurement included; None without dead time."""
-        longest = max(every(self._delays))
-        return Pairing(longest, channels=several(self._delays)) if longest else None
-
-    @property
-    def channels(self) -> int | None:
-        """The number of dead times where there are several."""
-        return len(self.cycles) if isinstance(self.cycles, tuple) else self.map.channels
-
-    @property
-    def leak(self) -> float:
+    def _leak(self) -> float:
         """The pole p in use."""
         return chosen_pole(self.map.effective_gain(), self._delays, self.uncertainty, self.pole)
 
@@ -110,17 +101,12 @@ class ModelReferenced(Wrapper):
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         return Layout((Signal("own_deformation", past),)) + self.map.memory(elements)
 
-    def settled(self, request: Expression, response: Expression) -> dict[str, Expression]:
-        """Return what is remembered at a fixed point: every deformation is request minus response."""
-        past = ca.repmat(request - response, self._queue.length, 1)
-        return {"own_deformation": past, **self.map.settled(request, response)}
-
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the next request; `request` is the model's response, behind the mirror."""
         size, queue, past = request.numel(), self._queue, memory["own_deformation"]
-        before, pole = past[:size], self.leak
+        before, pole = past[:size], self._leak
         undeformed = request - queue.delayed(past, size)
         next_request, next_memory = self.map.step(request, response, undeformed, of_map(self, memory, size))
         deformation = next_request - undeformed
@@ -154,10 +140,25 @@ def require_own_requests(owner: str, deformation: Deformation) -> None:
         )
 
 
+def settled(deformation: Deformation, request: Expression, response: Expression) -> dict[str, Expression]:
+    """Return what a map remembers where `request` causes the desired `response`, by name; other signals keep their start.
+
+    At a fixed point every deformation of a model-referenced form is request minus response.
+    """
+    known: dict[str, Expression] = {}
+    inside: Deformation | None = deformation
+    while inside is not None:
+        if isinstance(inside, ModelReferenced):
+            known["own_deformation"] = ca.repmat(request - response, inside._queue.length, 1)
+        inside = inside.inner
+    return known
+
+
 def form_inside(deformation: Deformation) -> Deformation | None:
     """Return the wrapper that changes what a model-referenced form inside it compares; None where there is no such wrapper."""
     while deformation.inner is not None:
-        if deformation.inner.mirror is not None and not deformation.passes_pair:
+        passes = isinstance(deformation, Wrapper) and deformation.passes_pair
+        if deformation.inner.mirror is not None and not passes:
             return deformation
         deformation = deformation.inner
     return None

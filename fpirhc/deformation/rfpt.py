@@ -8,7 +8,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Reach, require_numbers
+from fpirhc.deformation.base import Deformation, Iteration, Reach, require_numbers
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression
 
@@ -46,9 +46,9 @@ class RFPT(Deformation):
             )
 
     @property
-    def reach(self) -> Reach:
+    def iteration(self) -> Iteration:
         """The gains hold for |K_c| >> |r|."""
-        return Reach("offset", abs(self.offset))
+        return Iteration(reach=Reach("offset", abs(self.offset)))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

@@ -20,7 +20,7 @@ from typing import ClassVar, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Reach, require_numbers
+from fpirhc.deformation.base import Deformation, Iteration, Reach, require_numbers
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression
 
@@ -60,9 +60,9 @@ class Rotation(Deformation):
             raise InvalidValue(f"Rotation(radius={self.radius!r}): expected a positive number in units of the response")
 
     @property
-    def reach(self) -> Reach:
+    def iteration(self) -> Iteration:
         """R is several times the longest vector."""
-        return Reach("radius", self.radius)
+        return Iteration(reach=Reach("radius", self.radius))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
@@ -51,7 +51,7 @@ class Sigmoid(Deformation):
 
     gain: float
     shift: float = 0.3
-    scale: float | None = None
+    scale: float | None = field(default=None, metadata={"automatic": True})
 
     def __post_init__(self) -> None:
         require_numbers("Sigmoid", {"gain": self.gain})
@@ -65,11 +65,6 @@ class Sigmoid(Deformation):
     def with_scale(self, scale: float) -> Self:
         """Return the same map with scale S."""
         return replace(self, scale=scale)
-
-    @property
-    def automatic(self) -> tuple[str, ...]:
-        """The scale, unless the user has set it."""
-        return ("scale",) if self.scale is None else ()
 
     def suited(self, demand: Demand) -> Self:
         """Return the map with a scale S of at least 1 that serves the demand; a scale that the user has set stays.

@@ -17,10 +17,10 @@ SMALL = 0.01  # of the range between an input's limits
 def chatter_small(grid: ReviewGrid, controller: Controller) -> Answer | None:
     """Return the rms steps of the commands that noise causes; None without white noise on a response, or where it is late."""
     problem, deformation = grid.problem, controller.deformation
-    if problem.sensing.ideal or problem.response_delay > 0 or not deformation.constant:
+    if problem.sensing.ideal or problem.response_delay > 0 or not deformation.iteration.constant:
         return None
     try:
-        steps = chatter_of(grid, controller, deformation.effective_gain(), deformation.error_pole)
+        steps = chatter_of(grid, controller, deformation.effective_gain(), deformation.iteration.error_pole)
     except FpirhcError:
         return None
     lower, upper = problem.limits.input_bounds(problem.plant)

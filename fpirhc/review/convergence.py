@@ -55,7 +55,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
         text += f", beside those of the states that decay by themselves, {float(loops.radii.max()):.6g}"
     numbers = {"radius": worst, "smallest_radius": float(radii.min())}
     deformation = controller.deformation
-    if not deformation.constant or loops.learns:
+    if not deformation.iteration.constant or loops.learns:
         what = (
             f"{type(controller).__name__} changes its model"
             if loops.learns

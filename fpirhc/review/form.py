@@ -34,9 +34,9 @@ def form_of(deformation: Deformation) -> str:
     """The form in use."""
     if deformation.mirror is not None:
         return REFERENCED
-    if not deformation.slows_desired:
+    if not deformation.iteration.slows_desired:
         return INCREMENT
-    return PLAIN if deformation.pairing is None else "paired"
+    return PLAIN if deformation.iteration.pairing is None else "paired"
 
 
 def right_form(problem: Problem, deformation: Deformation, harm: Callable[[Deformation], str]) -> Answer:

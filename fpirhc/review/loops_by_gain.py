@@ -57,7 +57,7 @@ def loops_by_gain(grid: ReviewGrid, controller: Controller, own: Loops) -> Loops
 
     A gain that the linearised plants refuse has no loops, so there those of smaller gains are taken.
     """
-    if not controller.deformation.adapts or not controller.deformation.constant:
+    if not controller.deformation.adapts or not controller.deformation.iteration.constant:
         return None
     gain = controller.deformation.effective_gain()
     for share in _SHARES:

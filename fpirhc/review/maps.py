@@ -36,7 +36,7 @@ def largest_product(problem: Problem, deformation: Deformation, eigenvalues: np.
         deformation: the deformation.
         eigenvalues: of the response Jacobian, for the model-referenced form; their smallest and largest sizes count.
     """
-    pairing = deformation.pairing
+    pairing = deformation.iteration.pairing
     averaged = pairing is not None and pairing.uncertainty > 0
     behind = None if averaged else product_limit(problem, deformation)
     if behind is not None:
@@ -52,15 +52,15 @@ def largest_product(problem: Problem, deformation: Deformation, eigenvalues: np.
 
 def _limit(deformation: Deformation, late: float, own: float, size: float) -> float:
     """Limit of gain times an eigenvalue of this size, of one channel."""
-    pairing = deformation.pairing
+    pairing = deformation.iteration.pairing
     whole = math.floor(late + 1e-9)
     share = max(late - whole, 0.0)
     weights = np.append(np.zeros(whole), [1 - share, share])
     limit = leaking_limit(
         weights,
         cycles=own,
-        leak=deformation.leak,
-        pole=deformation.error_pole,
+        leak=deformation.iteration.leak,
+        pole=deformation.iteration.error_pole,
         eigenvalue=size,
         referenced=deformation.mirror is not None,
         width=pairing.uncertainty if pairing else 0,

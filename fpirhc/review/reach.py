@@ -14,7 +14,7 @@ _SPARE = 10.0
 
 def range_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray) -> Answer | None:
     """Return the ratio of the map's constant to the largest request; None for a map without such a constant."""
-    reach = deformation.reach
+    reach = deformation.iteration.reach
     if reach is None:
         return None
     size, name = reach.size, reach.name

@@ -22,7 +22,7 @@ def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answ
     law = law_of(grid, controller)
     if grid.problem.plant.step is not None:
         return None  # the linear loop of a map is exact
-    if law is None or not controller.deformation.slows_desired:
+    if law is None or not controller.deformation.iteration.slows_desired:
         return None
     rate, poles = law
     product = _products(controller, own)[0]

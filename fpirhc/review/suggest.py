@@ -163,7 +163,7 @@ def _with(deformation: Deformation, gain: float, pole: float) -> Deformation:
     if inner is None:
         changed = deformation.with_effective_gain(gain)
         return Filtered(changed, pole=pole) if pole else changed
-    if deformation.error_pole != inner.error_pole:  # a filter, which the new one replaces
+    if deformation.iteration.error_pole != inner.iteration.error_pole:  # a filter, which the new one replaces
         return _with(inner, gain, pole)
     return with_inner(deformation, _with(inner, gain, pole))
 

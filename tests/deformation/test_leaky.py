@@ -89,7 +89,7 @@ def test_the_map_itself_follows_the_theorem(form):
             iteration_radius(deformation, true) if form is fp.Increment else referenced_radius(deformation, true)
         )
         assert limit_value < 1
-        assert limit_value == pytest.approx(radius(1.0, deformation.leak, believed, true), abs=1e-6)
+        assert limit_value == pytest.approx(radius(1.0, deformation.iteration.leak, believed, true), abs=1e-6)
     assert iteration_radius(fp.Increment(affine(1.0), cycles=20, uncertainty=0), 21) > 1
 
 
@@ -97,8 +97,8 @@ def referenced_radius(deformation: fp.ModelReferenced, delay: int) -> float:
     """The same for the model-referenced form, whose model answers after the believed dead time: deltas, newest first."""
     import casadi as ca
 
-    assert deformation.pairing is not None
-    believed = round(deformation.pairing.cycles or 0.0)
+    assert deformation.iteration.pairing is not None
+    believed = round(deformation.iteration.pairing.cycles or 0.0)
     layout, size = deformation.memory(("q",)), max(delay, believed) + 1
     z = ca.SX.sym("z", size + layout.size)
     memory = layout.split(z[size:])

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import brentq
 
 import fpirhc as fp
-from fpirhc.deformation.base import Deformation, Demand, Reach
+from fpirhc.deformation.base import Deformation, Demand, Reach, automatic
 from fpirhc.errors import InvalidValue
 
 
@@ -49,7 +49,7 @@ def test_robust_fixed_point_transformation(offset, sign):
     assert (other.offset, other.sign) == (offset, sign)
     assert other.gain == pytest.approx(-0.2 / (offset * sign))
     assert other.effective_gain() == pytest.approx(0.2)
-    assert one.reach == Reach("offset", 50.0)
+    assert one.iteration.reach == Reach("offset", 50.0)
 
 
 def test_settings_of_the_robust_transformation():
@@ -96,7 +96,7 @@ def test_scale_of_the_sigmoid():
     assert step == pytest.approx(0.81, abs=5e-3)  # with the usual shift of 0.3
     for demand, scale in selection.items():
         assert free.suited(demand).scale == pytest.approx(scale, rel=5e-3)
-    assert (free.automatic, free.with_scale(2.0).automatic) == (("scale",), ())
+    assert (automatic(free), automatic(free.with_scale(2.0))) == (("scale",), ())
     assert free.with_scale(2.0).suited(Demand(50.0, sudden=True)).scale == 2.0
     assert fp.Sigmoid(gain=-0.5, shift=5.0).shift == 5.0
     for wrong in (
@@ -136,7 +136,7 @@ def test_facts_of_the_rotation():
     assert (one.effective_gain(), one.largest_step(), one.gain_name) == (0.4, math.inf, "fraction")
     assert one.secant_gain() == pytest.approx(0.4 * 2 * math.pi / (3 * math.sqrt(3)))
     assert one.with_effective_gain(0.3) == fp.Rotation(fraction=0.3, radius=10.0)
-    assert one.reach == Reach("radius", 10.0)
+    assert one.iteration.reach == Reach("radius", 10.0)
     for wrong in ({"fraction": 0.0}, {"radius": 0.0}, {"radius": -1.0}, {"radius": math.inf}):
         with pytest.raises(InvalidValue, match="expected"):
             fp.Rotation(**{"fraction": 0.4, "radius": 1.0, **wrong})

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import pytest
 from reviewed import about, answers, mass, torque
 
@@ -19,7 +20,7 @@ from fpirhc.conformance import check_deformation
 from fpirhc.conformance.deformation_facts import check_deformation_facts
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, rename
 from fpirhc.controllers.contract import resolved, with_optimiser, without_deformation
-from fpirhc.deformation.base import Deformation, Pairing, Reach
+from fpirhc.deformation.base import Deformation, Iteration, Pairing, Reach, automatic
 from fpirhc.deformation.wrappers.base import Wrapper
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.simulation.lyapunov_view import lyapunov_view
@@ -127,23 +128,29 @@ def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
 
     @dataclass(frozen=True)
     class Steady(fp.Damped):
-        constant = True
+        @property
+        def iteration(self):
+            return self.map.iteration
 
     @dataclass(frozen=True)
     class Quick(fp.Filtered):
-        error_pole = 0.0
+        @property
+        def iteration(self):
+            return self.map.iteration
 
     @dataclass(frozen=True)
     class Early(fp.Paired):
-        pairing = Pairing(2.0)
+        @property
+        def iteration(self):
+            return replace(super().iteration, pairing=Pairing(2.0))
 
     @dataclass(frozen=True)
     class Boundless(fp.RFPT):
-        reach = None  # type: ignore[assignment]  # what a careless user writes
+        iteration = Iteration()
 
     @dataclass(frozen=True)
     class Narrow(fp.RFPT):
-        reach = Reach("offset", 1e6)
+        iteration = Iteration(reach=Reach("offset", 1e6))
 
     @dataclass(frozen=True)
     class Finished(fp.Sigmoid):
@@ -152,8 +159,18 @@ def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
 
     @dataclass(frozen=True)
     class Stubborn(fp.Filtered):
-        def around(self, inner):
-            return replace(self, map=inner, pole=0.5 * self.pole)
+        def __post_init__(self):
+            object.__setattr__(self, "pole", 0.5 * self.pole)
+
+    @dataclass(frozen=True)
+    class Boasting(fp.Filtered):
+        def shown(self):
+            return {"filtered": "filter_error", "hidden": "filter_state"}
+
+    @dataclass(frozen=True)
+    class Confused(fp.Filtered):
+        def held(self, request, memory):
+            return {**super().held(request, memory), "filter_error": ca.vertcat(request, request)}
 
     inner = fp.Affine(gain=-1.0)
     liars = {
@@ -164,6 +181,8 @@ def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
         Narrow(offset=10.0, sign=-1, gain=0.05): "reach",
         Finished(gain=-0.5): "automatic settings",
         Stubborn(inner, pole=0.5): "inner can be exchanged",
+        Boasting(inner, pole=0.5): "shown is remembered",
+        Confused(inner, pole=0.5): "held keeps the memory",
     }
     for liar, law in liars.items():
         with pytest.raises(AssertionError, match=f"breaks the law '{law}"):
@@ -174,10 +193,14 @@ def test_facts_go_through_wrappers():
     """Reach, pairing, pole and what is automatic are those of the map inside; a wrapper with a memory is not constant by itself."""
     inside = fp.Paired(fp.Filtered(fp.RFPT(offset=1e3, sign=-1, gain=1e-4), pole=0.3), cycles=4, uncertainty=1)
     outside = fp.Damped(inside)
-    assert (outside.reach, outside.pairing, outside.error_pole) == (Reach("offset", 1e3), Pairing(4, 1), 0.3)
-    assert inside.constant
-    assert not outside.constant
-    assert fp.Damped(fp.Sigmoid(gain=-0.5)).automatic == ("scale",)
+    assert (outside.iteration.reach, outside.iteration.pairing, outside.iteration.error_pole) == (
+        Reach("offset", 1e3),
+        Pairing(4, 1),
+        0.3,
+    )
+    assert inside.iteration.constant
+    assert not outside.iteration.constant
+    assert automatic(fp.Damped(fp.Sigmoid(gain=-0.5))) == ("scale",)
     assert isinstance(inside, Wrapper)
 
 

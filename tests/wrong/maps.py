@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from fpirhc.deformation import Deformation
+from fpirhc.deformation.base import Iteration
 
 
 @dataclass(frozen=True)
@@ -112,18 +113,18 @@ class SaysDesiredPassesAtOnce(Softsign):
     """Is the plain form and says that it is not."""
 
     @property
-    def slows_desired(self):
+    def iteration(self):
         """Wrong."""
-        return False
+        return Iteration(slows_desired=False)
 
 
 class SaysItFilters(Softsign):
     """Names a filter that it does not have."""
 
     @property
-    def error_pole(self):
+    def iteration(self):
         """Wrong."""
-        return 0.9
+        return Iteration(error_pole=0.9)
 
 
 class SaysItDoesNotAdapt(Softsign):
@@ -139,6 +140,6 @@ class SaysItLeaks(Softsign):
     """Names a leak that it does not have."""
 
     @property
-    def leak(self):
+    def iteration(self):
         """Wrong."""
-        return 0.5
+        return Iteration(leak=0.5)

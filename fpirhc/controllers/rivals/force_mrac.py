@@ -27,7 +27,7 @@ from fpirhc.controllers.contract import Deforms, PlantModel
 from fpirhc.controllers.demands import command_demand
 from fpirhc.controllers.face import on_face
 from fpirhc.controllers.tracked import bounded, desired_blocks
-from fpirhc.deformation.base import Deformation, Mirror
+from fpirhc.deformation.base import Deformation, Mirror, automatic
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
@@ -55,7 +55,7 @@ class ForceMRAC(Controller):
 
     def with_defaults(self, problem: Problem) -> ForceMRAC:
         """Return the controller with a scale for the command that the reference model needs along the reference."""
-        if not self.deformation.automatic:
+        if not automatic(self.deformation):
             return self
         demand = command_demand(problem, self.plant_model(problem).parameters(problem.plant))
         return replace(self, deformation=self.deformation.suited(demand))

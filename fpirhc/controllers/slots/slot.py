@@ -117,9 +117,9 @@ def _check_deformation(deformation: Deformation) -> None:
             "ModelReferenced in a slot compares with the model's response of this instant; dead time and lag keep commands of "
             "earlier cycles, which belong to another slot after a switch; leave cycles, measurement and lag out"
         )
-    if deformation.pairing is not None:
+    if deformation.iteration.pairing is not None:
         pairs = deformation
-        while pairs.inner is not None and pairs.inner.pairing is not None:
+        while pairs.inner is not None and pairs.inner.iteration.pairing is not None:
             pairs = pairs.inner
         raise NotSupported(
             f"{type(pairs).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch; "

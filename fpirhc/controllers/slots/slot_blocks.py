@@ -22,6 +22,7 @@ from fpirhc.controllers.base import clip, error_signal, like
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.slot import Channel, First
+from fpirhc.deformation.model_referenced import settled
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
@@ -163,7 +164,7 @@ def settled_in(one: Channel) -> First:
     request = one.wire(_request_before(one))
 
     def first(s: Signals) -> Mapping[str, Expression]:
-        return one.slot.deformation.settled(getattr(s, request), getattr(s, one.wire("realised")))
+        return settled(one.slot.deformation, getattr(s, request), getattr(s, one.wire("realised")))
 
     return first
 

@@ -29,7 +29,7 @@ from fpirhc.controllers.base import Controller, compose_controller, embedded, li
 from fpirhc.controllers.contract import Deforms, without_deformation
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.target_pairing import ThroughModel
-from fpirhc.deformation.base import Deformation, Demand
+from fpirhc.deformation.base import Deformation, Demand, automatic
 from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Composite, Delay
@@ -85,7 +85,7 @@ class Cascade(Controller):
         return replace(
             self,
             paired=None if paired is None else paired.stated(problem),
-            deformation=map_.suited(self._demand(problem)) if map_.automatic else map_,
+            deformation=map_.suited(self._demand(problem)) if automatic(map_) else map_,
         )
 
     def _demand(self, problem: Problem) -> Demand:
@@ -111,7 +111,7 @@ class Cascade(Controller):
             raise NotSupported(
                 "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself"
             )
-        if self.deformation.pairing is not None:
+        if self.deformation.iteration.pairing is not None:
             raise NotSupported(
                 f"Cascade: {type(self.deformation).__name__} pairs by itself; give the map inside, and "
                 "ThroughModel(dead_time=...)"

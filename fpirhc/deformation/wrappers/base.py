@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import ClassVar, Self
 
 import casadi as ca
 
@@ -24,6 +24,8 @@ class Wrapper(Deformation, ABC):
     Args:
         map: the wrapped deformation, the first field of every wrapper.
     """
+
+    passes_pair: ClassVar[bool] = False  # whether a model-referenced form inside is given what it compares
 
     map: Deformation
 

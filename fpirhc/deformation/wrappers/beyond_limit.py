@@ -6,10 +6,10 @@ A saturating map beyond its limit ends in a bounded oscillation, which is worth 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, Iteration
 from fpirhc.deformation.wrappers.base import Wrapper
 from fpirhc.symbolic.layout import Expression, Layout
 
@@ -25,9 +25,9 @@ class BeyondLimit(Wrapper):
     passes_pair: ClassVar[bool] = True
 
     @property
-    def limited(self) -> bool:
-        """False: a gain beyond the limit is asked for."""
-        return False
+    def iteration(self) -> Iteration:
+        """That of the map, where a gain beyond the limit is asked for."""
+        return replace(self.map.iteration, limited=False)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """That of the map."""

@@ -25,12 +25,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Pairing
+from fpirhc.deformation.base import Deformation, Iteration, Pairing
 from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_longest, check_uncertainty, every, several
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
@@ -65,19 +65,11 @@ class _Queued(Wrapper):
     longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
     @property
-    def constant(self) -> bool:
-        """As the map: the wrapper remembers pairs, which change neither gain nor pairing."""
-        return self.map.constant
-
-    @property
-    def pairing(self) -> Pairing:
-        """The believed dead time, the longest of several."""
-        return Pairing(max(every(self.cycles)), channels=several(self.cycles))
-
-    @property
-    def channels(self) -> int | None:
-        """The number of dead times where there are several."""
-        return len(self.cycles) if isinstance(self.cycles, tuple) else self.map.channels
+    def iteration(self) -> Iteration:
+        """That of the map, on the pairs of the believed dead time, the longest of several."""
+        pairing = Pairing(max(every(self.cycles)), channels=several(self.cycles))
+        channels = len(every(self.cycles)) if several(self.cycles) else self.map.iteration.channels
+        return replace(self.map.iteration, pairing=pairing, channels=channels)
 
     @property
     @abstractmethod
@@ -157,9 +149,11 @@ class Paired(_Queued):
             )
 
     @property
-    def pairing(self) -> Pairing:
-        """The believed dead time, the longest of several, and the width of the mean."""
-        return Pairing(max(every(self.cycles)), self.uncertainty, several(self.cycles))
+    def iteration(self) -> Iteration:
+        """With the width of the mean."""
+        return replace(
+            super().iteration, pairing=Pairing(max(every(self.cycles)), self.uncertainty, several(self.cycles))
+        )
 
     @property
     def _queue(self) -> Queue:
@@ -200,12 +194,12 @@ class Increment(_Queued):
             check_pole("Increment", self.pole)
 
     @property
-    def slows_desired(self) -> bool:
-        """False: the desired response is added after the map."""
-        return False
+    def iteration(self) -> Iteration:
+        """With a leak; the desired response is added after the map."""
+        return replace(super().iteration, slows_desired=False, leak=self._leak)
 
     @property
-    def leak(self) -> float:
+    def _leak(self) -> float:
         """The pole p in use."""
         return chosen_pole(self.map.effective_gain(), self.cycles, self.uncertainty, self.pole)
 
@@ -216,7 +210,7 @@ class Increment(_Queued):
     def _request(
         self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        size, pole = desired.numel(), self.leak
+        size, pole = desired.numel(), self._leak
         undeformed, request = self._queue.delayed(past.desired, size), self._queue.delayed(past.requests, size)
         next_request, next_memory = self.map.step(request, response, undeformed, memory)
         deformation = next_request - undeformed

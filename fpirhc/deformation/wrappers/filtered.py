@@ -14,9 +14,9 @@ cycle.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, Iteration
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -43,14 +43,9 @@ class Filtered(Wrapper):
             )
 
     @property
-    def constant(self) -> bool:
-        """As the map: the filtered error changes neither gain nor pairing."""
-        return self.map.constant
-
-    @property
-    def error_pole(self) -> float:
-        """The pole of the filter."""
-        return self.pole
+    def iteration(self) -> Iteration:
+        """That of the map, on the filtered error."""
+        return replace(self.map.iteration, error_pole=self.pole)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The filtered error, and the memory of the map."""

@@ -14,11 +14,11 @@ uses, -1 before the first estimate.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Pairing
+from fpirhc.deformation.base import Deformation, Iteration, Pairing
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import total
@@ -50,9 +50,9 @@ class DelayWatched(Wrapper):
         _check_most(type(self).__name__, self.most)
 
     @property
-    def constant(self) -> bool:
-        """As the map: the estimate does not change the iteration."""
-        return self.map.constant
+    def iteration(self) -> Iteration:
+        """That of the map: the estimate does not change it."""
+        return self.map.iteration
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The memory of the estimate and of the map."""
@@ -97,9 +97,9 @@ class SelfPaired(Wrapper):
             raise InvalidValue(f"SelfPaired(confidence={self.confidence!r}): expected a share between 0 and 1")
 
     @property
-    def pairing(self) -> Pairing:
-        """A pairing whose dead time is estimated on line."""
-        return Pairing(None)
+    def iteration(self) -> Iteration:
+        """With a pairing whose dead time is estimated on line."""
+        return replace(super().iteration, pairing=Pairing(None))
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """Past requests, the dead time in use, the candidate and its age; the memory of the estimate and of the map."""

@@ -30,7 +30,7 @@ def comes_back(case: Case) -> Answer | None:
     """Return the largest response error beside the basin; None for other forms, laws without known poles, unbounded steps."""
     deformation = case.controller.deformation
     law, step = law_of(case.grid, case.controller), deformation.largest_step()
-    plain = deformation.adapts and deformation.slows_desired and deformation.pairing is None
+    plain = deformation.adapts and deformation.iteration.slows_desired and deformation.iteration.pairing is None
     if law is None or not plain or not (0 < step < math.inf):
         return None
     error = _largest_error(case)
@@ -44,7 +44,7 @@ def comes_back(case: Case) -> Answer | None:
     numbers = {"error": error, "basin": basin}
     if ratio >= _SPARE:
         return Answer(TEXT, Verdict.YES, text, "", numbers)
-    verdict = Verdict.UNKNOWN if ratio > _LASTING or not deformation.constant else Verdict.NO
+    verdict = Verdict.UNKNOWN if ratio > _LASTING or not deformation.iteration.constant else Verdict.NO
     change = f"Raise the map's scale at least {_SPARE / ratio:.2g} times, or leave it out to have it chosen."
     return Answer(TEXT, verdict, text, change, numbers)
 

@@ -27,7 +27,7 @@ _CHANGE = (
 
 def bears_wrong_dead_time(case: Case) -> Answer | None:
     """Return by how many cycles the dead time may be wrong; None where there is none and none is believed."""
-    pairing = case.controller.deformation.pairing
+    pairing = case.controller.deformation.iteration.pairing
     if not is_late(case.problem) and (pairing is None or pairing.cycles == 0):
         return None
     if not case.loops.loops:
@@ -50,7 +50,7 @@ def bears_wrong_dead_time(case: Case) -> Answer | None:
     assert beyond is not None
     margin = _margin_below_one(case)
     text = f"delay margin {margin:.3g} cycles; wrong by one cycle, the slowest mode is multiplied by {beyond[1]:.6g} per cycle"
-    verdict = Verdict.UNKNOWN if case.loops.learns or not case.controller.deformation.constant else Verdict.NO
+    verdict = Verdict.UNKNOWN if case.loops.learns or not case.controller.deformation.iteration.constant else Verdict.NO
     numbers = {"borne": 0.0, "radius_one_cycle": beyond[1]} | ({"delay_margin": margin} if margin < 1 else {})
     return Answer(TEXT, verdict, text, _CHANGE, numbers)
 

@@ -26,7 +26,11 @@ _POINTS = 3
 def plan_keeps_up(case: Case) -> Answer | None:
     """Return the map's gain over the smallest stable one of its plan; None for other forms and laws with known poles."""
     deformation = case.controller.deformation
-    if tracking_law(case.controller) is not None or not deformation.slows_desired or not deformation.constant:
+    if (
+        tracking_law(case.controller) is not None
+        or not deformation.iteration.slows_desired
+        or not deformation.iteration.constant
+    ):
         return None
     factor = _least_factor(case) if case.loops.loops and deformation.effective_gain() else None
     too_large = factor is not None and factor <= 1 and case.loops.radii.max() >= 1  # which other questions say
@@ -79,7 +83,7 @@ def _remedy(case: Case, factor: float) -> str:
     deformation = case.controller.deformation
     names = []
     for name, form in forms_of(case.problem, deformation).items():
-        if form.slows_desired:
+        if form.iteration.slows_desired:
             continue
         try:
             loops = loops_at(case.grid, case.controller.with_deformation(form), case.loops.places[:1])

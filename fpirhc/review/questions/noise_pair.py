@@ -26,24 +26,20 @@ def suits_noise(case: Case) -> Answer | None:
     """Return gain and pole for the problem's sensors beside those in use; None without noise or for a map that changes on line."""
     deformation = case.controller.deformation
     noisy = any(sensor.noise is not None for sensor in case.problem.sensing.sensors.values())
-    if not noisy or not deformation.constant or case.problem.response_delay > 0:
+    if not noisy or not deformation.iteration.constant or case.problem.response_delay > 0:
         return None
     try:
-        steps = chatter_of(case.grid, case.controller, deformation.effective_gain(), deformation.error_pole)
+        steps = chatter_of(case.grid, case.controller, deformation.effective_gain(), deformation.iteration.error_pole)
         budget = _budget(case) or steps
         pair = suggest(case.problem, case.controller, chatter=budget)
     except FpirhcError as error:
         return Answer(TEXT, Verdict.UNKNOWN, str(error))
+    pole = deformation.iteration.error_pole
     gain, share = abs(deformation.effective_gain()), abs(deformation.effective_gain() / pair.effective_gain)
-    numbers = {
-        "gain": gain,
-        "pole": deformation.error_pole,
-        "recommended": abs(pair.effective_gain),
-        "recommended_pole": pair.pole,
-    }
+    numbers = {"gain": gain, "pole": pole, "recommended": abs(pair.effective_gain), "recommended_pole": pair.pole}
     allowed = ", ".join(f"{name} {value:.3g}" for name, value in budget.items())
     text = (
-        f"effective gain {gain:.3g} and pole {deformation.error_pole:.3g}; with steps per cycle of {allowed} from noise the pair "
+        f"effective gain {gain:.3g} and pole {pole:.3g}; with steps per cycle of {allowed} from noise the pair "
         f"is {abs(pair.effective_gain):.3g} and {pair.pole:.3g}"
     )
     if share >= _ENOUGH and all(steps[name] <= 1.01 * value for name, value in budget.items()):

@@ -13,7 +13,7 @@ from fpirhc.broken import attempted
 from fpirhc.contraction.gains import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved, without_deformation
-from fpirhc.deformation.base import innermost
+from fpirhc.deformation.base import automatic, innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, Mistakes, NotContractive, NotSupported
 from fpirhc.fields.checked import checked_call
@@ -254,7 +254,7 @@ def _entry(
         learns=ready.learns,
         plan_every=every,
         information=informed,
-        automatic=tuple(controller.deformation.automatic),
+        automatic=automatic(controller.deformation),
     )
 
 
@@ -296,5 +296,5 @@ def _notes(controller: Controller, ready: Controller) -> tuple[str, ...]:
     """Which settings of the deformation were chosen automatically."""
     map_ = innermost(ready.deformation)
     return tuple(
-        f"{name} = {getattr(map_, name):g} was chosen automatically" for name in controller.deformation.automatic
+        f"{name} = {getattr(map_, name):g} was chosen automatically" for name in automatic(controller.deformation)
     )
