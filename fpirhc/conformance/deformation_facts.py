@@ -221,8 +221,8 @@ def desired_passes_as_told(trial: _Cycles, generator: np.random.Generator) -> No
         told = passes
     hold(
         told,
-        f"`slows_desired` is {str(deformation.iteration.slows_desired).lower()}, but of a change of the desired response the request "
-        f"has the share {share:.4g} one cycle later: the rate of its loop would be judged wrongly",
+        f"`slows_desired` is {str(deformation.iteration.slows_desired).lower()}, but of a change of the desired response the "
+        f"request has the share {share:.4g} one cycle later: the rate of its loop would be judged wrongly",
     )
 
 
@@ -243,8 +243,6 @@ def leak_is_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noq
 
 LAWS = (
     inner_can_be_exchanged,
-    shown_is_remembered,
-    held_keeps_the_memory,
     automatic_settings_are_chosen,
     adaptation_is_told,
     desired_passes_as_told,
@@ -252,4 +250,6 @@ LAWS = (
     filter_and_pairing_are_told,
     reach_is_told,
     leak_is_told,
+    shown_is_remembered,
+    held_keeps_the_memory,
 )

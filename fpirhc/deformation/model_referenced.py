@@ -145,20 +145,17 @@ def settled(deformation: Deformation, request: Expression, response: Expression)
 
     At a fixed point every deformation of a model-referenced form is request minus response.
     """
-    known: dict[str, Expression] = {}
-    inside: Deformation | None = deformation
-    while inside is not None:
-        if isinstance(inside, ModelReferenced):
-            known["own_deformation"] = ca.repmat(request - response, inside._queue.length, 1)
-        inside = inside.inner
-    return known
+    size = request.numel()
+    memory = deformation.memory(tuple(f"q{k}" for k in range(size)))
+    if "own_deformation" not in memory:
+        return {}
+    return {"own_deformation": ca.repmat(request - response, memory["own_deformation"].size // size, 1)}
 
 
 def form_inside(deformation: Deformation) -> Deformation | None:
     """Return the wrapper that changes what a model-referenced form inside it compares; None where there is no such wrapper."""
     while deformation.inner is not None:
-        passes = isinstance(deformation, Wrapper) and deformation.passes_pair
-        if deformation.inner.mirror is not None and not passes:
+        if deformation.inner.mirror is not None and not getattr(deformation, "passes_pair", False):
             return deformation
         deformation = deformation.inner
     return None

@@ -10,6 +10,7 @@ import fpirhc as fp
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.deformation import Deformation, Identity
+from fpirhc.errors import NotSupported
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Layout
 
@@ -37,6 +38,11 @@ class Gentle(Controller):
         writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
         closing, delays = closing_blocks(problem, self.deformation)
         return [reference_block(problem), Block("law", reads, writes, step), *closing], delays
+
+    def check(self, problem):
+        """Refuse plants without velocities."""
+        if problem.plant.step is not None or set(problem.plant.face.orders) != {2}:
+            raise NotSupported("Gentle feeds back an error and its derivative: outputs of relative order 2 only")
 
     def motion(self, plant):
         """What it feeds back: the measured outputs."""
@@ -155,4 +161,7 @@ class NamesAnotherLaw(Gentle):
 
 
 class SaysItControlsMaps(Gentle):
-    """Takes differences of steps for derivatives, and refuses no map."""
+    """Refuses no map, and can control none."""
+
+    def check(self, problem):
+        """Wrong."""

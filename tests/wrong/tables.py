@@ -16,7 +16,7 @@ CONTROLLERS = {
     controllers.TakesTheStateForTheOutput: ("outputs are controlled", "read plant.output and not plant.state"),
     controllers.IgnoresItsDeformation: ("deformation acts", "half of the effective gain 0.198"),
     controllers.NamesAnotherLaw: ("law is what it does", "fed back with 36, its law Exponential says 3600"),
-    controllers.SaysItControlsMaps: ("maps are controlled", "it takes a map, but"),
+    controllers.SaysItControlsMaps: ("maps are controlled", "it says that it can control a map, but cannot be built"),
 }
 MAPS = {
     maps.HalfTheStep: ("step is bounded", r"above largest_step\(\) = 0.75"),
