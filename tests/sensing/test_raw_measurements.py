@@ -63,12 +63,14 @@ def replayed(stepper: fp.Stepper, run: fp.Run) -> np.ndarray:
     return commands
 
 
-by_estimator = pytest.mark.parametrize("number", range(len(ESTIMATORS)), ids=[str(e) for e in ESTIMATORS])
 by_name = pytest.mark.parametrize("name", CONTROLLERS)
+# A twin has an estimator of its own, so it meets every one; an estimator is the same block before every other controller.
+WINDOW = next(k for k, e in enumerate(ESTIMATORS) if isinstance(e, fp.SavitzkyGolay))
+PAIRS = [(k, "referenced") for k in range(len(ESTIMATORS))] + [(WINDOW, n) for n in CONTROLLERS if n != "referenced"]
+by_pair = pytest.mark.parametrize(("number", "name"), PAIRS, ids=[f"{ESTIMATORS[k]}-{name}" for k, name in PAIRS])
 
 
-@by_estimator
-@by_name
+@by_pair
 @pytest.mark.parametrize("late", LATE)
 def test_raw_measurements_of_a_run_give_its_commands(number, name, late):
     """Bit by bit: both are the same composed step, with noise, lost samples, dead time, and the wait at the start."""
@@ -135,8 +137,7 @@ GO_ON |= {"mirror_estimate_past", "mirror_filter_stages", "mirror_filter_inputs"
 GO_ON |= {"mirror_estimate_smooth"}
 
 
-@by_estimator
-@by_name
+@by_pair
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_bad_raw_sample_is_a_skipped_tick(number, name, bad):
     """Nothing but filters and queues goes on, and afterwards everything is as if the tick had been missed."""
@@ -158,7 +159,7 @@ def test_bad_raw_sample_is_a_skipped_tick(number, name, bad):
 
 def test_first_good_sample_begins_the_estimates():
     """Lost samples before it leave the start's motion in the window, as if the run had begun later."""
-    stepper, run = case([type(e) for e in ESTIMATORS].index(fp.SavitzkyGolay), "computed torque")
+    stepper, run = case(WINDOW, "computed torque")
     measured, fresh, late = raw_measurements(run), stepper.start(), stepper.start()
     for k in range(3):
         held, late = stepper.step_measured(float(run.time[k]), measured[k] + np.nan, late)
