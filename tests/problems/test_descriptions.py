@@ -47,7 +47,7 @@ def error(path: Path, controller: str, element: str) -> float:
         metrics = json.loads(baseline.read_text(encoding="utf-8"))["controllers"][controller]["metrics"]
         return float(metrics[f"rms_error.{element}"]["value"])
     task = fp.load_problem(str(path))
-    run = fp.simulate(task.problem, task.controllers[controller], seed=0, compiled=False)
+    run = fp.simulate(task.problem, task.controllers[controller], seed=0)
     for name, value in fp.measure(task.problem, run).rms_error.items():
         if name == element:
             return value
