@@ -222,8 +222,8 @@ class Reality(Checked):
             what, _, remedy = stiff.partition("; use ")
             raise InvalidProblem(f"reality: {what}; use Reality(..., {remedy})")
 
-    def check_as_model(self, model: Plant) -> None:
-        """Raise if a controller of the model cannot have this reality as its model: both need the same coordinates and orders.
+    def as_model(self, model: Plant) -> Plant:
+        """Return its plant as the model of a controller, with outputs where the model has the same quantities as outputs.
 
         Raises:
             NotSupported: with what differs.
@@ -241,11 +241,11 @@ class Reality(Checked):
         differences += [f"{own} measured in place of {c}" for c, own in self.seen.items()]
         if not differences and plant.names != model.names:
             differences = ["its coordinates in another order"]
-        if tuple(plant.outputs) != tuple(model.outputs):
+        if plant.output.elements != model.output.elements:
             differences.append("other outputs")
         if (plant.step is None) != (model.step is None):
             differences.append("differential equations, and the model is a map")
-        if not differences and (plant.controlled or tuple(plant.outputs) or plant.names) != model.controlled_names:
+        if not differences and (plant.controlled or plant.face.names) != model.controlled_names:
             differences = [
                 f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"
             ]
@@ -253,6 +253,7 @@ class Reality(Checked):
             raise NotSupported(
                 f"the reality has {'; '.join(differences)}: it cannot be the exact model of this controller; leave ExactModel out"
             )
+        return plant if tuple(plant.outputs) == tuple(model.outputs) else replace(plant, outputs=model.outputs)
 
     def _names(self, model: Plant, *, seen: bool) -> tuple[str, ...]:
         """The reality's coordinate for each of the model's."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from test_outputs import OPTIMISER, SHORT, TWO_MASS, arm, circle, hill, on_outputs, planned, sedated, simulated
@@ -25,17 +27,53 @@ def late(problem: fp.Problem, time: float = LATE) -> fp.Problem:
     return replace(problem, dead_time=fp.DeadTime(inputs={"u": time}))
 
 
+@pytest.mark.parametrize("by", [fp.ByModel(), fp.ByModel(residual_time=0.02), fp.ByDesired()], ids=repr)
 @pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC"])
-def test_outputs_that_are_coordinates_change_no_prediction(name: str) -> None:
+def test_outputs_that_are_coordinates_change_no_prediction(name: str, by: Any) -> None:
     dead_time = fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}, measurement=2e-3)
     short = replace(SHORT, duration=0.06, measure_from=0.0, dead_time=dead_time)
-    controller = fp.Predicted(TWO_MASS.controllers[name], inputs=3e-3, measurement=2e-3)
+    controller = fp.Predicted(TWO_MASS.controllers[name], inputs=3e-3, measurement=2e-3, by=by)
     if controller.deformation.adapts:
         controller = controller.with_deformation(fp.Paired(controller.deformation, cycles=5))
     plain, run = (simulated(p, controller) for p in (short, on_outputs(short)))
     for signal in ("state", "command", "state_ahead"):
         assert np.array_equal(plain[signal], run[signal])
     assert np.array_equal(run["output_ahead"], run["state_ahead"])
+
+
+def scaled(gain: float) -> Callable[..., Any]:
+    return lambda q, v, p: gain * q.x
+
+
+def waved(gain: float) -> Callable[..., Any]:
+    return lambda t: {"y": gain * ca.sin(t)}
+
+
+def test_the_residual_of_an_output_is_the_forcing_that_makes_it_up() -> None:
+    """Y = 3 x of a tank with a wrong leak: the residual of y'' acts on the state as a third of it, as if x had been measured."""
+    runs = []
+    for gain, by in ((1.0, fp.ByModel(residual_time=0.5)), (3.0, fp.ByModel(residual_time=0.5)), (1.0, fp.ByModel())):
+        plant = fp.Plant(
+            coordinates={"x": "m"},
+            inputs={"u": "N"},
+            parameters={"a": fp.Parameter(1.0, 2.0, "1")},
+            response=lambda q, v, u, p: {"x": u.u - p.a * q.x},
+            outputs={"y": fp.Output("m", scaled(gain))},
+        )
+        problem = fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(waved(gain)),
+            start={"x": 0.0, "x'": 1.0},
+            period=0.02,
+            duration=6.0,
+            measure_from=4.0,
+            dead_time=fp.DeadTime(inputs={"u": 0.1}),
+        )
+        runs.append(simulated(problem, fp.Predicted(fp.ComputedTorque(LAW), inputs=0.1, by=by)))
+    for signal in ("command", "state_ahead"):
+        assert runs[1][signal] == pytest.approx(runs[0][signal], rel=1e-6, abs=1e-9)
+    missed = [np.abs(run["state_ahead"][200:-5] - run["plant_state"][205:]).max() for run in runs]
+    assert missed[0] < 0.5 * missed[2]
 
 
 def test_outputs_ahead_of_a_right_model_are_those_that_come() -> None:
@@ -90,7 +128,7 @@ def test_an_estimator_inside_a_prediction_has_the_measured_outputs() -> None:
 REFUSED: dict[str, tuple[Callable[[], Controller], str]] = {
     "desired": (
         lambda: fp.Predicted(fp.ComputedTorque(LAW), inputs=LATE, by=fp.ByDesired()),
-        r"the inverse needs the state; use by=ByModel\(\)",
+        r"ByDesired\(\) does not predict C, which no desired response moves; use ByModel\(\)",
     ),
     "inside": (
         lambda: fp.Predicted(fp.RecedingHorizon(OPTIMISER, replanning=fp.FromPlan(LAW)), inputs=LATE),

@@ -201,8 +201,32 @@ def test_an_inverse_of_the_user_has_the_disturbance_of_the_response() -> None:
     one, other = (disturbed(one, ("depth''",)).inverse_function(x, r, p) for one in (plant, by_user))
     assert float(one) == pytest.approx(float(other), rel=1e-9)
     assert float(one) == pytest.approx(float(plant.inverse_function(x, r - 0.4, 5.5)), rel=1e-9)
-    with pytest.raises(NotSupported, match=r"Plant\(inverse=...\) does not know the disturbance of C"):
-        disturbed(by_user, ("C",))
+    own = disturbed(
+        by_user, ("C",)
+    ).inverse_function  # a state of which the output is an expression: the derived inverse
+    assert float(own(x, r, p)) == pytest.approx(float(disturbed(plant, ("C",)).inverse_function(x, r, p)), rel=1e-12)
+
+
+def test_the_exact_model_may_be_written_in_other_words() -> None:
+    """The reality of the heat exchanger has no outputs; the model has the coordinate as an output, and is replaced by it."""
+    task = fp.load_problem("heat_exchanger")
+    spelled = replace(task.problem.plant, outputs={"outlet": fp.Output("K", lambda q, p: q.outlet)})
+    short = replace(task.problem, duration=60.0, measure_from=0.0)
+    exact = task.controllers["static inverse, exact map"]
+    plain, run = (simulated(p, exact) for p in (short, replace(short, plant=spelled)))
+    assert np.array_equal(plain["command"], run["command"])
+
+
+def test_a_disturbed_coordinate_that_is_an_output_keeps_the_inverse_of_the_user() -> None:
+    """The turbojet's offset-free plan, with its temperature as an output: the same bits."""
+    task = fp.load_problem("turbojet")
+    plant, cost = task.problem.plant, task.problem.cost
+    outputs = {n: fp.Output(unit, lambda q, v, p, *, n=n: q[n]) for n, unit in plant.coordinates.items()}
+    assert isinstance(cost, fp.Quadratic)
+    short = replace(task.problem, duration=20 * task.problem.period, measure_from=0.0)
+    spelled = replace(short, plant=replace(plant, outputs=outputs), cost=replace(cost, states={}, outputs=cost.states))
+    plain, run = (simulated(p, task.controllers["RHC offset-free"]) for p in (short, spelled))
+    assert np.array_equal(plain["command"], run["command"])
 
 
 WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {

@@ -48,7 +48,8 @@ class ExactModel(Controller):
         if problem.foreign is not None:
             raise NotSupported("a foreign reality has no equations that could be the exact model; leave ExactModel out")
         if problem.symbolic_reality is not None:
-            problem.symbolic_reality.check_as_model(problem.plant)
+            plant = problem.symbolic_reality.as_model(problem.plant)
+            return PlantModel(plant, really_known(problem.signals), exact=True)
         return PlantModel(problem.real_plant, really_known(problem.signals), exact=True)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:

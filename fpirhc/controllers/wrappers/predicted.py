@@ -11,7 +11,8 @@ There are two ways to predict:
     ByModel    integrates the approximate model over the commands on their way, optionally with the residual: the low-passed
                difference between the measured response and the model's.
     ByDesired  integrates the desired responses on their way. It needs no model, because a deformation makes the realised response
-               the desired one. It is for plants in which every coordinate is controlled.
+               the desired one. It is for plants in which every state is a controlled
+               quantity or a derivative of one.
 
 References:
     O. J. M. Smith, Closer control of loops with dead time, Chemical Engineering Progress 53, 1957.
@@ -28,6 +29,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.output_ahead import output_ahead
 from fpirhc.controllers.own_reference import own_signals
@@ -35,7 +37,9 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
+from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.map_steps import one_step
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
@@ -122,15 +126,14 @@ class ByDesired(Predictor):
         """Raise if some state does not follow from the desired responses.
 
         Raises:
-            NotSupported: the motion of a coordinate that is not controlled, or of states behind outputs, needs a model.
+            NotSupported: the motion of a quantity that is not controlled, or of a state that is no output, needs a model.
         """
-        if plant.outputs:
+        hidden = [e for e, place in zip(plant.state.elements, plant.known_by_outputs, strict=True) if place < 0]
+        free = [e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names]
+        if hidden or free:
             raise NotSupported(
-                f"ByDesired() does not cover outputs that are expressions of the state ({', '.join(plant.outputs)}): it predicts "
-                "what is desired of the outputs, and the inverse needs the state; use by=ByModel()"
+                f"ByDesired() does not predict {(hidden or free)[0]}, which no desired response moves; use ByModel()"
             )
-        if len(plant.controlled_names) != len(plant.names):
-            raise NotSupported("ByDesired() needs every coordinate to be controlled; use ByModel()")
 
     def sent(self, plant: Plant) -> Signal:
         """Return the signal of the desired responses."""
@@ -142,19 +145,21 @@ class ByDesired(Predictor):
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
         """Return Taylor's formula with the highest derivative held over the cycle, as a Function."""
-        x, _, p = plant.symbols()
-        d, w = ca.SX.sym("d", len(plant.names)), ca.SX.sym("w", len(plant.names))
-        elements, state_next = plant.state.elements, {}
-        for k, name in enumerate(plant.names):
-            chain = [e for e in elements if e.rstrip("'") == name]
-            values = [x[elements.index(e)] for e in sorted(chain, key=len)] + [d[k]]
-            for order, element in enumerate(sorted(chain, key=len)):
+        x, u, p = plant.symbols()
+        d, w = ca.SX.sym("d", len(plant.controlled_names)), ca.SX.sym("w", len(plant.names))
+        seen = plant.output_function(x, 0 * u, p, 0 * w)
+        elements, later = plant.output.elements, {}
+        for k, name in enumerate(plant.controlled_names):
+            chain = sorted((e for e in elements if e.rstrip("'") == name), key=len)
+            values = [seen[elements.index(e)] for e in chain] + [d[k]]
+            for order, element in enumerate(chain):
                 series, factor = ca.SX(0), 1.0
                 for j, value in enumerate(values[order:]):
                     series += factor * value
                     factor *= period / (j + 1)
-                state_next[element] = series
-        return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*(state_next[e] for e in elements))])
+                later[element] = series
+        state_next = [later[elements[place]] for place in plant.known_by_outputs]
+        return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*state_next)])
 
 
 @dataclass(frozen=True)
@@ -224,11 +229,6 @@ class Predicted(Controller):
         """
         self.controller.check(problem)
         self.by.check(problem.plant)
-        if problem.plant.step is not None and self.by.residual_time is not None:
-            raise NotSupported(
-                f"Predicted(by={self.by!r}): a residual compares the response with the model's at this state, and the response "
-                "of a map belongs to the state of the last cycle; use by=ByModel()"
-            )
         if self.controller.response(problem) is not None and self.by != ByModel():
             raise NotSupported(
                 f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
@@ -244,8 +244,7 @@ class Predicted(Controller):
             return self.controller.blocks(problem)
         inner = compose_controller(problem, self.controller, ahead=True)
         ahead = {"time": like(plant.time, "time_ahead"), "state": like(plant.state, "state_ahead")}
-        if plant.outputs:
-            ahead["output"] = like(plant.output, "output_ahead")
+        ahead |= {s.name: like(s, f"{s.name}_ahead") for s in measured_signals(plant)[1:]}
         feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: plant.time}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
@@ -324,43 +323,59 @@ def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal,
     advance = by.advance(plant, problem.period)
     corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
     responses = (plant.response_signal("realised"),) if corrected else ()
-    outputs = (plant.output,) if plant.outputs else ()
-    reads = (plant.time, plant.state, *outputs, *responses, plant.parameter, before)
-    own = (queue, residual) if corrected else (queue,)
-    outputs_ahead = output_ahead(plant) if plant.outputs else None
+    reads = (plant.time, *measured_signals(plant), *responses, plant.parameter, before)
+    last = _answered_at(problem) if corrected else ()
+    own = (queue, residual, *last) if corrected else (queue,)
+    # An output that is the state is where the state is.
+    outputs_ahead = {s.name: output_ahead(plant) for s in measured_signals(plant)[1:]}
 
     def step(s: Signals) -> dict[str, Expression]:
         queued = ca.vertcat(s._sent_before, s.sent[: size * cycles])
         memory_next = {"sent_next": queued}
         error = expression(ca.MX.zeros(len(plant.names)))
         if corrected:
-            error = corrected(s.residual, s.state, lead.oldest(queued, size), s.realised, s.parameters)
-            memory_next["residual_next"] = error
+            at = getattr(s, last[0].name) if last else s.state
+            error = corrected(s.residual, at, lead.oldest(queued, size), s.realised, s.parameters)
+            memory_next |= {"residual_next": error, **{f"{signal.name}_next": s.state for signal in last}}
         on_their_way = [queued[size * k : size * (k + 1)] for k in range(cycles)]
         state = lead.integrated(advance, s.state, on_their_way, [s.parameters, error])
-        if outputs_ahead is not None:
+        for name, function in outputs_ahead.items():
             time = lead.cycles_of(s.state) * problem.period
-            memory_next["output_ahead"] = outputs_ahead(s.output, s.state, state, s.parameters, time)
+            memory_next[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, time)
         return {"time_ahead": s.time + lead.time, "state_ahead": state, **memory_next}
 
     def wait(s: Signals) -> dict[str, Expression]:
         """The value that is held was sent once more."""
         later = {"sent_next": ca.vertcat(s._sent_before, s.sent[: size * cycles]), "time_ahead": s.time + lead.time}
-        return {**later, "residual_next": s.residual} if corrected else later
+        return {**later, **{f"{signal.name}_next": getattr(s, signal.name) for signal in own[1:]}}
 
     ahead = tuple(w for w in writes if w.name == "time_ahead")
     waits = Block("predict_waits", Layout((plant.time, before)), Layout(ahead), wait, Layout(own))
     return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True, waits=waits)
 
 
+def _answered_at(problem: Problem) -> tuple[Signal, ...]:
+    """The state to which a map answered with the response that is measured now; none where it is that of now."""
+    state, start = problem.plant.state, tuple(map(float, problem.start_state))
+    return (Signal("state_answered", state.elements, state.units, start),) * response_age(problem.plant)
+
+
 def _residual(plant: Plant, time: float, period: float) -> ca.Function:
-    """Function (residual, state, command that acted, realised, parameters) -> the low-passed residual one cycle later."""
+    """Function (residual, state, command that acted, realised, parameters) -> the low-passed residual one cycle later.
+
+    It is the smallest forcing w of the states' rates that makes the model's response the measured one, D w = f - f^ with
+    D = d f^/d w; of controlled coordinates these are their responses themselves.
+    """
     x, u, p = plant.symbols()
-    old, f = ca.SX.sym("old", len(plant.names)), ca.SX.sym("f", len(plant.controlled_names))
-    residual_now = ca.SX.zeros(len(plant.names))
-    residual_now[list(plant.controlled_indices)] = f - plant.controlled_response_function(x, u, p)
+    old, w, f = (
+        ca.SX.sym(n, k) for n, k in (("old", len(plant.names)), ("w", len(plant.names)), ("f", len(plant.inputs)))
+    )
+    forced = derivatives_function(plant, list(plant.response_orders.items()))(x, u, p, w)
+    effect = ca.substitute(ca.jacobian(forced, w), w, 0 * w)
+    missing = f - plant.controlled_response_function(x, u, p)
+    residual_now = ca.mtimes(effect.T, ca.solve(ca.mtimes(effect, effect.T), missing))
     share = 1 - float(np.exp(-period / time))
-    return ca.Function("fpirhc_residual", [old, x, u, f, p], [old + share * (residual_now - old)])
+    return ca.Function("fpirhc_residual", [old, x, u, f, p], [ca.densify(old + share * (residual_now - old))])
 
 
 def examples(inner: Controller) -> tuple[Example, ...]:
