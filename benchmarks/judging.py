@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
-from fpirhc.optimisers.scales import scales
+from fpirhc.optimisers.bounds import scales
 
 _MET = 1e-6  # of the range: nearer limits may have a multiplier
 _ROUGH = 1e-4  # the same for a rough judgement: interior-point methods end that far from limits of small multipliers

@@ -17,7 +17,7 @@ import fpirhc as fp
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.optimisers.scales import scales
+from fpirhc.optimisers.bounds import scales
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
 

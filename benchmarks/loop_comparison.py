@@ -13,7 +13,7 @@ from limited_loop import Loop
 import fpirhc as fp
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import KEPT
-from fpirhc.optimisers.scales import scales
+from fpirhc.optimisers.bounds import scales
 
 CONVERGED, SHARE, COST, TOGETHER = 1e-4, 0.01, 1e-4, 1e-3
 PROMPT, SMALL = 2000.0, 5  # us, up to so many states

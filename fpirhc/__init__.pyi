@@ -56,8 +56,7 @@ from .errors import FpirhcError, HarmfulAdaptation
 from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.horizon import Horizon
-from .learning.estimators.disturbance_kalman import DisturbanceKalman
-from .learning.estimators.disturbed import disturbed
+from .learning.estimators.disturbance_kalman import DisturbanceKalman, disturbed
 from .learning.estimators.moving_horizon import MovingHorizon
 from .learning.estimators.recursive_least_squares import RecursiveLeastSquares
 from .learning.estimators.uncertain import Uncertain

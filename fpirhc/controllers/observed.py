@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.sample_time import SampleTime
 from fpirhc.errors import NotSupported
-from fpirhc.horizon.regular_gain import nominal_run
+from fpirhc.horizon.nominal import nominal_run
 from fpirhc.plant.maps import growth_of
 from fpirhc.sensing.base import values_of
 from fpirhc.sensing.observability import members, slowest

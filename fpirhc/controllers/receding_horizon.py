@@ -32,10 +32,9 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.horizon.cost import Cost
-from fpirhc.horizon.live_data import SCALE, STEEPEST, live_signals
 from fpirhc.horizon.nominal import feedforward, known_on_reference
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
+from fpirhc.horizon.stage_data import SCALE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint

@@ -5,8 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.nominal import known_on_reference
-from fpirhc.horizon.regular_gain import nominal_run
+from fpirhc.horizon.nominal import known_on_reference, nominal_run
 from fpirhc.plant.instant import nominal_responses
 from fpirhc.task.problem import Problem, nominal_start
 

@@ -26,11 +26,9 @@ from fpirhc.horizon.constraint_states import (
 )
 from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.live_data import live_signals, live_table, settings_in
 from fpirhc.horizon.nominal import feedforward, known_on_reference, nominal_motion, reference_state
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.reference_expansion import expand_along, input_curvature
-from fpirhc.horizon.stage_data import data_layout, stage_data
+from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
+from fpirhc.horizon.stage_data import data_layout, live_signals, live_table, settings_in, stage_data
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.stiffness import spurious_growth
 from fpirhc.symbolic.latest import Latest

@@ -1,35 +1,110 @@
-"""Limits of a plan: their distances, and what they add to a sweep as equalities (pure) or by a barrier (interior).
+"""Limits of a plan: their units, their distances, what they add to a sweep, and how far a plan is from the first-order conditions.
 
 Entry r of stage i is input r, or a limited state one stage later. Matrices of limits have the shape (rows, 2 N): lower limits of
 all stages, then upper ones. With sign 1 for lower, -1 for upper ones, d = sign (w - limit) is a distance, and a multiplier z >= 0
 adds -sign z to the gradient. A multiplier of a state is at most rho: beyond it the limit gives way (exact L1 penalty).
-
-pure        the limits with gamma z > d are equalities with the weight kappa = 1e8 / gamma, and the others are left out:
-            gradient -sign (z - kappa d), and afterwards z <- z - kappa (sign dw + d).
-interior    w - limit - t + e = 0, t z = mu, e (rho - z) = mu: weight kappa = 1 / (t / z + e / (rho - z)) and gradient
-            -sign (z - kappa b) with b = d - mu / z + mu / (rho - z).
-
-References: S. J. Wright, Primal-Dual Interior-Point Methods, SIAM 1997; M. Hintermueller, K. Ito, K. Kunisch, SIAM J. Optim. 13(3),
-2002, for the sign rule.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.sweep import Expansion
-from fpirhc.optimisers.scales import Scales
-from fpirhc.symbolic.expression import FINITE
+from fpirhc.horizon.riccati import Expansion
+from fpirhc.optimisers.base import FEASIBLE, KEPT, clip
+from fpirhc.symbolic.expression import FINITE, is_finite
 
+_LEAST = 1e-3  # a smaller spread of the reference is no measure of a state
+_CAPACITY = 1e4  # largest multiplier of a hard limit, in units of cost per unit
+_NARROW = 1e-6  # limits closer together than this share of the reference's spread are an equation, not a range
 ENOUGH = 0.99  # share of the largest multiplier from which a limit counts as given up
 STIFF = 1e8  # weight of an equality, in units of 1 / gamma
 BOUNDARY = 0.99  # largest share of the distance to the boundary in one step
-CLOSED = 1e-6  # scaled gap below which a plan counts as a trajectory
+_CLOSED = 1e-6  # scaled gap below which a plan counts as a trajectory
 HAIR = 1e-8  # of the unit: how far inside the limits of inputs descents stay
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """Units of a problem.
+
+    Args:
+        inputs: shape (nu,).
+        states: shape (ns,).
+        cost: C.
+        bounded: places of the states that have a limit.
+        capacity: largest multipliers of the bounded states, in cost per unit.
+        hard: whether the limits of the bounded states have no price.
+    """
+
+    inputs: np.ndarray
+    states: np.ndarray
+    cost: float
+    bounded: tuple[int, ...]
+    capacity: np.ndarray
+    hard: np.ndarray
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Units of the entries that can be limited: the inputs, then the bounded states."""
+        return np.concatenate([self.inputs, self.states[list(self.bounded)]])
+
+
+def scales(ocp: OptimalControl) -> Scales:
+    """Return the scales of a problem, from its limits and its reference.
+
+        inputs    half the range of the input, 1 where it is free
+        states    half the range of the state's limits; without both, half the spread of the reference and a tenth of its size
+        cost      C = median over the inputs of Q_uu (half range)^2, with Q_uu the curvature that is left along an input of the
+                  first stage once all later inputs answer it: without the answer it grows with every stage of an unstable model
+
+    gamma = unit^2 / C turns a gradient into a move, and 1e4 C / unit is the largest multiplier that a limit of a state may have.
+    """
+    inputs = _half(ocp.input_lower, ocp.input_upper)
+    inputs = np.where(np.isfinite(inputs) & (inputs > 0), inputs, 1.0)
+    nodes = ocp.nodes[0]
+    size = np.abs(nodes).max(axis=1)
+    about = 0.5 * np.ptp(nodes, axis=1) + 0.1 * size
+    about = np.where(about > 0, np.maximum(about, _LEAST), 1.0)
+    range_ = _half(ocp.state_lower, ocp.state_upper)
+    narrow = ~(np.isfinite(range_) & (range_ > _NARROW * about))
+    cost = float(np.median(_answered_curvature(ocp) * inputs**2))
+    places, states = (
+        np.flatnonzero(np.isfinite(ocp.state_lower) | np.isfinite(ocp.state_upper)),
+        np.where(narrow, about, range_),
+    )
+    hard = ocp.hard[places]
+    capacity = np.where(hard, _CAPACITY * cost / states[places], ocp.state_price[places])
+    return Scales(inputs, states, cost, tuple(int(k) for k in places), capacity, hard)
+
+
+def tolerated(ocp: OptimalControl) -> np.ndarray:
+    """Return the violation of every state's limits that still counts as kept, shape (ns,)."""
+    half = _half(ocp.state_lower, ocp.state_upper)
+    return np.where(np.isfinite(half) & (half > KEPT), np.minimum(FEASIBLE, KEPT * half), FEASIBLE)
+
+
+def _answered_curvature(ocp: OptimalControl) -> np.ndarray:
+    """Diagonal of Q_uu (nu,) of the first stage, by a Riccati sweep along the reference."""
+    along = ocp.along
+    value = along.final
+    for a, b, q, s, r in zip(*(v[::-1] for v in (along.a, along.b, along.q, along.s, along.r)), strict=True):
+        q_uu, cross = r + b.T @ value @ b, s + b.T @ value @ a
+        value = q + a.T @ value @ a - cross.T @ np.linalg.lstsq(q_uu, cross, rcond=None)[0]
+    diagonal = q_uu.diagonal()
+    usable = np.isfinite(diagonal) & (diagonal > 0)
+    return np.where(usable, diagonal, ocp.step * ocp.curvature)
+
+
+def _half(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(0.5 * (upper - lower))
+
+
 _NONE = 10 * FINITE
 
 
@@ -101,10 +176,15 @@ class Limited:
         return self.both(-self.sign * self.of_states * counted * ca.fmin(ca.fmax(z, 0), self.rho))
 
     def pure(self, p: Expansion, z: ca.MX, slope: ca.MX, gap: ca.MX) -> tuple[ca.MX, ...]:
-        """Return (weights, gradients, multipliers) of the active limits."""
+        """Return (weights, gradients, multipliers) of the active limits.
+
+        Limits with gamma z > d are equalities with the weight kappa = 1e8 / gamma, and the others are left out: gradient
+        -sign (z - kappa d), afterwards z <- z - kappa (sign dw + d). Source: M. Hintermueller, K. Ito, K. Kunisch, SIAM J. Optim.
+        13(3), 2002, for the sign rule.
+        """
         d = self.distance(p)
         slopes = self.entries(slope, ca.MX.zeros(p.states.shape))
-        held = ca.logic_and(ca.logic_and(self.of_states == 0, gap < CLOSED), ca.logic_and(z == 0, d == 0))
+        held = ca.logic_and(ca.logic_and(self.of_states == 0, gap < _CLOSED), ca.logic_and(z == 0, d == 0))
         # The cost holds an input on its limit where the gradient is a multiplier of it.
         z = ca.if_else(held, ca.fmax(self.sign * slopes, 0), z)
         capped, active = self._chosen(d, z)
@@ -155,7 +235,10 @@ class Limited:
         return ca.if_else(self.present, t, 1), ca.if_else(ca.logic_and(self.present, self.of_states), e, 0)
 
     def interior(self, p: Expansion, y: Interior, mu: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Return (weights, gradients) of the barrier."""
+        """Return (weights, gradients) of the barrier: w - limit - t + e = 0, t z = mu, e (rho - z) = mu.
+
+        The weight is kappa = 1 / (t / z + e / (rho - z)), the gradient -sign (z - kappa b) with b = d - mu / z + mu / (rho - z).
+        """
         kappa, pull = self._linear(p, y, mu)
         return self.both(kappa), self.both(-self.sign * (y.z - kappa * pull))
 
@@ -191,3 +274,97 @@ def _shares(value: ca.MX, move: ca.MX, tau: ca.MX) -> ca.MX:
 
 def _everywhere(column: np.ndarray, stages: int) -> ca.DM:
     return ca.repmat(ca.DM(column), 1, 2 * stages)
+
+
+class Certified(NamedTuple):
+    """How far a plan is from the first-order conditions."""
+
+    slope: ca.MX  # g (nu, N)
+    left: ca.MX  # stationarity
+    violation: ca.MX
+    broken: ca.MX  # violation of limits that are not given up
+    error: ca.MX  # E
+
+
+def certified(ocp: OptimalControl, limits: Limited, scales: Scales, p: Expansion, z: ca.MX) -> Certified:
+    """Return how far an expanded plan with multipliers z (rows, 2 N) is from the first-order conditions.
+
+        E = max( |U - clip(U - gamma g)| / unit,  |gap| / unit,  |min(d, gamma z)| / unit,  gamma max(-z, 0) / unit )
+
+    with g the reduced gradient with the multipliers of limited states. A limit that is given up (z = rho) need not be kept: its
+    plan is a stationary point of the cost plus rho times the violations, so the limits cannot all be kept nearby.
+    """
+    n = ocp.stages
+    slope = certify(ocp, limits, p, z)
+    units = [
+        ca.repmat(ca.DM(v), 1, n) for v in (scales.inputs, scales.inputs**2 / scales.cost, ocp.step * ocp.curvature)
+    ]
+    low, high = limits.inputs()
+    step = ca.fabs(p.inputs - clip(p.inputs - units[1] * slope, low, high)) / units[0]
+    left = ca.norm_inf(ca.vec(p.inputs - clip(p.inputs - slope / units[2], low, high)))
+    d = limits.distance(p)
+    counted = ca.logic_and(limits.present, limits.of_states)
+    given_up = z >= ENOUGH * limits.rho
+    complementarity = ca.fabs(ca.fmin(d, limits.reach * ca.fmin(ca.fmax(z, 0), limits.rho)))
+    error = ca.if_else(given_up, ca.fmax(d, 0), complementarity)
+    error = ca.if_else(counted, ca.fmax(error, limits.reach * ca.fmax(-z, 0)) / limits.unit, 0)
+    beyond = ca.if_else(counted, ca.fmax(-d, 0), 0)
+    broken = ca.if_else(given_up, 0, beyond)
+    worst = ca.fmax(ca.fmax(ca.mmax(step), largest_gap(p, scales)), ca.mmax(error))
+    finite = is_finite(ca.vec(slope))
+    numbers = [ca.if_else(finite, v, 10 * FINITE) for v in (left, worst)]
+    return Certified(slope, numbers[0], ca.mmax(beyond * limits.hard), ca.mmax(broken), numbers[1])
+
+
+def certify(ocp: OptimalControl, limits: Limited, p: Expansion, z: ca.MX, counted: ca.MX | float = 1) -> ca.MX:
+    """Return the reduced gradient g (nu, N) with the multipliers of states that are `counted`."""
+    return _adjoint(ocp, limits, p, limits.pushes(z, counted))
+
+
+def _adjoint(ocp: OptimalControl, limits: Limited, p: Expansion, push: ca.MX) -> ca.MX:
+    """Return g (nu, N) by one backward sweep; `push` (rows, N) are gradients with respect to the limited entries."""
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    shapes = ((ns, 1), (ns, ns), (ns, nu), (ns, 1), (nu, 1), (ns, 1))
+    costate, a, b, by_state, by_input, more = y = [ca.SX.sym(f"y{k}", *shape) for k, shape in enumerate(shapes)]
+    after = costate + more
+    stage = ca.Function("fpirhc_certified_stage", y, [by_state + a.T @ after, by_input + b.T @ after])
+    pushed = limits.on_states(push)
+    turned = [_turned(v, n) for v in (p.a, p.b, p.by_state, p.by_input, pushed)]
+    return _turned(stage.mapaccum("fpirhc_certified_stages", n)(p.tail, *turned)[1], n)
+
+
+def largest_gap(p: Expansion, scales: Scales) -> ca.MX:
+    """Return the largest |F(X, U) - X+| in units of the states."""
+    gaps = ca.fabs(p.next_states - p.states[:, 1:])
+    return ca.mmax(gaps / ca.repmat(ca.DM(scales.states), 1, gaps.shape[1]))
+
+
+def barrier_error(
+    limits: Limited, scales: Scales, p: Expansion, y: Interior, costates: ca.MX
+) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """Return the scaled residual of the barrier problem without complementarity, and the least and largest of its products."""
+    n = p.inputs.shape[1]
+    states, z = ca.logic_and(limits.present, limits.of_states), y.z
+    push = limits.both(-limits.sign * z)
+    apart = ca.if_else(limits.present, ca.fabs(limits.distance(p) - y.t + y.e) / limits.unit, 0)
+    pairs = [(limits.present, y.t * z), (states, y.e * (limits.rho - z))]
+    least = ca.fmin(*(ca.mmin(ca.if_else(c, v, 10 * FINITE)) for c, v in pairs))
+    most = ca.fmax(*(ca.mmax(ca.if_else(c, v, 0)) for c, v in pairs))
+    nu, ns = p.inputs.shape[0], p.next_states.shape[0]
+    rest_u = p.by_input + push[:nu, :] + _stage_product(p.b, costates, nu, ns, n)
+    before = ca.horzcat(p.by_state[:, 1:] + _stage_product(p.a, costates, ns, ns, n)[:, 1:], p.tail)
+    rest_x = before - costates + limits.on_states(push)
+    units = [ca.repmat(ca.DM(v), 1, n) / scales.cost for v in (scales.inputs, scales.states)]
+    worst = [ca.mmax(ca.fabs(r) * u) for r, u in zip((rest_u, rest_x), units, strict=True)]
+    total = ca.fmax(ca.fmax(*worst), ca.fmax(largest_gap(p, scales), ca.mmax(apart)))
+    return total, least, most
+
+
+def _stage_product(stacked: ca.MX, costates: ca.MX, columns: int, rows: int, n: int) -> ca.MX:
+    """A_i' lambda_{i+1} for every stage, (columns, N)."""
+    a, costate = ca.SX.sym("a", rows, columns), ca.SX.sym("l", rows)
+    return ca.Function("fpirhc_stage_product", [a, costate], [a.T @ costate]).map(n)(stacked, costates)
+
+
+def _turned(stacked: ca.MX, stages: int) -> ca.MX:
+    return ca.horzcat(*reversed(ca.horzsplit(stacked, stacked.shape[1] // stages))) if stages > 1 else stacked

@@ -22,8 +22,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.fields.kinds import Count
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.reference_expansion import steepest_curvature
+from fpirhc.horizon.problem import OptimalControl, steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.anderson import Anderson, iterated
 from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of

@@ -1,6 +1,6 @@
 """The iteration of `FixedPoint` on horizons with limits of states, and where its plain iteration does not contract.
 
-Two settings of one Riccati sweep (`fpirhc.horizon.sweep`). The pure step is the fixed-point step with the active limits as
+Two settings of one Riccati sweep (`fpirhc.horizon.riccati`). The pure step is the fixed-point step with the active limits as
 equalities of the sweep, rolled out with its feedback. The interior step keeps all limits by a barrier, on a plan whose states are
 free (multiple shooting), with limits of states that give way at a price (exact L1 penalty); it runs only where pure steps do not
 contract, and ends as soon as they do. A plan is OK by its own first-order conditions once it is rolled out, never by the barrier's
@@ -17,17 +17,23 @@ from importlib import resources
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end, hessian_stage
+from fpirhc.horizon.hessian_models import (
+    ExactHessian,
+    GaussNewton,
+    hessian_end,
+    hessian_stage,
+    partial_count,
+    split_hessian,
+    stage_leaves,
+)
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.split_stage import partial_count, split_hessian, stage_leaves
-from fpirhc.horizon.sweep import PIVOT
+from fpirhc.horizon.riccati import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
 from fpirhc.optimisers.base import FEASIBLE, KEPT, shift, shift_gains
-from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF
+from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF, Scales, scales
 from fpirhc.optimisers.limited_graph import limited_graph
+from fpirhc.optimisers.limited_phases import guess
 from fpirhc.optimisers.limited_settings import LimitedSettings, limited_memory
-from fpirhc.optimisers.limited_state import guess
-from fpirhc.optimisers.scales import Scales, scales
 from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.scales import Scales, scales
+from fpirhc.optimisers.bounds import Scales, scales
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 PATIENCE = 3  # pure steps in a row that may fail to halve the error: the active limits are changing

@@ -8,11 +8,10 @@ from importlib import resources
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage
-from fpirhc.horizon.live_data import SCALE, STEEPEST
+from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, stage_leaves
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.riccati import PIVOT, rounds
-from fpirhc.horizon.split_stage import partial_count, stage_leaves
+from fpirhc.horizon.riccati import BOX_PIVOT, rounds
+from fpirhc.horizon.stage_data import SCALE, STEEPEST
 from fpirhc.optimisers.base import clip, sane, shift, shift_gains, stationarity, status_of
 from fpirhc.optimisers.search import (
     ARMIJO,
@@ -147,7 +146,7 @@ def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object
         "PLAIN": _MOST_PLAIN,
         "UNTRIED": UNTRIED,
         "FINITE": FINITE,
-        "PIVOT": PIVOT,
+        "PIVOT": BOX_PIVOT,
         "ROUNDS": rounds(ocp.input.size),
         "CONVERGED": int(Status.OK),
         "NOT_CONVERGED": int(Status.NOT_CONVERGED),

@@ -14,7 +14,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.optimisers.base import FEASIBLE, Optimiser, improved, judge
-from fpirhc.optimisers.scales import tolerated
+from fpirhc.optimisers.bounds import tolerated
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 

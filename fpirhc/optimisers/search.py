@@ -11,9 +11,9 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
-from fpirhc.horizon.live_data import STEEPEST
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.riccati import backward_sweep
+from fpirhc.horizon.riccati import backward_sweep, in_reverse
+from fpirhc.horizon.stage_data import STEEPEST
 from fpirhc.optimisers.base import clip
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.live import Number
@@ -151,9 +151,9 @@ def _expansion(ocp: OptimalControl) -> ca.Function:
     costs, data = ca.MX.sym("l", 1, n), ca.MX.sym("data", ocp.data.size, n + 1)
     stacked = [ca.MX.sym(f"m{k}", rows, columns * n) for k, (rows, columns) in enumerate(_stage_shapes(ns, nu))]
     final, last, _ = hessian_end(ocp)(states[:, n], data[:, n])
-    turned = [_turned(m, n) for m in stacked]
+    turned = [in_reverse(m, n) for m in stacked]
     _, slope, costates = stage.mapaccum("fpirhc_costate_stages", n)(last, *turned)
-    results = [ca.sum2(costs) + final, _turned(slope, n), _turned(costates, n)]
+    results = [ca.sum2(costs) + final, in_reverse(slope, n), in_reverse(costates, n)]
     return ca.Function("fpirhc_expansion", [states, inputs, costs, data, *stacked], results)
 
 
@@ -182,11 +182,6 @@ def deformed_move(map: Deformation, size: int) -> ca.Function:
 
 def _stage_shapes(ns: int, nu: int) -> tuple[tuple[int, int], ...]:
     return (ns, ns), (ns, nu), (ns, 1), (nu, 1)
-
-
-def _turned(stacked: ca.MX, stages: int) -> ca.MX:
-    """The blocks of the stages in reverse order."""
-    return ca.horzcat(*reversed(ca.horzsplit(stacked, stacked.shape[1] // stages))) if stages > 1 else stacked
 
 
 def _judgement(ocp: OptimalControl) -> ca.Function:

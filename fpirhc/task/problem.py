@@ -16,7 +16,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration, finite_number
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.regular_gain import Bounds, nominal_run, singular_gain
+from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.integrators import USUAL, Integrator

@@ -11,9 +11,15 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.horizon.hessian_models import hessian_stage, linear_stage
+from fpirhc.horizon.hessian_models import (
+    hessian_stage,
+    linear_stage,
+    linearise_stage,
+    split_hessian,
+    split_stage,
+    stage_leaves,
+)
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.split_stage import linearise_stage, split_hessian, split_stage, stage_leaves
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic.chain_rule import chain_rule

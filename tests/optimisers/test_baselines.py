@@ -11,7 +11,7 @@ from test_fixed_point import linear_problem, pendulum_problem
 
 import fpirhc as fp
 from fpirhc.errors import NotContractive, NotSupported
-from fpirhc.horizon.reference_expansion import steepest_curvature
+from fpirhc.horizon.problem import steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.full_space import auxiliary_hessian
 

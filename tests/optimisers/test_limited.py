@@ -17,8 +17,8 @@ from plants import known
 import fpirhc as fp
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.optimisers.bounds import scales
 from fpirhc.optimisers.limited import limited_step
-from fpirhc.optimisers.scales import scales
 from fpirhc.symbolic.native import find_compiler, native
 
 # The horizon's first state as in the recorded loops, and IPOPT's cost there at an accuracy of 1e-9; its limits are relaxed by 1e-8.

@@ -12,7 +12,7 @@ from foreign import FOREIGN
 import fpirhc as fp
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.scales import scales
+from fpirhc.optimisers.bounds import scales
 from fpirhc.symbolic.native import find_compiler, native
 
 OPTIMISER = fp.FixedPoint(iterations=1, tolerance=1e-3)

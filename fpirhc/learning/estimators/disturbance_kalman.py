@@ -22,8 +22,9 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -31,14 +32,14 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, Estimator, Seen, Wait
-from fpirhc.learning.estimators.disturbed import disturbance_name, disturbed
 from fpirhc.plant.map_steps import one_step
-from fpirhc.plant.maps import response_age
-from fpirhc.plant.plant import Plant
+from fpirhc.plant.maps import Differences, response_age
+from fpirhc.plant.output import Output
+from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import quantities, response_names
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.following import Following, following
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
 from fpirhc.symbolic.live import is_live, live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
@@ -81,7 +82,7 @@ class DisturbanceKalman(Estimator):
 
     def learned(self) -> tuple[str, ...]:
         """The disturbances."""
-        return tuple(disturbance_name(c) for c in self.drift)
+        return tuple(_disturbance_name(c) for c in self.drift)
 
     @property
     def acts_at_once(self) -> bool:
@@ -325,3 +326,127 @@ def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
 
 
 EXAMPLES = (DisturbanceKalman({"a": 1.0, "b": 1.0}, dict.fromkeys(("a", "b", "a'", "b'"), 1e-3)),)
+
+
+_Map = Callable[..., Mapping[str, Expression]]
+
+
+def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
+    """Return the plant with disturbances as parameters of value 0, see `disturbance_name`.
+
+    The disturbance of a coordinate adds to its response, that of an output to the output. That of an output's response (y'' for
+    order 2) adds to the response alone, and no state sees it. A name of both a coordinate and an output is the coordinate's.
+
+    Raises:
+        InvalidProblem: an unknown name, no name, or a parameter that already has the name.
+        NotSupported: the disturbance of a state, which an inverse of the user's does not know.
+    """
+    mistakes = Mistakes("disturbed")
+    responses = dict(zip(response_names(plant.face), plant.controlled_names, strict=True)) if plant.outputs else {}
+    what = "coordinate, output or response of an output" if plant.outputs else "coordinate"
+    mistakes.unknown(what, names, [*plant.names, *plant.outputs, *responses])
+    if not names:
+        mistakes.add("name at least one coordinate whose response is disturbed")
+    for name in (_disturbance_name(c) for c in names):
+        if name in plant.parameters:
+            mistakes.add(f"the plant has a parameter '{name}' already; rename it")
+    mistakes.raise_if_any()
+    coordinates = [n for n in names if n in plant.coordinates]
+    if plant.outputs and plant.inverse is not None and coordinates:
+        raise NotSupported(
+            f"disturbed: Plant(inverse=...) does not know the disturbance of {coordinates[0]}, of which outputs are expressions; "
+            f"leave the inverse out, or disturb an output ({', '.join(plant.outputs)})"
+        )
+    units = {n: one.unit for n, one in plant.outputs.items()} | dict(
+        zip(plant.names, plant.response_units, strict=True)
+    )
+    if responses:
+        units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
+    added = {_disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
+    next_states = None if plant.next is None else _next(plant, coordinates)
+    response = _response(plant, coordinates) if next_states is None else _differences(plant, next_states)
+    return replace(
+        plant,
+        parameters={**plant.parameters, **added},
+        response=response,
+        next=next_states,
+        inverse=None if plant.inverse is None else _inverse(plant, plant.inverse, names),
+        outputs={n: _output(plant, n, one, names) for n, one in plant.outputs.items()},
+    )
+
+
+def _disturbance_name(name: str) -> str:
+    """Name of the parameter that disturbs a coordinate's response, an output (w_y), or an output's response (w_y_2 of y'')."""
+    order = name.count("'")
+    return f"w_{name.rstrip(chr(39))}_{order}" if order else f"w_{name}"
+
+
+def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
+    def response(*arguments: Named) -> Mapping[str, Expression]:
+        count = 1 if plant.algebraic is None else 2  # algebraic states come after the parameters
+        others, (p, *algebraic) = arguments[:-count], arguments[-count:]
+        responses = plant.response(*others, _own(plant, p), *algebraic)
+        return {c: v + p[_disturbance_name(c)] if c in coordinates else v for c, v in responses.items()}
+
+    vars(response)["__signature__"] = inspect.signature(plant.response)
+    return response
+
+
+def _differences(plant: Plant, next_states: _Map) -> _Map:
+    """The response of a map: the difference of its steps."""
+    return Differences(next_states, plant.names, float(plant.step or 1.0))
+
+
+def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
+    """The map with its disturbances, whose response is the difference per step."""
+    assert plant.next is not None
+    original, step = plant.next, float(plant.step or 1.0)
+
+    def next_states(*arguments: Named) -> Mapping[str, Expression]:
+        *others, p = arguments
+        values = original(*others, _own(plant, p))
+        return {c: v + step * p[_disturbance_name(c)] if c in coordinates else v for c, v in values.items()}
+
+    vars(next_states)["__signature__"] = inspect.signature(original)
+    return next_states
+
+
+def _output(plant: Plant, name: str, one: Output, names: Sequence[str]) -> Output:
+    """The output as an expression of the plant's own parameters, and of those of `names` that disturb it or its response."""
+    shifted = name in names and name not in plant.coordinates
+    own = [n for n in names if "'" in n and n.rstrip("'") == name]
+
+    def expression(*arguments: Named) -> Expression:
+        *others, p = arguments
+        value = one.expression(*others, _own(plant, p))
+        return value + p[_disturbance_name(name)] if shifted else value
+
+    vars(expression)["__signature__"] = inspect.signature(one.expression)
+    if own and one.response_disturbance:
+        raise NotSupported(
+            f"disturbed: the response of '{name}' has the disturbance {one.response_disturbance} already"
+        )
+    return replace(
+        one, expression=expression, response_disturbance=_disturbance_name(own[0]) if own else one.response_disturbance
+    )
+
+
+def _inverse(
+    plant: Plant, inverse: Callable[..., Mapping[str, Expression]], names: Sequence[str]
+) -> Callable[..., Mapping[str, Expression]]:
+    """The user's inverse for the response without its disturbance; that of an output itself changes no response."""
+    responses = zip(response_names(plant.face), plant.controlled_names, strict=True)
+    disturbs = dict(responses) if plant.outputs else dict.fromkeys(plant.names)
+    by = {disturbs[n] or n: _disturbance_name(n) for n in names if n in disturbs}
+
+    def undisturbed(*arguments: Named) -> Mapping[str, Expression]:
+        *others, r, p = arguments
+        entries = [r[c] - p[by[c]] if c in by else r[c] for c in plant.controlled_names]
+        return inverse(*others, Named(plant.controlled_names, ca.vertcat(*entries), "coordinate"), _own(plant, p))
+
+    return undisturbed
+
+
+def _own(plant: Plant, p: Named) -> Named:
+    """The parameters of the plant without disturbances."""
+    return Named(tuple(plant.parameters), p.vector[: len(plant.parameters)], "parameter")
