@@ -37,7 +37,7 @@ def test_the_independent_plant_moves_as_scipy_moves_it(name: str) -> None:
 
 # One plant of every relative order from 1 to 4, and one with two outputs of different orders. The slow study has all fifteen.
 RMS = {"growth": 1.0e-4, "anaesthesia": 0.0104, "link": 2.1e-5, "flexible_joint": 2.5e-6, "vehicle": 5.7e-5}
-"""Rms errors with the model-referenced deformation. Without adaptation they are 28 (growth) to 3 300 (flexible joint) times as large."""
+"""Rms errors with the model-referenced deformation; without adaptation 28 (growth) to 3 300 (flexible joint) times as large."""
 
 
 @pytest.mark.parametrize("name", RMS)
