@@ -3,7 +3,11 @@
     half-width = max(3 (max_i v_i - min_i v_i), 1e-6 |v|, floor),        v nominal, v_i under the variants of one source, and v.
 
 The factor is three, because another draw of a normal value then leaves a band from eight seeds about once in 10 000 times (30
-times as often with five seeds). A count that is the same under all variants is exact.
+times as often with five seeds). A count that is the same under all variants is exact. How a number is compared, its metric says:
+
+    exact   counts, statuses, sizes: equal or changed
+    tight   optimal costs of open-loop plans: equal to 1e-6
+    banded  results of a closed loop: inside a band, also where the variants of another class disagree
 """
 
 from __future__ import annotations
@@ -12,11 +16,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fpirhc.baselines.catalogue import BANDED, EXACT, TIGHT, Family, family_of
-from fpirhc.baselines.measuring import FINISHED, Measurement, Number
-from fpirhc.baselines.variants import NOMINAL, Variant
+from fpirhc.baselines.measuring import FINISHED, NOMINAL, Measurement, Number, Variant, metric_of
 from fpirhc.simulation import metrics as run_metrics
 
+EXACT, TIGHT, BANDED = "exact", "tight", "banded"
+KINDS = (EXACT, TIGHT, BANDED)
 FACTOR = 3.0
 RELATIVE = 1e-6  # also what 'tight' means
 _LOOSE = 0.5  # share of the value above which a band shows few changes
@@ -90,7 +94,7 @@ def expected(
         if measured[0][0] != NOMINAL:
             not_compared[name] = "only some variants have it"
             continue
-        family = family_of(name, metrics)
+        family = metric_of(name, metrics)
         metric = _metric(family, measured, _quantum(family, results[0], period))
         if metric is None:
             not_compared[name] = "some variants have a value and some have none, or words that differ"
@@ -99,7 +103,7 @@ def expected(
     return Expected(outcomes, compared, not_compared)
 
 
-def _metric(family: Family, measured: Sequence[tuple[str, Number]], quantum: float) -> Metric | None:
+def _metric(family: run_metrics.Metric, measured: Sequence[tuple[str, Number]], quantum: float) -> Metric | None:
     values = [value for _, value in measured]
     if any(isinstance(v, str) for v in values):
         return Metric(EXACT, values[0], 0.0, {}) if len(set(values)) == 1 else None
@@ -111,11 +115,11 @@ def _metric(family: Family, measured: Sequence[tuple[str, Number]], quantum: flo
         return None
     value, spread = values[0], _spread([(source, float(v)) for source, v in measured])
     largest = FACTOR * max(spread.values(), default=0.0)
-    if family.kind == EXACT and largest == 0:
+    if family.compared == EXACT and largest == 0:
         return Metric(EXACT, value, 0.0, {})
     rounded = {source: float(f"{width:.2g}") for source, width in spread.items()}
     tight = RELATIVE * abs(float(value))
-    if family.kind == TIGHT and largest <= tight:
+    if family.compared == TIGHT and largest <= tight:
         return Metric(TIGHT, value, _readable(max(tight, family.floor)), rounded)
     return Metric(BANDED, value, _readable(max(largest, tight, family.floor, _QUANTA * quantum)), rounded)
 
@@ -133,7 +137,7 @@ def _spread(measured: Sequence[tuple[str, float]]) -> dict[str, float]:
     return {source: width for source, width in widths.items() if width}
 
 
-def _quantum(family: Family, nominal: Measurement, period: float) -> float:
+def _quantum(family: run_metrics.Metric, nominal: Measurement, period: float) -> float:
     """The smallest step of a metric that counts cycles."""
     cycles = nominal.numbers.get("cycles", 0)
     if family.step is None or not isinstance(cycles, int | float) or cycles < 1:

@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeGuard
 
-from fpirhc.baselines.bands import Expected, Metric
-from fpirhc.baselines.baseline import Baseline
-from fpirhc.baselines.catalogue import EXACT, family_of
-from fpirhc.baselines.measuring import FINISHED, Measurement, Number
-from fpirhc.baselines.settings import Settings, differences
+from fpirhc.baselines.bands import EXACT, Expected, Metric
+from fpirhc.baselines.baseline import Baseline, Settings, differences
+from fpirhc.baselines.measuring import FINISHED, Measurement, Number, metric_of
 from fpirhc.simulation import metrics as run_metrics
 
 HOLDS, BETTER, WORSE, CHANGED, GONE, NEW = "holds", "better", "worse", "changed", "gone", "new"
@@ -211,7 +209,7 @@ def _row(
     if fresh is None:
         return Row(controller, name, metric.value, None, band, GONE)
     value = fresh if isinstance(fresh, str) or math.isfinite(fresh) else None
-    return Row(controller, name, metric.value, value, band, _verdict(family_of(name, metrics).better, metric, value))
+    return Row(controller, name, metric.value, value, band, _verdict(metric_of(name, metrics).better, metric, value))
 
 
 def _verdict(better: run_metrics.Better, metric: Metric, fresh: Number | None) -> str:

@@ -11,16 +11,17 @@ from functools import cache
 
 import numpy as np
 
-from fpirhc.baselines.catalogue import NOT_COMPARED, family_of
-from fpirhc.baselines.variants import Variant
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.errors import FpirhcError
+from fpirhc.errors import FpirhcError, InvalidName, nearest
 from fpirhc.problem_files.problem_file import Task, load_problem
-from fpirhc.simulation.metrics import measure
+from fpirhc.simulation import metrics as run_metrics
+from fpirhc.simulation.metrics import known_metrics, measure
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.simulate import disturbance_table, sensing_table, simulate
 from fpirhc.studies.open_loop import solve_first
+from fpirhc.studies.scenarios.draws import with_exact
+from fpirhc.symbolic.native import find_compiler
 from fpirhc.task.problem import Problem
 
 FINISHED, DIVERGED, REFUSED = "finished", "diverged", "refused"
@@ -56,6 +57,42 @@ class Job:
 
     controller: str
     variant: Variant
+
+
+def _no_run_has_it(problem: Problem, run: Run) -> None:
+    """The first horizon's open-loop plan has these numbers, see `measuring.first_plan`."""
+
+
+PLANS = {
+    metric.name: metric
+    for metric in (
+        run_metrics.Metric("plan.cost", _no_run_has_it, better="neither", compared="tight", finite=True),
+        run_metrics.Metric("plan.stages", _no_run_has_it, better="neither", compared="exact", finite=True),
+        run_metrics.Metric("plan.iterations", _no_run_has_it, better="neither", compared="exact"),
+        run_metrics.Metric("plan.status", _no_run_has_it, better="neither", compared="exact", finite=True),
+        # A difference of eigenvalues from one.
+        run_metrics.Metric("plan.factor", _no_run_has_it, floor=1e-4),
+    )
+}
+
+
+def metric_of(key: str, metrics: Sequence[run_metrics.Metric] | None = None) -> run_metrics.Metric:
+    """Return the metric of a number, which says how it is compared.
+
+    Args:
+        key: name of the number, 'metric.element'.
+        metrics: metrics of the problem's runs; None: the shipped and the installed ones.
+
+    Raises:
+        InvalidName: neither fpirhc nor the problem has such a metric.
+    """
+    entries = {**PLANS, **{m.name: m for m in (known_metrics() if metrics is None else metrics)}}
+    name = key
+    while name not in entries and "." in name:  # an element may have dots of its own
+        name = name.rpartition(".")[0]
+    if name not in entries:
+        raise InvalidName(f"metric '{key}' is unknown.{nearest(name, entries)}")
+    return entries[name]
 
 
 def measure_all(
@@ -107,7 +144,7 @@ def measure_job(task: Task, job: Job) -> Measurement:
             return Measurement(DIVERGED, run.stop, {})
         numbers = _numbers(task, problem, run)
         for metric, value in numbers.items():
-            if family_of(metric, task.metrics).finite and isinstance(value, float) and not math.isfinite(value):
+            if metric_of(metric, task.metrics).finite and isinstance(value, float) and not math.isfinite(value):
                 return Measurement(DIVERGED, f"{metric} is not finite", {})
         plan = first_plan(task, problem, ready) if variant.plans else {}
     except FpirhcError as error:
@@ -117,7 +154,7 @@ def measure_job(task: Task, job: Job) -> Measurement:
 
 def _numbers(task: Task, problem: Problem, run: Run) -> dict[str, Number]:
     measured = measure(problem, run, task.metrics)
-    return {m.key(element): value for m, element, value in measured if m.compared != NOT_COMPARED}
+    return {m.key(element): value for m, element, value in measured if m.compared != "not"}
 
 
 def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str, Number]:
@@ -140,3 +177,82 @@ def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str
         "plan.status": solved.plan.status.name,
         "plan.factor": solved.certificate.factor if solved.certificate else math.nan,
     }
+
+
+NOMINAL, SEEDS, ROUNDING, INTEGRATOR = "nominal", "seeds", "rounding", "integrator"
+SOURCES = (SEEDS, ROUNDING, INTEGRATOR)
+_NUDGE = 1e-14  # some tens of rounding errors
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to run a problem that leaves its settings alone.
+
+    Args:
+        source: source of spread to which it belongs.
+        name: its name in words.
+        seed: seed of the run.
+        compiled: whether the run uses compiled C.
+        flags: flags of the compiler.
+        nudge: relative change of the first state and the exact parameters.
+        finer: factor of the number of integrator steps.
+    """
+
+    source: str
+    name: str
+    seed: int
+    compiled: bool
+    flags: tuple[str, ...] = ()
+    nudge: float = 0.0
+    finer: int = 1
+
+    @property
+    def plans(self) -> bool:
+        """Whether open-loop plans can differ in this variant: they are solved in the virtual machine, without noise."""
+        return self.source == NOMINAL or self.nudge > 0
+
+    def applied(self, problem: Problem) -> Problem:
+        """Return the problem as it runs in this variant."""
+        if self.nudge:
+            start = {name: value * (1 + self.nudge) for name, value in problem.start.items()}
+            elsewhere = replace(problem, start=start)
+            return elsewhere if problem.foreign else with_exact(elsewhere, problem.real_plant.exact * (1 + self.nudge))
+        if self.finer > 1:
+            finer = problem.real_integrator.finer(self.finer) or problem.real_integrator
+            if problem.symbolic_reality is not None:
+                return replace(problem, reality=replace(problem.symbolic_reality, integrator=finer))
+            return replace(problem, integrator=finer)
+        return problem
+
+
+def nominal(seed: int, compiled: bool) -> Variant:
+    """Return the variant that `check` measures."""
+    return Variant(NOMINAL, "nominal", seed, compiled)
+
+
+def variants(problem: Problem, *, seed: int, seeds: int, compiled: bool) -> list[Variant]:
+    """Return the nominal variant and all others that can differ from it; without noise there is one seed only."""
+    all_variants = [nominal(seed, compiled)]
+    if _is_random(problem):
+        all_variants += [Variant(SEEDS, f"seed {seed + k}", seed + k, compiled) for k in range(1, seeds)]
+    if compiled and find_compiler():
+        all_variants.append(Variant(ROUNDING, "virtual machine", seed, False))
+        all_variants.append(Variant(ROUNDING, "compiled -O0", seed, True, flags=("-O0",)))
+    all_variants.append(
+        Variant(ROUNDING, f"start and exact parameters moved by {_NUDGE:g}", seed, compiled, nudge=_NUDGE)
+    )
+    if not problem.foreign and problem.real_integrator.finer(2):
+        all_variants.append(Variant(INTEGRATOR, "twice the integrator steps", seed, compiled, finer=2))
+    return all_variants
+
+
+def names_by_source(all_variants: Sequence[Variant]) -> dict[str, list[str]]:
+    """Return the names of the variants by their source."""
+    return {source: [v.name for v in all_variants if v.source == source] for source in SOURCES}
+
+
+def _is_random(problem: Problem) -> bool:
+    tables = (disturbance_table, sensing_table)
+    return any(
+        not np.array_equal(draw(problem, 0, problem.cycles), draw(problem, 1, problem.cycles)) for draw in tables
+    )

@@ -55,7 +55,7 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
     def check(problem: str | Path, controller: str | None = None) -> Judgement | None:
         __tracebackhide__ = True
         from fpirhc.baselines.check import check_baseline
-        from fpirhc.baselines.words import clean, headline, remarks, sentence
+        from fpirhc.baselines.outline import clean, headline, remarks, sentence
         from fpirhc.problem_files.problem_file import load_problem
 
         path = config.rootpath / problem
@@ -104,7 +104,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     measured = config.stash[_measured]
     if not measured:
         return
-    from fpirhc.baselines.merging import write_merged
+    from fpirhc.baselines.check import write_merged
     from fpirhc.errors import FpirhcError
 
     texts: dict[str, list[str]] = {}

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fpirhc.baselines.bands import Expected, Metric
-from fpirhc.baselines.baseline import FORMAT, Baseline, settings_hash
-from fpirhc.baselines.catalogue import BANDED, EXACT, KINDS, family_of
-from fpirhc.baselines.measuring import FINISHED
-from fpirhc.baselines.renamed import new_metrics, new_settings
-from fpirhc.baselines.settings import Settings, fingerprint
-from fpirhc.baselines.variants import SOURCES
+from fpirhc.baselines.bands import BANDED, EXACT, KINDS, Expected, Metric
+from fpirhc.baselines.baseline import FORMAT, Baseline, Settings, fingerprint, settings_hash
+from fpirhc.baselines.measuring import FINISHED, SOURCES, metric_of
 from fpirhc.errors import BaselineError, InvalidName
+from fpirhc.members import FORMER
 from fpirhc.simulation import metrics as run_metrics
 
 _LARGEST = 20_000_000  # bytes; a baseline has some tens of thousands
@@ -67,7 +66,7 @@ def read_text(text: str, path: Path, metrics: Sequence[run_metrics.Metric] | Non
     try:
         baseline = _baseline(facts)
         for key in {key for one in baseline.controllers.values() for key in one.metrics} if metrics is not None else ():
-            family_of(key, metrics)
+            metric_of(key, metrics)
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         reason = error if isinstance(error, BaselineError | InvalidName) else f"it lacks or misshapes {error}"
         raise BaselineError(f"'{path.name}': {reason}; {_ACCEPT}") from None
@@ -167,3 +166,51 @@ def _is_number(value: Any) -> bool:
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:  # a whole number beyond all floats
         return False
+
+
+METRICS = {"cost.correction": "cost.deviation"}
+# A setting's parent stands before it, so that a coordinate of a user's may have any name.
+_SETTINGS = {
+    r"((?:^|\bcontroller\.)(?:controller\.)*)nominal(?=\.)": r"\1replanning",
+    r"\boptimiser\.bend(?=\.|$)": "optimiser.hessian",
+    r"\bcost\.correction(?=\.|$)": "cost.deviation",
+    r"\bcost\.terminal_cost(?=\.|$)": "cost.terminal",
+}
+
+
+def new_settings(settings: Settings) -> tuple[Settings, dict[str, str]]:
+    """Return the settings with the names of today, and the new name of each old one."""
+    changed: dict[str, str] = {}
+    problem = _flat(settings.problem, changed)
+    return Settings(problem, {name: _flat(one, changed) for name, one in settings.controllers.items()}), changed
+
+
+def new_metrics(expected: Expected) -> tuple[Expected, dict[str, str]]:
+    """Return the expectations of a controller with the names of today, and the new name of each old one."""
+    changed = {k: METRICS[k] for k in (*expected.metrics, *expected.not_compared) if k in METRICS}
+    metrics = {METRICS.get(k, k): one for k, one in expected.metrics.items()}
+    skipped = {METRICS.get(k, k): why for k, why in expected.not_compared.items()}
+    return replace(expected, metrics=metrics, not_compared=skipped), changed
+
+
+def _flat(flat: Mapping[str, Any], changed: dict[str, str]) -> dict[str, Any]:
+    renamed = {}
+    for key, value in flat.items():
+        name = key
+        for pattern, today in _SETTINGS.items():
+            name = re.sub(pattern, today, name)
+        if name != key:
+            changed[_without_entry(key)] = _without_entry(name)
+        is_class = name == "is" or name.endswith(".is")
+        if is_class and value in FORMER:
+            changed[value] = FORMER[value]
+        renamed[name] = FORMER.get(value, value) if is_class else value
+    return renamed
+
+
+def _without_entry(key: str) -> str:
+    """The setting without the entry inside it, so that one rename is reported once: 'cost.correction'."""
+    parts = key.split(".")
+    old = {"nominal", "replanning", "bend", "hessian", "correction", "deviation", "terminal_cost", "terminal"}
+    last = max(k for k, part in enumerate(parts) if part in old)
+    return ".".join(parts[max(0, last - 1) : last + 1])

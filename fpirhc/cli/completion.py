@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from fpirhc.cli.discovery import known
 
 SHELLS = ("bash", "zsh", "fish", "tcsh")
-FOLDERS, FILES = ("out", "baselines"), ("tuned", "junit", "markdown")  # destinations of options
+FOLDERS, FILES = ("out", "baselines"), ("tuned", "markdown")  # destinations of options
 PROBLEMS = ("problem", "problems")
 
 

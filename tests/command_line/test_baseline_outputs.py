@@ -1,16 +1,12 @@
-"""Terminal, JUnit and Markdown say the same about a check, because they lay out one outline."""
+"""Terminal and Markdown say the same about a check, because they lay out one outline."""
 
 from __future__ import annotations
-
-from xml.etree import ElementTree as Xml
 
 import pytest
 
 from fpirhc.baselines.judging import Judgement, Row
-from fpirhc.baselines.junit import to_junit
-from fpirhc.baselines.markdown import to_markdown
 from fpirhc.baselines.outline import outline
-from fpirhc.baselines.terminal import show_check
+from fpirhc.baselines.printing import show_check, to_markdown
 
 HOLDING = Row("RHC", "rms_error.y", 1.0, 1.0, 0.1, "holds")
 QUIET = Row("RHC", "cycles", 300, 300, None, "holds")
@@ -25,11 +21,11 @@ EVERY = outline([GOOD, BAD, MISSING, BROKEN], [("chain", "takes a minute")])
 
 @pytest.fixture
 def texts(capsys):
-    """The three outputs, without what their formats add."""
+    """Both outputs, without what their formats add."""
     show_check(EVERY, every=False)
     terminal = " ".join(capsys.readouterr().out.split())
     markdown = to_markdown(EVERY).replace("&#95;", "_").replace("&#58;", ":")
-    return {"terminal": terminal, "junit": " ".join(to_junit(EVERY).split()), "markdown": markdown}
+    return {"terminal": terminal, "markdown": markdown}
 
 
 def test_an_outline_groups_by_controller_and_knows_what_changed():
@@ -45,7 +41,7 @@ def test_an_outline_groups_by_controller_and_knows_what_changed():
     assert bad.lines[3].sentence == "PID: outcome was finished, is ended early: changed"
 
 
-@pytest.mark.parametrize("form", ["terminal", "junit", "markdown"])
+@pytest.mark.parametrize("form", ["terminal", "markdown"])
 @pytest.mark.parametrize("word", ["effort.u", "RHC+FPI", "ended early", "missing.json", "no file at"])
 def test_every_form_has_what_changed_and_what_is_unclear(form, word, texts):
     """Nothing that makes a check fail is left out of any output."""
@@ -58,14 +54,3 @@ def test_metrics_that_hold_are_not_in_the_way(texts, capsys):
     assert "cycles" not in texts["markdown"]
     show_check(EVERY, every=True)
     assert "cycles" in capsys.readouterr().out
-
-
-def test_junit_counts_what_it_holds():
-    """As a CI reads it: a case per controller, one failure per controller with changes, an error where nothing can be said."""
-    suites = {suite.get("name"): suite for suite in Xml.fromstring(to_junit(EVERY))}
-    counts = {n: tuple(int(s.get(k) or 0) for k in ("tests", "failures", "errors")) for n, s in suites.items()}
-    assert counts == {"good": (1, 0, 0), "bad": (3, 2, 0), "missing": (1, 0, 1), "broken": (1, 0, 1)}
-    for name, suite in suites.items():
-        assert len(suite) == counts[name][0]
-        assert len(suite.findall("testcase/failure")) == counts[name][1]
-        assert len(suite.findall("testcase/error")) == counts[name][2]

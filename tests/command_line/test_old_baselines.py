@@ -8,10 +8,8 @@ from blessed import write_problems
 
 import fpirhc as fp
 from fpirhc.baselines.bands import Expected, Metric
-from fpirhc.baselines.baseline import to_text
-from fpirhc.baselines.reading import read_baseline
-from fpirhc.baselines.renamed import new_metrics, new_settings
-from fpirhc.baselines.settings import Settings
+from fpirhc.baselines.baseline import Settings, to_text
+from fpirhc.baselines.reading import new_metrics, new_settings, read_baseline
 
 OLD_NAMES = {"cost.deviation": "cost.correction", "replanning.": "nominal.", "optimiser.hessian": "optimiser.bend"}
 OLD_CLASSES = {"FromMeasurement": "Restart"}

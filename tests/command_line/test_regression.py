@@ -14,18 +14,25 @@ import pytest
 from blessed import LINE, NOISY, write_problems
 
 import fpirhc as fp
-from fpirhc.baselines.bands import FACTOR, Expected, expected
-from fpirhc.baselines.baseline import to_text
-from fpirhc.baselines.catalogue import BANDED, EXACT, KINDS, TIGHT, family_of
+from fpirhc.baselines.bands import BANDED, EXACT, FACTOR, KINDS, TIGHT, Expected, expected
+from fpirhc.baselines.baseline import fingerprint, settings_of, to_text
 from fpirhc.baselines.judging import Judgement, Row, judge
-from fpirhc.baselines.junit import to_junit
-from fpirhc.baselines.markdown import to_markdown
-from fpirhc.baselines.measuring import DIVERGED, FINISHED, Measurement
+from fpirhc.baselines.measuring import (
+    DIVERGED,
+    FINISHED,
+    INTEGRATOR,
+    NOMINAL,
+    ROUNDING,
+    SEEDS,
+    Measurement,
+    Variant,
+    metric_of,
+    variants,
+)
 from fpirhc.baselines.outline import outline
 from fpirhc.baselines.places import problems_here
+from fpirhc.baselines.printing import to_markdown
 from fpirhc.baselines.reading import read_baseline
-from fpirhc.baselines.settings import fingerprint, settings_of
-from fpirhc.baselines.variants import INTEGRATOR, NOMINAL, ROUNDING, SEEDS, Variant, variants
 from fpirhc.cli.main import main
 from fpirhc.errors import BaselineError, InvalidName
 from fpirhc.simulation.metrics import known_metrics
@@ -131,9 +138,9 @@ def test_every_measured_metric_is_in_the_catalogue(blessed):
     """And a misspelt one is answered with the nearest."""
     for name in ("line", "noisy"):
         for one in read_baseline(blessed / "baselines" / f"{name}.json").controllers.values():
-            assert all(family_of(metric).kind in KINDS for metric in one.metrics)
+            assert all(metric_of(metric).compared in KINDS for metric in one.metrics)
     with pytest.raises(InvalidName, match="Did you mean 'rms_error'"):
-        family_of("rms_eror.y")
+        metric_of("rms_eror.y")
 
 
 def test_a_baseline_says_what_it_was_made_of(blessed):
@@ -246,10 +253,10 @@ def test_a_baseline_that_is_no_text_or_no_file(folder, capsys):
         (["accept", "lin.py", "--reason", "x"], 2, "no file at 'lin.py'"),
         (["accept", "line.py", "--reason", "x", "--baselines", "../elsewhere"], 3, "outside of the project"),
         (["accept", "two_mass", "--reason", "x"], 3, "outside of the project"),
-        (["check", "--junit", "line.py"], 3, "is not overwritten"),
+        (["check", "--markdown", "line.py"], 3, "is not overwritten"),
         (["check", "--markdown", "baselines/line.json"], 3, "is not overwritten"),
-        (["check", "--junit", "nowhere/a.xml"], 3, "no folder 'nowhere'"),
-        (["check", "--junit", "a" * 300], 3, "File name too long"),
+        (["check", "--markdown", "nowhere/a.md"], 3, "no folder 'nowhere'"),
+        (["check", "--markdown", "a" * 300], 3, "File name too long"),
         (["check", "--baselines", "nowhere", "noisy.py", "--no-compile"], 6, "there is no baseline 'noisy.json'"),
         (["check", "nosuch"], 2, "problem 'nosuch' is unknown"),
     ],
@@ -358,11 +365,9 @@ class _Tags(HTMLParser):
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_names_are_only_text(name):
-    """XML parses to the same number of cases, Markdown holds no tag, link, mention or column of theirs."""
+    """Markdown holds no tag, link, mention or column of theirs."""
     row = Row(name, f"cost.{name}", 1.0, name, 0.1, "changed")
     judgement = Judgement(name, (row,), (f"stale: {name}",), "", name, name, (name,))
-    root = Xml.fromstring(to_junit(outline([judgement])))
-    assert [len(suite) for suite in root] == [2]
     page = to_markdown(outline([judgement], [(name, name)]))
     tags = _Tags()
     tags.feed(page)
@@ -383,28 +388,24 @@ def test_hostile_names_from_file_to_report(tmp_path, monkeypatch, capsys):
     Path(f"{stem}.py").write_text(text)
     assert main(["accept", f"{stem}.py", "--reason", "<i>why</i>", "--no-compile"]) == 0
     Path(f"{stem}.py").write_text(text.replace("fp.Noise(2.0)", "fp.Noise(20.0)"))
-    assert main(["check", "--no-compile", "--junit", "a.xml", "--markdown", "a.md"]) == 6
+    assert main(["check", "--no-compile", "--markdown", "a.md"]) == 6
     printed = capsys.readouterr().out
     assert "\x1b[2J" not in printed
     assert not any(line.strip().startswith("::") for line in printed.splitlines())
     assert "<img" not in Path("a.md").read_text()
-    assert len(Xml.parse("a.xml").getroot()) == 1
-    assert {p.name for p in tmp_path.iterdir()} == {f"{stem}.py", "baselines", "a.xml", "a.md"}
-    assert main(["check", "--no-compile", "--junit", "a.xml", "--markdown", "a.md"]) == 6, "reports replace reports"
+    assert {p.name for p in tmp_path.iterdir()} == {f"{stem}.py", "baselines", "a.md"}
+    assert main(["check", "--no-compile", "--markdown", "a.md"]) == 6, "reports replace reports"
 
 
 def test_reports_say_what_changed(folder, capsys):
-    """Old, new, band and verdict in all three."""
+    """Old, new, band and verdict in both."""
     text = (folder / "line.py").read_text()
     (folder / "line.py").write_text(text.replace("ca.sin(2 * t)", "1.1 * ca.sin(2 * t)"))
-    assert main(["check", "line.py", "--no-compile", "--junit", "a.xml", "--markdown", "a.md"]) == 5
+    assert main(["check", "line.py", "--no-compile", "--markdown", "a.md"]) == 5
     assert "rms_error.y" in capsys.readouterr().out
     page = Path("a.md").read_text()
     assert "0 of 1 problems hold" in page
     assert "<code>rms&#95;error.y</code>" in page
-    failures = Xml.parse("a.xml").getroot().findall(".//failure")
-    assert len(failures) == 3
-    assert all("rms_error.y was 0." in (f.text or "") for f in failures)
 
 
 TEST = """
@@ -417,7 +418,7 @@ def test_line(fpirhc_check, controller):
 
 
 def test_pytest_plugin(pytester, blessed):
-    """Missing, blessed by two workers, held, changed in one controller, and blessed for that one alone."""
+    """Missing, blessed by two workers, held, changed in one controller, and blessed for that one alone; with JUnit by pytest."""
     pytester.makepyfile(test_line=TEST)
     path = pytester.path / "line.py"
     path.write_text(LINE)
@@ -433,7 +434,9 @@ def test_pytest_plugin(pytester, blessed):
     path.write_text(
         LINE.replace('"CTC": fp.ComputedTorque(tracking)', '"CTC": fp.ComputedTorque(fp.Exponential(rate=9.0))')
     )
-    changed = run()
+    changed = run("--junitxml", "a.xml")
+    failures = Xml.parse(pytester.path / "a.xml").getroot().findall(".//failure")
+    assert ["rms_error.y was 0." in (failure.get("message") or "") for failure in failures] == [True]
     changed.assert_outcomes(passed=2, failed=1)
     changed.stdout.fnmatch_lines(["*tracking.rate was 6.0, is 9.0*", "*rms_error.y was *: worse"])
     run("--fpirhc-accept", "faster", "-k", "line and not FPI").assert_outcomes(passed=1, deselected=2)

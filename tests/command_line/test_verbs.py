@@ -299,7 +299,7 @@ JOURNEYS: dict[str, Any] = {
     "new": [(None, "class", 2), (None, "arm", 0), (None, "arm", 3)],
     "check": [
         (None, "", 6),
-        (None, "--junit line.py", 3),
+        (None, "--markdown line.py", 3),
         (lambda: main(["accept", "line.py", "--reason", "first", "--no-compile", "--seeds", "2"]), "--no-compile", 0),
         (None, "lin.py", 2),
         (faster, "--no-compile", 5),

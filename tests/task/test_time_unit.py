@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import fpirhc as fp
-from fpirhc.baselines.settings import settings_of
+from fpirhc.baselines.baseline import settings_of
 from fpirhc.errors import InvalidProblem
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.figures import pair_figures, plan_figure

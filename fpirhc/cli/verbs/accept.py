@@ -23,7 +23,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.baselines.check import accept
-    from fpirhc.baselines.terminal import show_baseline
+    from fpirhc.baselines.printing import show_baseline
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.terminal import progress_bars
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("problems", nargs="*", metavar="PROBLEM", help="names or files (default: all of this folder)")
-    parser.add_argument("--junit", type=Path, metavar="FILE", help="also write JUnit XML")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write Markdown, for a pull request")
     text = "show every metric, not only those that changed and the rms errors"
     parser.add_argument("--all", action="store_true", help=text)
@@ -30,25 +29,20 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
-    from fpirhc.baselines import junit, markdown
     from fpirhc.baselines.judging import ignoring
-    from fpirhc.baselines.outline import outline
+    from fpirhc.baselines.outline import check_replaceable, outline
     from fpirhc.baselines.places import problems_here, write_whole
-    from fpirhc.baselines.terminal import show_check
-    from fpirhc.baselines.words import check_replaceable
+    from fpirhc.baselines.printing import MARK, show_check, to_markdown
 
-    for path, mark in ((options.junit, junit.MARK), (options.markdown, markdown.MARK)):
-        if path:
-            check_replaceable(path, mark)
+    if options.markdown:
+        check_replaceable(options.markdown, MARK)
     problems, unchecked = (options.problems, {}) if options.problems else problems_here(Path(), options.baselines)
     measured = _judgements(options, list(dict.fromkeys(map(str, problems))))
     judgements = [ignoring(judgement, options.ignore_below) for judgement in measured]
     contents = outline(judgements, list(unchecked.items()))
     show_check(contents, options.all)
-    if options.junit:
-        write_whole(junit.to_junit(contents), options.junit, "report")
     if options.markdown:
-        write_whole(markdown.to_markdown(contents), options.markdown, "report")
+        write_whole(to_markdown(contents), options.markdown, "report")
     return _code(judgements)
 
 
@@ -106,13 +100,14 @@ VERB = Verb(
         ("fpirhc check", "every problem of ./problems, or of this folder"),
         ("fpirhc check my_arm.py two_mass", "these problems"),
         ("fpirhc check --ignore-below 0.1%", "another machine or library, whose last digits differ"),
-        ("fpirhc check --junit check.xml --markdown check.md", "for a pull request"),
+        ("fpirhc check --markdown check.md", "for a pull request"),
     ),
     notes="""
 A baseline is baselines/NAME.json beside the problem file; commit it. Without names, a problem in the folder that has
 no baseline fails, unless baselines/unchecked.toml gives a reason, such as: chain_of_masses = "takes a minute".
 Changes are sorted by size. A setting that changed stands first, with what changed along with it below; a change below
 0.1 % is called neither better nor worse.
+JUnit XML comes from pytest, in whose tests `fpirhc_check` is a fixture: pytest --junitxml check.xml.
 Of several problems, the exit code is the first of 2, 6 and 5 that applies to one of them.
 """,
 )
