@@ -11,7 +11,7 @@ import numpy as np
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.sensing.base import values_of
-from fpirhc.simulation.loop import _own_response
+from fpirhc.simulation.loop import true_response
 from fpirhc.status import Status
 
 
@@ -29,7 +29,7 @@ class Lossy:
         self.stepper = fp.Stepper(problem, controller, **({"compiled": False} | settings))
         self._advance = problem.integrator.step(plant, problem.period)
         own = checked(problem, controller).response(problem)
-        self._response = (own or _own_response(problem, seen=False)).function
+        self._response = (own or true_response(problem)).function
         self._shows = self._seen if self.stepper.estimates else self._measured
         x, u, p = plant.symbols()
         values = values_of(plant, x, u, p)

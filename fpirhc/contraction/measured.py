@@ -8,6 +8,7 @@ import numpy as np
 from fpirhc.contraction.gains import predicted_factor
 from fpirhc.contraction.spectrum import Array
 from fpirhc.errors import InvalidShape
+from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
 
@@ -66,7 +67,7 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    model, plant, reality = problem.plant, problem.real_plant, problem.symbolic_reality
+    model, plant = problem.plant, problem.real_plant
     matrix = kind(model.inverse_opaque or problem.real_integrator.opaque)
     x, state = matrix.sym("x", plant.state.size), matrix.sym("state", model.state.size)
     r, u = matrix.sym("r", len(model.controlled_names)), matrix.sym("u", model.input.size)
@@ -74,12 +75,11 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
     calm = ca.DM.zeros(len(plant.names))
     advance = problem.real_integrator.step(plant, problem.period)
     after = advance(x, u, exact, calm)
-    respond = reality.response_function(model, seen=True) if reality is not None else None
     later = matrix.sym("later", model.input.size)
     if model.step is not None:
         response = _differences(problem, advance, after, (later, exact, calm))
     else:
-        response = respond(after, u, exact, calm) if respond else model.controlled_response_function(after, u, exact)
+        response = problem.truth.function(response_names(model.face), seen=True)(after, u, exact, calm)
     gain = ca.Function("fpirhc_sampled_gain", [x, u, later, exact], [ca.densify(ca.jacobian(response, u))])
     command = model.inverse_function(state, r, assumed)
     jacobian = gain(x, command, command, exact) @ ca.jacobian(command, r)
@@ -97,11 +97,8 @@ def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tu
         after: its state one cycle after the command.
         held: commands of the cycles after it, parameters, no forcing.
     """
-    model, reality, face = problem.plant, problem.symbolic_reality, problem.plant.face
-    if reality is None:
-        outputs_of = model.output_function
-    else:
-        outputs_of = reality.output_function(model) if model.outputs else reality.state_function(model, seen=True)
+    model, face = problem.plant, problem.plant.face
+    outputs_of = problem.truth.function(face.state.elements, seen=True)
     states, entries = [after], []
     for _ in range(1, max(face.orders)):
         states.append(advance(states[-1], *held))

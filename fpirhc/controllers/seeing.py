@@ -10,6 +10,8 @@ them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
@@ -93,13 +95,9 @@ def seeing_blocks(problem: Problem) -> list[Block]:
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return state, or outputs, and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
-    plant, reality = problem.plant, problem.symbolic_reality
-    at = problem.real_start, problem.inputs_before, problem.real_parameters
-    if reality is None:
-        return problem.start_output, plant.controlled_response_function(*at).full().ravel()
-    calm = np.zeros(len(problem.real_plant.names))
+    plant = problem.plant
     motion = problem.start_output if plant.outputs else np.array(list(_first_states(problem).values()))
-    return motion, reality.response_function(plant, seen=True)(*at, calm).full().ravel()
+    return motion, _first_values(problem, response_names(plant.face))
 
 
 def first_shown(problem: Problem) -> dict[str, float]:
@@ -112,13 +110,15 @@ def first_shown(problem: Problem) -> dict[str, float]:
 
 def _first_states(problem: Problem) -> dict[str, float]:
     """First states of the plant that moves, by name in the model; the model's where it does not have them."""
-    plant, reality = problem.plant, problem.symbolic_reality
+    plant, shown = problem.plant, problem.truth.shown(problem.plant)
     states = dict(zip(plant.state.elements, map(float, problem.start_state), strict=True))
-    if reality is None:
-        return states
+    return states | dict(zip(shown, map(float, _first_values(problem, shown)), strict=True))
+
+
+def _first_values(problem: Problem, quantities: Sequence[str]) -> np.ndarray:
+    """Measured quantities at the start, of the plant that moves."""
     at = problem.real_start, problem.inputs_before, problem.real_parameters, np.zeros(len(problem.real_plant.names))
-    values = reality.state_function(plant, seen=True)(*at).full().ravel()
-    return states | dict(zip(reality.shown(plant), map(float, values), strict=True))
+    return np.asarray(problem.truth.function(quantities, seen=True)(*at).full()).ravel()
 
 
 def _believing(problem: Problem) -> Believing | None:

@@ -27,7 +27,8 @@ def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     most = {name: max(k for n, k in wanted if n == name) for name, _ in wanted}
-    chains = {name: _chain(plant, name, count, (x, u, p, w)) for name, count in most.items()}
+    responses = _responses(plant, (x, u, p, w))
+    chains = {name: _chain(plant, name, count, (x, u, p, w), responses) for name, count in most.items()}
     column = ca.vertcat(*(chains[name][k] for name, k in wanted))
     return ca.Function("fpirhc_derivatives", [x, u, p, w], [ca.densify(column)])
 
@@ -35,11 +36,18 @@ def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.
 def input_reaches_at(plant: Plant, name: str, count: int) -> int | None:
     """Return the first derivative of a quantity that depends on an input at once; None where none up to `count` does."""
     x, u, p = plant.symbols()
-    chain = _chain(plant, name, count, (x, u, p, ca.SX.sym("w", len(plant.names))))
+    symbols = x, u, p, ca.SX.sym("w", len(plant.names))
+    chain = _chain(plant, name, count, symbols, _responses(plant, symbols))
     return next((k for k, y in enumerate(chain) if ca.depends_on(y, u)), None)
 
 
-def _chain(plant: Plant, name: str, count: int, symbols: Symbols) -> list[Expression]:
+def _responses(plant: Plant, symbols: Symbols) -> Expression:
+    """The highest derivatives of all coordinates; a map has none."""
+    x, u, p, w = symbols
+    return w if plant.step is not None else plant.response_function(x, u, p) + w
+
+
+def _chain(plant: Plant, name: str, count: int, symbols: Symbols, responses: Expression) -> list[Expression]:
     """The coordinate or output and its first `count` derivatives."""
     x, u, p, w = symbols
     if name not in plant.coordinates:
@@ -47,13 +55,12 @@ def _chain(plant: Plant, name: str, count: int, symbols: Symbols) -> list[Expres
     elements, place = plant.state.elements, plant.names.index(name)
     if plant.step is not None:
         return lie_derivatives(plant, x[place], count, (x, u, p, w))
-    rate = plant.forced_derivative_function(x, u, p, w)
-    chain: list[Expression] = []
-    for k in range(count + 1):
-        if k < plant.orders[place]:
-            chain.append(x[elements.index(name + "'" * k)])
-        elif k == plant.orders[place]:
-            chain.append(plant.response_function(x, u, p)[place] + w[place])
-        else:
+    order = plant.orders[place]
+    chain = [x[elements.index(name + "'" * k)] for k in range(min(order, count + 1))]
+    if count >= order:
+        chain.append(responses[place])
+    if count > order:
+        rate = plant.forced_derivative_function(x, u, p, w)
+        for _ in range(count - order):
             chain.append(ca.jtimes(chain[-1], x, rate))
     return chain

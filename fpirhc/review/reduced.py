@@ -25,7 +25,7 @@ def outer_slopes(reality: Reality, model: Plant, state: np.ndarray, command: np.
     if model.outputs or len(known) == model.state.size or len(reality.shown(model)) < model.state.size:
         return np.eye(plant.state.size)[known]
     x, u, p = plant.symbols()
-    shown = reality.state_function(model, seen=False)(x, u, p, ca.SX.zeros(len(plant.names)))
+    shown = reality.function(reality.shown(model))(x, u, p, ca.SX.zeros(len(plant.names)))
     slopes = ca.Function("fpirhc_outer", [x, u, p], [ca.densify(ca.jacobian(shown, x))])
     return np.asarray(slopes(state, command, plant.exact).full())
 

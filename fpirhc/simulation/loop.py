@@ -23,8 +23,8 @@ from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.response_jumps import response_jumps
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, first_shown, seeing_blocks
-from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import response_names
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, sending_block, shows_truth
 from fpirhc.simulation.map_blocks import with_true_response
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
@@ -159,7 +159,7 @@ def _clock_block(time: Signal, period: float) -> Block:
 
 def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -> list[Block]:
     """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
-    plant, response = problem.plant, other or _own_response(problem, seen=False)
+    plant, response = problem.plant, other or true_response(problem)
     if problem.sees_plant:
         sense = [_sense_block(problem, measured_signals(plant), response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
@@ -180,12 +180,11 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Sho
     if problem.sensing.estimator.of_steps:
         sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
-    if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
+    if not problem.truth.seen:
         return blocks, true
     direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
     shown = (motion, response.signal) if direct else hidden
-    function = _own_response(problem, seen=True).function
-    return [*blocks, _seen_block(problem, shown, function)], shown
+    return [*blocks, _seen_block(problem, shown)], shown
 
 
 def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
@@ -240,18 +239,10 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     return Block("truth", Layout((plant.time, motion)), writes, step, opaque=problem.reference.opaque)
 
 
-def _own_response(problem: Problem, *, seen: bool) -> Response:
-    """The response of the controlled coordinates of the plant that moves; where `seen`, the measured one."""
+def true_response(problem: Problem) -> Response:
+    """The response of what the controller controls, of the plant that moves."""
     plant = problem.plant
-    if problem.symbolic_reality is not None:
-        return Response(plant.response_signal("realised"), problem.symbolic_reality.response_function(plant, seen=seen))
-    if plant.outputs:
-        function = derivatives_function(plant, list(plant.response_orders.items()))
-        return Response(plant.response_signal("realised"), function)
-    x, u, p = plant.symbols()
-    w = ca.SX.sym("w", len(plant.names))
-    response = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
-    return Response(plant.response_signal("realised"), ca.Function("fpirhc_realised", [x, u, p, w], [response]))
+    return Response(plant.response_signal("realised"), problem.truth.function(response_names(plant.face)))
 
 
 def _real_signals(problem: Problem) -> tuple[Signal, ...]:
@@ -270,37 +261,30 @@ def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response)
     """
     if problem.foreign is not None:
         return foreign_block(problem, motion, response.signal)
-    reality = problem.symbolic_reality
-    reads, writes = _real_signals(problem), (*motion, response.signal)
-    state_of = None if reality is None else reality.state_function(problem.plant, seen=False)
-    own = () if reality is None else (like(reality.plant.state, REALITY_STATE),)
-    outputs = motion[-1:] if problem.plant.outputs else ()
-    states = motion[: len(motion) - len(outputs)]
-    outputs_of = problem.plant.output_function if reality is None else reality.output_function(problem.plant)
+    reads, writes, truth = _real_signals(problem), (*motion, response.signal), problem.truth
+    own = () if problem.symbolic_reality is None else (like(truth.plant.state, REALITY_STATE),)
+    shown = {signal.name: truth.function(signal.elements) for signal in motion}
     shifts = bool(problem.disturbed_outputs)
     if shifts:
-        reads, own = (*reads, disturbance_signal(problem)), (*own, logged_signal(problem))
+        reads, writes = (*reads, disturbance_signal(problem)), (*writes, logged_signal(problem))
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
         values = {response.signal.name: response.function(*now)}
-        values |= {signal.name: outputs_of(*now) for signal in outputs}
+        values |= {name: function(*now) for name, function in shown.items()}
         if shifts:
             below, answered = added(problem, s.disturbance)
             sums = {response.signal.name: answered, motion[-1].name: below}
             values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
-        if state_of is None:
-            return {motion[0].name: s._state_before, **values}
-        values |= {signal.name: state_of(*now) for signal in states}
-        return {REALITY_STATE: s._state_before, **values}
+        return {**values, **{signal.name: s._state_before for signal in own}}
 
     return Block("sense", Layout(reads), Layout((*writes, *own)), step)
 
 
-def _seen_block(problem: Problem, shown: Shown, response: ca.Function) -> Block:
+def _seen_block(problem: Problem, shown: Shown) -> Block:
     """Block -> the state and the response that are measured in place of the true ones."""
-    assert problem.symbolic_reality is not None
-    state = problem.symbolic_reality.state_function(problem.plant, seen=True)
+    state = problem.truth.function(shown[0][0].elements, seen=True)
+    response = problem.truth.function(response_names(problem.plant.face), seen=True)
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
@@ -328,7 +312,7 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     plant = problem.real_plant
     advance = problem.real_integrator.step(plant, problem.period)
     state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
-    if problem.symbolic_reality is not None:
+    if problem.symbolic_reality is not None:  # its state is none of the model's
         state = like(plant.state, REALITY_STATE)
     exact = like(plant.parameter, real_name(problem))
     reads = (state, arriving, exact, *disturbed)

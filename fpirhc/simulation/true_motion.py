@@ -14,9 +14,9 @@ from fpirhc.task.problem import Problem
 
 def true_motion(problem: Problem) -> tuple[Signal, ...]:
     """Return the signals of state and outputs, with the states that what moves has; without any, no state."""
-    plant, reality, foreign = problem.plant, problem.symbolic_reality, problem.foreign
+    plant, foreign = problem.plant, problem.foreign
     state, *outputs = measured_signals(plant)
-    shown = state.elements if reality is None else reality.shown(plant)
+    shown = problem.truth.shown(plant)
     if foreign is not None and plant.outputs:
         shown = tuple(e for e in state.elements if e in foreign.measures)
     if shown == state.elements:

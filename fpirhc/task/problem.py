@@ -177,16 +177,12 @@ class Problem(Checked):
         """Whether the plant that moves has a coordinate or an output of the model."""
         if self.foreign is not None:
             return name in needed_measurements(self.plant, self.sensing)
-        return self.symbolic_reality is None or self.symbolic_reality.shows(name)
+        return self.truth.shows(name)
 
     @property
     def sees_plant(self) -> bool:
         """Whether a controller receives the plant's own state and response, unchanged and without delay."""
-        return (
-            MEASUREMENT not in self.dead_time.queued
-            and self.sensing.ideal
-            and not (self.symbolic_reality and self.symbolic_reality.seen)
-        )
+        return MEASUREMENT not in self.dead_time.queued and self.sensing.ideal and not self.truth.seen
 
     @property
     def symbolic_reality(self) -> Reality | None:
@@ -198,10 +194,15 @@ class Problem(Checked):
         """The reality where it is an object outside."""
         return self.reality.foreign if self.reality is not None else None
 
+    @cached_property
+    def truth(self) -> Reality:
+        """What a run moves, in the terms of the model: the reality, or the model itself with its exact parameters."""
+        return self.symbolic_reality or Reality(self.plant)
+
     @property
     def real_plant(self) -> Plant:
         """The plant that a run moves, with its exact parameters: the reality's, or the model's own."""
-        return self.plant if self.symbolic_reality is None else self.symbolic_reality.plant
+        return self.truth.plant
 
     @cached_property
     def disturbed_outputs(self) -> Mapping[str, int]:
@@ -224,8 +225,7 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        integrator = (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
-        return motion_of(self.real_plant, integrator, USUAL)
+        return motion_of(self.real_plant, self.truth.integrator or self.integrator, USUAL)
 
     @cached_property
     def real_start(self) -> np.ndarray:
@@ -234,9 +234,7 @@ class Problem(Checked):
         Raises:
             InvalidProblem: a reality whose own states neither are given nor settle.
         """
-        if self.symbolic_reality is None:
-            return self.start_state
-        return self.symbolic_reality.start_state(self.plant, self.start_state, self.inputs_before)
+        return self.truth.start_state(self.plant, self.start_state, self.inputs_before)
 
     @property
     def real_parameters(self) -> np.ndarray:
@@ -262,7 +260,7 @@ class Problem(Checked):
     @property
     def _plants(self) -> tuple[Plant, ...]:
         """The model, and another plant that moves."""
-        return (self.plant,) if self.symbolic_reality is None else (self.plant, self.real_plant)
+        return tuple(dict.fromkeys((self.plant, self.real_plant)))
 
     @cached_property
     def start_state(self) -> np.ndarray:
@@ -283,11 +281,7 @@ class Problem(Checked):
         """First value of the outputs and their derivatives, of the plant that moves; without outputs the first state."""
         if not self.plant.outputs:
             return self.start_state
-        if self.symbolic_reality is not None:
-            function = self.symbolic_reality.output_function(self.plant)
-        else:
-            function = self.plant.output_function
-        calm = np.zeros(len(self.real_plant.names))
+        function, calm = self.truth.function(self.plant.output.elements), np.zeros(len(self.real_plant.names))
         return np.asarray(function(self.real_start, self.inputs_before, self.real_parameters, calm).full()).ravel()
 
     @property

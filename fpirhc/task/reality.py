@@ -12,7 +12,7 @@ itself as its model. The exact values of the model's own parameters move nothing
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -108,34 +108,18 @@ class Reality(Checked):
 
     def shown(self, model: Plant) -> tuple[str, ...]:
         """Return the names of the model's states that it has, in the model's order."""
-        own = dict(zip(model.names, self._names(model, seen=True), strict=True))
-        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in _quantities_of(self.plant))
+        own = _quantities_of(self.plant)
+        return tuple(e for e in model.state.elements if self._own(e.rstrip("'"), seen=True) in own)
 
-    def state_function(self, model: Plant, *, seen: bool) -> ca.Function:
-        """Function (state, input, parameters, forcing) of the reality -> the model's states that it has, in the order of `shown`.
+    def function(self, quantities: Sequence[str], *, seen: bool = False) -> ca.Function:
+        """Function (state, input, parameters, forcing) of what moves -> quantities of the model by name: "q1", "q1'", "y".
 
         Args:
-            model: whose state is wanted.
-            seen: whether it is the measured one; else the judged one.
+            quantities: coordinates and outputs of the model, and their derivatives.
+            seen: whether they are the measured ones; else the judged ones.
         """
-        names = dict(zip(model.names, self._names(model, seen=seen), strict=True))
-        wanted = [(names[e.rstrip("'")], e.count("'")) for e in self.shown(model)]
+        wanted = [(self._own(e.rstrip("'"), seen=seen), e.count("'")) for e in quantities]
         return derivatives_function(self.plant, wanted)
-
-    def response_function(self, model: Plant, *, seen: bool) -> ca.Function:
-        """Function (state, input, parameters, forcing) of the reality -> the model's controlled responses."""
-        if model.outputs:
-            return derivatives_function(self.plant, list(model.response_orders.items()))
-        names = self._names(model, seen=seen)
-        return derivatives_function(self.plant, [(names[k], model.orders[k]) for k in model.controlled_indices])
-
-    def output_function(self, model: Plant) -> ca.Function:
-        """Function (state, input, parameters, forcing) of the reality -> the model's outputs and their derivatives.
-
-        Without outputs these are the states of the model that it has.
-        """
-        elements = model.output.elements if model.outputs else self.shown(model)
-        return derivatives_function(self.plant, [(e.rstrip("'"), e.count("'")) for e in elements])
 
     def start_state(self, model: Plant, start: np.ndarray, command: np.ndarray) -> np.ndarray:
         """Return the first state of the reality, shape (its nx,).
@@ -168,10 +152,8 @@ class Reality(Checked):
         hidden = [e for e in self.shown(model) if self.true_name(e.rstrip("'")) not in self.plant.coordinates]
         if model.outputs or self.start or not hidden:
             return
-        values = self.state_function(model, seen=False)(
-            first, command, self.plant.exact, np.zeros(len(self.plant.names))
-        )
-        own = dict(zip(self.shown(model), np.asarray(values.full()).ravel(), strict=True))
+        values = self.function(hidden)(first, command, self.plant.exact, np.zeros(len(self.plant.names)))
+        own = dict(zip(hidden, np.asarray(values.full()).ravel(), strict=True))
         for name in hidden:
             wanted = start[model.state.elements.index(name)]
             if not abs(own[name] - wanted) <= 1e-6 * (1 + abs(wanted)):
@@ -255,11 +237,9 @@ class Reality(Checked):
             )
         return plant if tuple(plant.outputs) == tuple(model.outputs) else replace(plant, outputs=model.outputs)
 
-    def _names(self, model: Plant, *, seen: bool) -> tuple[str, ...]:
-        """The reality's coordinate for each of the model's."""
-        if seen:
-            return tuple(self.seen.get(c, c) for c in model.names)
-        return tuple(self.true_name(c) for c in model.names)
+    def _own(self, name: str, *, seen: bool) -> str:
+        """Its coordinate or output for one of the model."""
+        return self.seen.get(name, name) if seen else self.true_name(name)
 
 
 def _quantities_of(plant: Plant) -> dict[str, str]:

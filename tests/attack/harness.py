@@ -12,7 +12,7 @@ from attack.faults import FIRST, Cycle, Fault
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.errors import FpirhcError
 from fpirhc.sensing.base import response_names
-from fpirhc.simulation.loop import _own_response
+from fpirhc.simulation.loop import true_response
 from fpirhc.status import Status
 
 _GONE = 1e12  # size of a state that no plant comes back from
@@ -75,7 +75,7 @@ class Bench:
         self.stepper = fp.Stepper(problem, controller, compiled=False)
         self.limits = problem.limits.input_bounds(plant)
         self._advance = problem.integrator.step(plant, problem.period)
-        response = checked(problem, controller).response(problem) or _own_response(problem, seen=False)
+        response = checked(problem, controller).response(problem) or true_response(problem)
         self._response = response.function
         self._calm = np.zeros(len(plant.names))
         self.lost = False  # whether the plant itself left its domain, such as a tank below its bottom

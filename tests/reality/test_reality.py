@@ -15,6 +15,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import checked
 from fpirhc.describe import describe
 from fpirhc.errors import InvalidProblem, NotContractive, NotSupported
+from fpirhc.sensing.base import response_names
 from fpirhc.studies.comparison.entry_facts import has_exact_model
 from fpirhc.studies.scenarios.draws import COMPARING, draw, with_exact
 
@@ -98,6 +99,21 @@ def test_reality_equal_to_the_model_changes_no_bit(controller, sensing):
     for name in set(one.layout.names) - judged:
         assert np.array_equal(one[name], other[name]), name
     assert set(other.layout.names) == {*one.layout.names, "reality_state"}
+
+
+@pytest.mark.parametrize("name", ["two_mass", "noisy_motor", "leaking_tanks", "turbojet", "fishery"])
+def test_model_as_what_moves_shows_its_own_outputs_and_responses(name):
+    problem = fp.load_problem(name).problem
+    plant = problem.plant
+    assert problem.truth.plant is plant
+    generator = np.random.default_rng(0)
+    x, u = problem.start_state * generator.uniform(0.9, 1.1, plant.state.size), problem.inputs_before
+    at = x, u, problem.real_parameters
+    calm = np.zeros(len(plant.names))
+    shown = problem.truth.function(plant.output.elements)(*at, calm)
+    np.testing.assert_array_equal(shown, plant.output_function(*at, calm))
+    answered = problem.truth.function(response_names(plant.face))(*at, calm)
+    np.testing.assert_array_equal(answered, plant.controlled_response_function(*at))
 
 
 def test_no_reality_is_no_setting():

@@ -15,7 +15,7 @@ import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.controllers.response_jumps import JUMPS, response_jumps
-from fpirhc.simulation.loop import _own_response
+from fpirhc.simulation.loop import true_response
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
@@ -33,7 +33,7 @@ class Closed:
 
     def __init__(self, problem: fp.Problem, controller: Controller, *, compiled: bool = False) -> None:
         self.problem, self.stepper = problem, fp.Stepper(problem, controller, compiled=compiled)
-        response = checked(problem, controller).response(problem) or _own_response(problem, seen=False)
+        response = checked(problem, controller).response(problem) or true_response(problem)
         self.advance, self.response = problem.integrator.step(problem.plant, problem.period), response.function
 
     def run(self, added: dict[int, float], pushed: dict[int, float] | None = None) -> tuple[np.ndarray, list[Status]]:

@@ -17,7 +17,7 @@ from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.sensing.base import response_names
-from fpirhc.simulation.loop import _own_response, close_loop
+from fpirhc.simulation.loop import close_loop, true_response
 from fpirhc.tracking.base import Tracking
 
 PROBLEM = replace(two_masses(), duration=6.0)
@@ -74,7 +74,7 @@ def _wide() -> dict[str, tuple[float, float]]:
 
 def motion(stepper: fp.Stepper, spike: Spike | None, cycles: int) -> np.ndarray:
     """Positions of the two masses, shape (cycles, 2)."""
-    advance, response = PROBLEM.integrator.step(PLANT, PROBLEM.period), _own_response(PROBLEM, seen=False).function
+    advance, response = PROBLEM.integrator.step(PLANT, PROBLEM.period), true_response(PROBLEM).function
     memory, x, u, calm = stepper.start(), np.array(PROBLEM.start_state), np.zeros(2), np.zeros(2)
     positions = []
     for k in range(cycles):
