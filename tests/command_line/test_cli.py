@@ -82,29 +82,6 @@ def test_list_and_help(capsys):
     assert stop.value.code == 0
 
 
-BAD = {
-    "misspelt parameter": (("p.k * q.y", "p.kk * q.y"), "parameter 'kk' is unknown. Did you mean 'k'"),
-    "misspelt input": (("u.u", "u.v"), "input 'v' is unknown"),
-    "approximate None": (("approximate=1.0", "approximate=None"), "Parameter.approximate: expected a number, got None"),
-    "misspelt public name": (("fp.Sigmoid", "fp.Sigmod"), "Did you mean 'Sigmoid'"),
-    "raises on import": (("tracking =", "1 / 0\ntracking ="), "line.py, line 20: 1 / 0"),
-    "syntax error": (("problem = fp", "problem = = fp"), "line.py, line 14"),
-    "no controllers": (("controllers =", "others ="), "it must define controllers"),
-    "start not finite": (('"y": 0.5', '"y": float("nan")'), "Problem.start['y']: expected a number, got nan"),
-    "unknown field": (("measure_from", "measure_form"), "measure_form"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_problem_files(case, folder, capsys):
-    """One clear error with the user's own line where there is one; exit code 2; nothing written."""
-    (old, new), message = BAD[case]
-    _write(folder, old, new)
-    assert main(["compare", "line.py"]) == 2
-    assert message in capsys.readouterr().err
-    assert not (folder / "results").exists()
-
-
 def test_wrong_sign_of_the_gain_is_explained(folder, capsys):
     """It is refused before anything runs, naming the controller, the right sign and the admissible gains."""
     _write(folder, "gain=-0.5", "gain=0.5, scale=1.0")
@@ -113,22 +90,6 @@ def test_wrong_sign_of_the_gain_is_explained(folder, capsys):
     assert "controller 'CTC+FPI'" in printed
     assert "wrong sign" in printed
     assert "negative gain" in printed
-    assert not list(folder.rglob("report.html"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["compare", "two_mas"], "Did you mean 'two_mass'"),
-        (["compare", "nowhere/x.py"], "no file at 'nowhere/x.py'"),
-        (["compare", "line.py", "--controllers", "CTC+FPY"], "Did you mean 'CTC+FPI'"),
-        (["run", "line.py", "CCT"], "Did you mean 'CTC'"),
-    ],
-)
-def test_bad_arguments(arguments, message, folder, capsys):
-    """Exit code 2, the nearest valid name, nothing written."""
-    assert main(arguments) == 2
-    assert message in capsys.readouterr().err
     assert not list(folder.rglob("report.html"))
 
 

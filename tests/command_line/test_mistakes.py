@@ -1,7 +1,7 @@
 """Typical mistakes in problem files: each is refused with its file and line, its cause and how to mend it, and without a traceback.
 
 Each case changes one place of a correct file. What stands in a message is what a user needs: the line of the change, what is wrong
-there, and what to write instead.
+there, and what to write instead. `test_wrong_files` has the mistakes of people who come from other tools.
 """
 
 from __future__ import annotations
@@ -73,27 +73,11 @@ MISTAKES = {
         "lambda t: 0.5",
         "reference must return {name: expression}, got 0.5",
     ),
-    "reference that is a function": Mistake(
-        'fp.Trajectory(lambda t: {"y": ca.sin(t), "z": 0.1 * ca.cos(t)})',
-        'lambda t: {"y": t, "z": t}',
-        "Problem.reference: expected a Reference, got the function",
-    ),
     "reference without a coordinate": Mistake(
         '"z": 0.1 * ca.cos(t)', "", "coordinate 'z' has no nominal motion", "add 'z' to the reference"
     ),
-    "predicted with a mapping": Mistake(
-        "fp.Predicted(fp.ComputedTorque(tracking), inputs=0.01)",
-        'fp.Predicted(fp.ComputedTorque(tracking), {"u": 0.3})',
-        "Predicted.inputs: expected a number, got {'u': 0.3}",
-    ),
     "negative weight": Mistake(
         '"z": 10.0, "y\'": 0.1}', '"z": -10.0}', "the weight of 'z' must be a finite number of at least 0, got -10.0"
-    ),
-    "misspelt weight": Mistake('"z": 10.0, "y\'": 0.1}', '"zz": 10.0}', "states: 'zz' is unknown", "Did you mean 'z'?"),
-    "list of controllers": Mistake(
-        'headline = ("CTC", "CTC+FPI")',
-        "controllers = list(controllers.values())",
-        "it must define controllers = {'name': fpirhc.ComputedTorque(...), ...}, got [",
     ),
     "limits that no number meets": Mistake(
         '"force": (-20.0, 20.0)',
@@ -104,40 +88,15 @@ MISTAKES = {
     "limits by one number": Mistake(
         '"force": (-20.0, 20.0)', '"force": 20.0', "Limits.inputs['force']: expected (a number, a number)"
     ),
-    "limits the wrong way round": Mistake(
-        '"force": (-20.0, 20.0)', '"force": (20.0, -20.0)', "lower 20.0 above upper -20.0", "swap them"
-    ),
-    "vanishing period": Mistake("period=1e-2", "period=1e-300", "Problem.period: expected a number from 1e-12 to 1e12"),
-    "endless duration": Mistake(
-        "duration=0.1", "duration=1e300", "Problem.duration: expected a number from 1e-12 to 1e12"
-    ),
     "too many cycles": Mistake("duration=0.1", "duration=1e9", "more than 1e+09 cycles", "shorten it"),
-    "number as a text": Mistake(
-        "period=1e-2", 'period="1e-2"', "expected a number from 1e-12", "write 1e-2 without quotes"
-    ),
     "comma behind a number": Mistake(
         "gain=-0.2, scale", "gain=(-0.2,), scale", "Sigmoid.gain: expected a number", "remove the comma"
-    ),
-    "negative iterations": Mistake(
-        "iterations=1", "iterations=-3", "FixedPoint.iterations: expected a whole number from 1"
     ),
     "stages with a point": Mistake("stages=4", "stages=4.0", "Horizon.stages: expected a whole number", "write 4"),
     "zero accuracy": Mistake(
         "fp.FixedPoint(iterations=1, tolerance=1e-2)",
         "fp.Ipopt(accuracy=0)",
         "Ipopt.accuracy: expected a number above 0",
-    ),
-    "misspelt field": Mistake(
-        "measure_from=0.02",
-        "measured_from=0.02",
-        "Problem has no field 'measured_from'",
-        "Did you mean 'measure_from'?",
-    ),
-    "missing field": Mistake(
-        "fp.Exponential(rate=6.0)", "fp.Exponential()", "Exponential needs rate", "write Exponential(rate=...)"
-    ),
-    "misspelt class": Mistake(
-        "fp.Exponential(", "fp.Exponental(", "fpirhc has no name 'Exponental'", "Did you mean 'Exponential'?"
     ),
     "if on a symbol": Mistake(
         "u.lift / p.mass - 9.81",
@@ -160,20 +119,11 @@ MISTAKES = {
         "Affine.gain: expected a number, got a CasADi symbol",
         "a setting is a number",
     ),
-    "response of too few arguments": Mistake(
-        "def response(q, v, u, p):",
-        "def response(q, u, p, v=0, *, w):",
-        "response takes 5 argument(s)",
-        "response(q, v, u, p)",
-    ),
     "response that returns nothing": Mistake(
         'return {"y"', '_ = {"y"', "response must return {name: expression}, got None", "return"
     ),
     "misspelt parameter": Mistake(
         "p.friction", "p.fricton", "parameter 'fricton' is unknown", "Did you mean 'friction'?"
-    ),
-    "problem under another name": Mistake(
-        "problem = fp.Problem(", "task = fp.Problem(", "it must define problem", "call it 'problem'"
     ),
     "headline of one name": Mistake('("CTC", "CTC+FPI")', '"CTC"', "headline must be a pair of names"),
     "program ended by the file": Mistake(
@@ -200,9 +150,9 @@ def test_a_typical_mistake_is_explained_in_place(name, tmp_path, monkeypatch, ca
     assert mistake.cause in said
     assert mistake.mend in said
     assert "Traceback" not in said
-    # A definition that is missing has no line; everything else has the line of its statement or of the change itself.
+    # The line is that of the statement or of the change itself.
     lines = {int(number) for number in re.findall(r"line (\d+)", said)}
-    assert lines & _possible_lines(text, SOURCES.index(mistake.old)) or "it must define problem" in said
+    assert lines & _possible_lines(text, SOURCES.index(mistake.old))
 
 
 def _possible_lines(text: str, place: int) -> set[int]:
@@ -367,7 +317,7 @@ def test_the_file_without_mistakes_is_accepted(tmp_path):
 
 @pytest.mark.filterwarnings("ignore")
 def test_random_mistakes_never_end_in_a_raw_error(tmp_path, monkeypatch):
-    raw = [raw_error(tmp_path / "mine.py", seed, monkeypatch) for seed in range(300)]
+    raw = [raw_error(tmp_path / "mine.py", seed, monkeypatch) for seed in range(120)]
     assert [one for one in raw if one] == []
 
 

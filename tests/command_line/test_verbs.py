@@ -123,11 +123,6 @@ def test_another_package_replaces_no_command(other_package, capsys):
     assert "adds a command 'list', which exists: ignored" in printed.err
 
 
-def test_unknown_commands_get_the_nearest_name(capsys):
-    assert main(["comapre", "two_mass"]) == ExitCode.BAD_INPUT
-    assert "Did you mean 'compare'?" in capsys.readouterr().err
-
-
 # --- Help -------------------------------------------------------------------------------------------------------------
 
 
