@@ -21,6 +21,7 @@ from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.symbolic.live import LiveNumber, Number
 
 _POWER_STEPS = 50
+_RUNS_AWAY = 2e3  # times that a motion of the model grows over the horizon
 _MARGIN = 1.1  # a power iteration approaches the eigenvalue from below
 
 
@@ -88,6 +89,13 @@ class OptimalControl:
     def scale(self) -> np.ndarray:
         """D = 1 / (step c), shape (nu,): it turns a gradient into a move of the inputs."""
         return 1 / (self.step * self.curvature)
+
+    @property
+    def measured_at_rest(self) -> OptimalControl:
+        """The problem whose D is that of later inputs at rest, for plans with states of their own: a model that runs away enlarges
+        what their inputs are rounded by, and D with answers would call them not solved.
+        """
+        return self if self.settings else replace(self, curvature=curvature_at_rest(self.along, self.step))
 
     @cached_property
     def steepest(self) -> float:
@@ -260,7 +268,20 @@ def expand_along(
 
 
 def input_curvature(along: _ReferenceExpansion, step: float) -> np.ndarray:
-    """Return c (nu,), positive.
+    """Return c (nu,), positive, that of later inputs at rest.
+
+    Where the model runs away over the horizon that is no measure of a plan, because every plan looks stationary: there it is the
+    curvature that is left once all later inputs answer.
+    """
+    rest = curvature_at_rest(along, step)
+    if not np.prod(along.growth()) > _RUNS_AWAY:
+        return rest
+    answered = answered_curvature(along) / step
+    return np.where(np.isfinite(answered) & (answered > 0), answered, rest)
+
+
+def curvature_at_rest(along: _ReferenceExpansion, step: float) -> np.ndarray:
+    """Return the curvature of the cost rate along the first stage's inputs (nu,), positive, with later inputs at rest.
 
     An input without curvature gets the largest curvature of the others, or 1 where no input has one.
     """
@@ -271,6 +292,15 @@ def input_curvature(along: _ReferenceExpansion, step: float) -> np.ndarray:
     total = np.abs(total + np.einsum("ik,ij,jk->k", slope, along.final, slope)) / step
     usable = np.isfinite(total) & (total > 0)
     return np.where(usable, total, total[usable].max() if usable.any() else 1.0)
+
+
+def answered_curvature(along: _ReferenceExpansion) -> np.ndarray:
+    """Return the diagonal of Q_uu (nu,) of the first stage, by a Riccati sweep; it may be no positive number."""
+    value = along.final
+    for a, b, q, s, r in zip(*(v[::-1] for v in (along.a, along.b, along.q, along.s, along.r)), strict=True):
+        q_uu, cross = r + b.T @ value @ b, s + b.T @ value @ a
+        value = q + a.T @ value @ a - cross.T @ np.linalg.lstsq(q_uu, cross, rcond=None)[0]
+    return np.asarray(q_uu.diagonal())
 
 
 def steepest_curvature(along: _ReferenceExpansion, scale: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.problem import OptimalControl, answered_curvature
 from fpirhc.horizon.riccati import Expansion
 from fpirhc.optimisers.base import FEASIBLE, KEPT, clip
 from fpirhc.symbolic.expression import FINITE, is_finite
@@ -89,13 +89,8 @@ def tolerated(ocp: OptimalControl) -> np.ndarray:
 
 
 def _answered_curvature(ocp: OptimalControl) -> np.ndarray:
-    """Diagonal of Q_uu (nu,) of the first stage, by a Riccati sweep along the reference."""
-    along = ocp.along
-    value = along.final
-    for a, b, q, s, r in zip(*(v[::-1] for v in (along.a, along.b, along.q, along.s, along.r)), strict=True):
-        q_uu, cross = r + b.T @ value @ b, s + b.T @ value @ a
-        value = q + a.T @ value @ a - cross.T @ np.linalg.lstsq(q_uu, cross, rcond=None)[0]
-    diagonal = q_uu.diagonal()
+    """The curvature (nu,) along the inputs of the first stage once later inputs answer; that of later inputs at rest else."""
+    diagonal = answered_curvature(ocp.along)
     usable = np.isfinite(diagonal) & (diagonal > 0)
     return np.where(usable, diagonal, ocp.step * ocp.curvature)
 

@@ -29,7 +29,7 @@ from fpirhc.symbolic.live import settled
 _DIGITS = 1e-15  # relative rounding of a number
 _MOST_LIMITED = 1000  # iterations of one open-loop call with limits of states
 _FIRST_CALLS = 5  # of `converging`, before a run
-_GROWTH = 1e8  # of a motion of the model over the horizon, beyond which half the digits of a plan's gradient are lost
+_GROWTH = 1e12  # of a motion of the model over the horizon, beyond which rollouts of plans leave their gradients too few digits
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
 

@@ -148,7 +148,7 @@ class MultipleShooting(Optimiser):
         )
         inputs = clip(separate(ocp, solution["x"])[1], lower, upper)
         multipliers = separate(ocp, solution["lam_x"])[0][:, 1:] * int(ocp.bounds_states)
-        cost, residual, violation = judge(ocp)(inputs, s0, data, lower, upper, multipliers)
+        cost, residual, violation = judge(ocp.measured_at_rest)(inputs, s0, data, lower, upper, multipliers)
         finite = is_finite(ca.vertcat(ca.vec(inputs), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
         plan = ca.if_else(finite, inputs, start)
         numbers = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))

@@ -8,6 +8,11 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
+from fpirhc.optimisers.base import judge
+from fpirhc.optimisers.plan import solve
+from fpirhc.status import Status
 
 INERTIA = 2.25e-4  # kg m^2
 SPRINGS = 2.697e-3, 2.66e-3, 3.05e-3, 2.86e-3  # N m/rad: motor to disc, between discs, disc to motor
@@ -104,7 +109,33 @@ def test_a_plant_that_runs_away_itself_is_planned_with_states_of_its_own():
     np.testing.assert_allclose(run["state"], other["state"], atol=1e-4)
 
 
-def test_a_plant_that_runs_away_itself_is_refused_without_them():
+@pytest.mark.parametrize("horizon", [1.6, 3.0, 4.0])
+def test_a_plant_that_runs_away_itself_is_planned_without_them(horizon):
+    """Every plan, the first one too, is that of IPOPT and OK: a plan that lets the pendulum fall does not look stationary."""
+    problem = pendulum(0.25, horizon, {})
+    ocp, first, data = posed(problem)
+    for tolerance in (1e-4, 1e-8):
+        plan = solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance), first, data)
+        best = solve(ocp, fp.Ipopt(tolerance=1e-8), first, data)
+        assert plan.status is best.status is Status.OK
+        assert plan.cost == pytest.approx(best.cost, rel=1e-6)
+    judged = judge(ocp)(np.zeros((1, ocp.stages)), first, data, -20.0, 20.0, np.zeros((2, ocp.stages)))
+    assert float(judged[1]) > 1.0  # N m, of the plan without torque
+    run = fp.simulate(problem, PLANNED, seed=0, compiled=False)
+    other = fp.simulate(problem, fp.RecedingHorizon(fp.Ipopt(tolerance=1e-8)), seed=0, compiled=False)
+    assert set(fp.measure(problem, run).statuses) == {"OK"}
+    np.testing.assert_allclose(run["state"], other["state"], atol=1e-4)
+
+
+def test_a_plant_that_runs_away_too_far_is_refused_without_them():
     """A gradient by rollouts has no digits there, whatever the integrator; the message says what helps."""
     with pytest.raises(NotSupported, match=r"limit a state, however widely, Limits\(states="):
-        fp.simulate(pendulum(0.25, 4.0, {}), PLANNED, seed=0)
+        fp.simulate(pendulum(0.25, 6.0, {}), PLANNED, seed=0)
+
+
+def posed(problem):
+    """The first horizon of a problem: the optimal control problem, its first state, and the data of its stages."""
+    own = problem.plant, problem.reference, problem.horizon, problem.cost
+    ocp = transcribe(*own, problem.limits, None, problem.start_state)
+    data = np.asarray(stage_data(*own)(0.0, problem.plant.approximate).full())
+    return ocp, np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel(), data

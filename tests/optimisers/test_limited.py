@@ -15,6 +15,7 @@ from judging import Judge
 from plants import known
 
 import fpirhc as fp
+from fpirhc.horizon.problem import curvature_at_rest
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.bounds import scales
@@ -261,7 +262,7 @@ def test_a_horizon_that_cannot_be_kept_ends_with_the_least_violation():
 def test_scales_do_not_grow_with_the_horizon_of_an_unstable_plant():
     """C is the curvature with later inputs answering: for the pendulum it stays, where the open-loop one is 1e4 times as large."""
     ocp, _, _ = first_horizon("pendulum")
-    assert scales(ocp).cost < 1e-3 * float(ocp.step * ocp.curvature[0]) * 15.0**2
+    assert scales(ocp).cost < 1e-3 * float(ocp.step * curvature_at_rest(ocp.along, ocp.step)[0]) * 15.0**2
 
 
 @pytest.mark.parametrize("start", [3, 13])
