@@ -1,0 +1,146 @@
+"""A problem as a Gymnasium environment: its plant, disturbances, dead times and sensors, with the commands of somebody else.
+
+The environment is the closed loop of the problem around a controller that sends the action: a policy meets what a controller does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fpirhc.adapters.names import package
+from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import NotSupported
+from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.simulation.ranges import ranges_of
+from fpirhc.simulation.simulate import disturbance_table, sensing_table
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+
+_ACTION, _JUDGED = "_action", "_action_status"
+Reward = Callable[[Mapping[str, np.ndarray]], float]
+
+
+def as_env(problem: Problem, *, reward: Reward | None = None) -> Any:
+    """Return a problem as a Gymnasium environment.
+
+    An action is the command of one cycle, in the units and within the limits of the inputs. An observation has the measured state
+    and the reference of the judged coordinates. An episode is truncated after the problem's duration, and terminated where a state
+    leaves its physical range or the error is a million times the reference. `info` has every signal of the cycle, by name.
+
+    Args:
+        problem: the task; limits of its inputs are those of the actions.
+        reward: function of the signals at the end of a step; None: minus the sum of the squared errors.
+
+    Raises:
+        NotSupported: Gymnasium is not installed, or the plant is an object outside.
+    """
+    gymnasium = package("gymnasium")
+    if problem.foreign is not None:
+        raise NotSupported("as_env: the plant is an object outside; make the environment from that object itself")
+    play = _Play(problem, reward or _squared_error)
+    low, high = (np.array(ends, dtype=float) for ends in problem.limits.input_ends(problem.plant))
+
+    base: Any = gymnasium.Env
+
+    class Environment(base):  # type: ignore[misc]  # the package may be missing
+        """The problem, one control cycle a step."""
+
+        metadata: Mapping[str, Any] = {"render_modes": []}
+        action_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (play.observation.size,), dtype=np.float64)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+            """Go to the problem's start; the seed is that of its noise."""
+            super().reset(seed=seed, options=options)
+            play.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
+            return play.observation, play.signals
+
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, np.ndarray]]:
+            """Send the action, and measure at the end of the cycle."""
+            gone = play.step(np.asarray(action, dtype=float))
+            return play.observation, play.reward, gone, play.cycle >= problem.cycles, play.signals
+
+    return Environment()
+
+
+class _Play:
+    """One run of the loop, cycle by cycle, with the command of somebody else.
+
+    Args:
+        problem: the task.
+        reward: of the signals.
+    """
+
+    def __init__(self, problem: Problem, reward: Reward) -> None:
+        self._problem, self._reward = problem, reward
+        self._loop = close_loop(problem, _Sent())
+        self._step, self._ranges = Evaluator(self._loop.function), ranges_of(problem, self._loop.trace)
+        self._place = self._loop.memory.slice(_ACTION)
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Go to the start."""
+        self.cycle, cycles = 0, self._problem.cycles + 1
+        tables = disturbance_table(self._problem, seed, cycles), sensing_table(self._problem, seed, cycles)
+        self._tables = [table for table in tables if table.shape[1]]
+        self._memory = start_memory(self._loop, self._problem, _Sent())
+        self._measure()
+
+    def step(self, action: np.ndarray) -> bool:
+        """Hold a command for a cycle, and return whether the plant is gone."""
+        self._memory[self._place] = action
+        self._memory, sent = self._step(self._memory, *(table[self.cycle] for table in self._tables))
+        self.cycle += 1
+        self._measure()
+        finite = np.isfinite(self._memory).all() and np.isfinite(sent).all()
+        return not finite or self._ranges.first_outside(self._row[np.newaxis]) is not None
+
+    def _measure(self) -> None:
+        """Sense at the beginning of the cycle that comes; sensors do not depend on its command."""
+        _, row = self._step(self._memory, *(table[self.cycle] for table in self._tables))
+        self._row = row.ravel()
+        self.signals = self._loop.trace.unpack(self._row)
+        self.observation = np.concatenate([np.ravel(self.signals[name]) for name in ("state", "reference")])
+        self.reward = float(self._reward(self.signals))
+
+
+def _squared_error(signals: Mapping[str, np.ndarray]) -> float:
+    return -float(np.sum(signals["error"] ** 2))
+
+
+@dataclass(frozen=True)
+class _Sent(Controller):
+    """The command that stands in its memory."""
+
+    @property
+    def deformation(self) -> Deformation:
+        """Identity(): nothing is deformed."""
+        return Identity()
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Return the blocks reference, sent, limit, judge, running."""
+        plant, action = problem.plant, Signal(_ACTION, problem.plant.input.elements, problem.plant.input.units)
+        closing, delays = commanding_blocks(problem, [scalar(_JUDGED)])
+        responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
+
+        def step(s: Signals) -> dict[str, Expression]:
+            response = plant.controlled_response_function(s.state, s._action, s.parameters)
+            return {
+                **{r.name: response for r in responses},
+                "command_unclipped": s._action,
+                _JUDGED: Expression(int(Status.OK)),
+            }
+
+        writes = Layout((*responses, like(plant.input, "command_unclipped"), scalar(_JUDGED)))
+        sent = Block("sent", Layout((action, plant.state, plant.parameter)), writes, step)
+        return [reference_block(problem), sent, *closing], [*delays, Delay(action, _ACTION)]

@@ -1,0 +1,60 @@
+"""A problem as a Gymnasium environment: the commands of a run give the motion of the run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.adapters.environment import as_env
+from fpirhc.controllers.base import Controller
+
+pytest.importorskip("gymnasium", reason="it needs the extra fpirhc[outside]")
+
+
+def task(name: str) -> tuple[fp.Problem, Controller]:
+    loaded = fp.load_problem(name)
+    problem = replace(loaded.problem, duration=30 * loaded.problem.period, measure_from=0.0)
+    return problem, loaded.controllers["CTC"] if "CTC" in loaded.controllers else next(
+        iter(loaded.controllers.values())
+    )
+
+
+@pytest.mark.parametrize("name", ["two_link_arm", "delayed_mass", "noisy_motor", "leaking_tanks", "freeway"])
+def test_the_commands_of_a_run_give_its_motion(name):
+    """Dead time, noise and quantisation of the sensors, physical ranges, a map: bit by bit."""
+    problem, controller = task(name)
+    run = fp.simulate(problem, controller, seed=5, compiled=False)
+    env = as_env(problem)
+    env.reset(seed=5)
+    for command, state in zip(run["command"][:-1], run["state"][1:], strict=True):
+        seen, _, terminated, _, signals = env.step(command)
+        assert not terminated
+        assert np.array_equal(signals["state"], state)
+        assert np.array_equal(seen[: state.size], state)
+
+
+@pytest.mark.filterwarnings("ignore:.*WARN")
+def test_gymnasium_finds_nothing_wrong():
+    from gymnasium.utils.env_checker import check_env
+
+    check_env(as_env(task("two_link_arm")[0]), skip_render_check=True)
+
+
+def test_seeds_repeat_and_an_episode_ends_in_time():
+    env = as_env(task("noisy_motor")[0])
+    episodes = []
+    for seed in (1, 1, 2):
+        seen, _ = env.reset(seed=seed)
+        rows, over = [seen], False
+        while not over:
+            seen, reward, terminated, over, signals = env.step(np.zeros(env.action_space.shape))
+            assert reward == pytest.approx(-float(signals["error"] @ signals["error"]))
+            assert not terminated
+            rows.append(seen)
+        episodes.append(np.array(rows))
+    assert len(episodes[0]) == 31
+    assert np.array_equal(episodes[0], episodes[1])
+    assert not np.array_equal(episodes[0], episodes[2])
