@@ -7,8 +7,7 @@ import re
 from pathlib import Path
 
 from fpirhc.cli.discovery import shipped
-from fpirhc.cli.exit_codes import ExitCode, markdown_table
-from fpirhc.cli.verb import Verb
+from fpirhc.cli.verb import ExitCode, Verb, markdown_table
 
 PAGE = Path(__file__).resolve().parent / "command-line.md"
 README = PAGE.parents[1] / "README.md"

@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 
-from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.verb import ExitCode
 
 REPORT = "please report it on the project's issue page, with the command line and what --debug prints"
 

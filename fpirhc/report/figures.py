@@ -34,10 +34,12 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Contraction, Entry
     from fpirhc.studies.open_loop import Solved
+    from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
     from fpirhc.task.problem import Problem
 
     Draw: TypeAlias = Callable[[Axes, Run, Sequence[str]], None]
 
+_GROUPS = 6  # of scenarios with similar mismatch, whose medians are joined by a line
 _WIDE = 16.5  # inches, of a picture as wide as the page
 _CYCLES = 150  # of the decay of a response error
 _BEYOND = 1.2  # of the linear limit, up to which the factor is drawn
@@ -298,3 +300,28 @@ def _draw_factor(axis: Axes, name: str, scale: float, entries: Sequence[Entry], 
     axis.set_title("Predicted factor; o predicted, x measured", fontsize=10)
     axis.grid(visible=True, alpha=0.25)
     draw_legend(axis)
+
+
+def mismatch_figure(comparison: ScenarioComparison) -> Figure:
+    """Return the figure of the error of every scenario against its mismatch, one colour per controller."""
+    figure = new_figure(9, 4.8, f"{comparison.problem}: error against mismatch, {comparison.count} scenarios")
+    axis = figure.subplots()
+    finite = np.concatenate([s.errors[np.isfinite(s.errors)] for s in comparison.summaries])
+    edge = 200 * float(finite.max(initial=1e-3))
+    for k, one in enumerate(comparison.summaries):
+        colour, ended = PALETTE[k % len(PALETTE)], ~np.isfinite(one.errors)
+        x, y = 100 * one.mismatch, 100 * one.errors
+        axis.semilogy(x[~ended], y[~ended], "o", color=colour, ms=3, alpha=0.5)
+        axis.semilogy(x[ended], np.full(ended.sum(), edge), "x", color=colour, ms=6)
+        axis.semilogy(*_medians(x[~ended], y[~ended]), "-", color=colour, lw=1.5, label=literal(one.name))
+    axis.set_xlabel("mismatch between model and plant [%]")
+    axis.set_ylabel("rms error [% of the reference's range]")
+    axis.grid(visible=True, alpha=0.25)
+    axis.legend(fontsize=8, framealpha=0.8)
+    return figure
+
+
+def _medians(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:
+    order = np.argsort(x)
+    groups = [g for g in np.array_split(order, min(_GROUPS, max(1, x.size // 3))) if g.size]
+    return [float(np.median(x[g])) for g in groups], [float(np.median(y[g])) for g in groups]

@@ -1,4 +1,4 @@
-"""The page of a comparison: verdict first, then the tables, linked charts, pictures, settings."""
+"""The pages of comparisons and of scenarios: verdict first, then the tables, charts, pictures, settings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.errors import InvalidName
-from fpirhc.report.figures import contraction_figure, lyapunov_figure, pair_figures
+from fpirhc.report.figures import contraction_figure, lyapunov_figure, mismatch_figure, pair_figures
 from fpirhc.report.page import Image, asset, picture, render_page, write_page
 from fpirhc.report.series import chart_data
 from fpirhc.simulation.drawing import BANDS, PALETTE
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Entry
+    from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 
 _CAPTIONS = {
     "Trajectory tracking": "Nominal (dashed) and realised motion over time.",
@@ -34,6 +35,13 @@ _LYAPUNOV = (
     "measured part. A small response error keeps V near zero."
 )
 _CONTRACTION = "Predicted contraction factor against the gain, and the response error's decay"
+
+
+_MISMATCH = (
+    "One point per scenario and controller; lines join medians of scenarios with similar mismatch, crosses at the upper edge "
+    "are runs that ended early. Mismatch: rms over the parameters of the relative distance between the model and the drawn "
+    "plant. Error: rms error divided by the reference's range, root mean square over the coordinates."
+)
 
 
 def write_report(comparison: Comparison, path: Path) -> None:
@@ -130,3 +138,19 @@ def _new_numbers(entry: Entry) -> Iterator[tuple[float, str, float]]:
     for time, numbers in entry.run.in_force:
         yield from ((time, path, value) for path, value in numbers.items() if last.get(path) != value)
         last = numbers
+
+
+def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
+    """Write the report, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_page(render_scenarios(comparison), path)
+
+
+def render_scenarios(comparison: ScenarioComparison) -> str:
+    """Return the page's text."""
+    figure = mismatch_figure(comparison) if comparison.summaries else None
+    chart = picture(figure, "Error against mismatch", _MISMATCH) if figure else None
+    return render_page("scenarios.html", comparison.view, chart=chart)

@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from fpirhc.cli.completion import SHELLS, script
 from fpirhc.cli.discovery import shipped
 from fpirhc.cli.main import main
+from fpirhc.cli.verbs.completion import SHELLS, script
 from fpirhc.errors import NotSupported
 
 ASK = """

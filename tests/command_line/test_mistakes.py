@@ -22,8 +22,8 @@ from mutated_problems import SOURCE
 from raw_errors import raw_error
 
 import fpirhc as fp
-from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.main import main
+from fpirhc.cli.verb import ExitCode
 from fpirhc.controllers.contract import checked
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidField

@@ -18,8 +18,8 @@ import fpirhc as fp
 from fpirhc.cli import discovery
 from fpirhc.cli import verbs as package
 from fpirhc.cli.discovery import shipped
-from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode
 from fpirhc.cli.main import main
+from fpirhc.cli.verb import OF_EVERY_VERB, ExitCode
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 VERBS = tuple(shipped().values())
 THEIRS = """
 import argparse
-from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.verb import ExitCode
 from fpirhc.cli.verb import Verb
 
 def add(parser):

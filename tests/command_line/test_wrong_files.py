@@ -15,8 +15,8 @@ import pytest
 from first_files import PENDULUM, REACTOR, TANKS
 
 import fpirhc as fp
-from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.main import main
+from fpirhc.cli.verb import ExitCode
 from fpirhc.errors import OF_OTHER_TOOLS
 from fpirhc.fields.checked import Checked, field_names
 

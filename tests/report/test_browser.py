@@ -18,8 +18,7 @@ from plants import chain, linear
 
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.html import write_report
-from fpirhc.report.scenarios import write_scenarios
+from fpirhc.report.html import write_report, write_scenarios
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 

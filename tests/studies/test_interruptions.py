@@ -14,8 +14,8 @@ import pytest
 from test_scenarios import LINE
 
 import fpirhc as fp
-from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.main import main
+from fpirhc.cli.verb import ExitCode
 from fpirhc.symbolic.evaluate import unwrapped
 
 COMMAND = [

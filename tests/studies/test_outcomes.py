@@ -10,8 +10,7 @@ import pytest
 from fpirhc.report.page import asset, css_class
 from fpirhc.report.terminal import STYLES
 from fpirhc.studies.comparison.outcome import Outcome
-from fpirhc.studies.scenarios.bootstrap import ConfidenceInterval
-from fpirhc.studies.scenarios.paired import Summary, verdict
+from fpirhc.studies.scenarios.paired import ConfidenceInterval, Summary, verdict
 
 
 def summary(name: str, interval: tuple[float, float] | None) -> Summary:

@@ -14,8 +14,7 @@ from fpirhc.baselines.baseline import settings_of
 from fpirhc.errors import InvalidProblem
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.figures import pair_figures, plan_figure
-from fpirhc.report.html import headline_pair, render
-from fpirhc.report.scenarios import render_scenarios
+from fpirhc.report.html import headline_pair, render, render_scenarios
 from fpirhc.report.series import chart_data
 from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare

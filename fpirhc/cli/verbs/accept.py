@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_baselines, add_no_compile, add_problem, add_processes, add_seed
-from fpirhc.cli.verb import Verb
+from fpirhc.cli.verb import ExitCode, Verb
 
 
 def _add(parser: argparse.ArgumentParser) -> None:

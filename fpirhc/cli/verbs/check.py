@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_baselines, add_no_compile, add_processes
-from fpirhc.cli.verb import Verb
+from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
     from fpirhc.baselines.judging import Judgement

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.exit_codes import ExitCode
-from fpirhc.cli.verb import Verb
+from fpirhc.cli.verb import ExitCode, Verb
 
 
 def _add(parser: argparse.ArgumentParser) -> None:

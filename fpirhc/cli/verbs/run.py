@@ -6,10 +6,9 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_no_compile, add_out, add_problem, add_seed
 from fpirhc.cli.output import results_folder
-from fpirhc.cli.verb import Verb
+from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
     from fpirhc.controllers.base import Controller

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_optimisers, add_out, add_problem
 from fpirhc.cli.output import results_folder
-from fpirhc.cli.verb import Verb
+from fpirhc.cli.verb import ExitCode, Verb
 
 
 def _add(parser: argparse.ArgumentParser) -> None:

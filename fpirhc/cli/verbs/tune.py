@@ -6,10 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_controllers, add_mismatch, add_out, add_problem, add_scenarios, add_seed
 from fpirhc.cli.output import results_folder, resumable
-from fpirhc.cli.verb import Verb
+from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
     from fpirhc.studies.tuning.tune import Tuning

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
+
+import numpy as np
 
 from fpirhc.controllers.contract import Controller, checked, resolved
 from fpirhc.describe import describe
@@ -18,10 +21,10 @@ from fpirhc.fields.kinds import CountOrZero
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.late import is_late, live_paths, roomy, scaled
-from fpirhc.simulation.metrics import measure
+from fpirhc.simulation.metrics import Metrics, measure
+from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.scenarios.draws import COMPARING, Scenario, draw, with_exact
-from fpirhc.studies.scenarios.score import outcome, ranges, relative_error
 from fpirhc.task.problem import Problem
 
 FORMAT = 3  # of records
@@ -203,3 +206,38 @@ def _finite(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {k: _finite(v) for k, v in value.items()}
     return value if abs(value) < float("inf") else None
+
+
+DIVERGED = 1.0  # relative error above which a run that lasted to its end has diverged: as large as the motion itself
+_SAMPLES = 2000
+
+
+def ranges(problem: Problem) -> dict[str, float]:
+    """Return the range of the reference of every judged coordinate.
+
+    The error at the start stands for it where that is larger, and 1 where both are zero.
+    """
+    plant = problem.plant
+    places = [plant.output.elements.index(c) for c in problem.judged_names]
+    function = problem.reference.function(plant)
+    times = np.linspace(0.0, problem.duration, _SAMPLES)
+    states = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full())[places]
+    sizes = np.maximum(np.ptp(states, axis=1), np.abs(states[:, 0] - problem.start_output[places]))
+    return {c: float(s) if s > 0 else 1.0 for c, s in zip(problem.judged_names, sizes, strict=True)}
+
+
+def relative_error(metrics: Metrics, sizes: dict[str, float]) -> float:
+    """Return the rms error divided by the reference's range, root mean square over the judged coordinates.
+
+    The error of a run that ended early is infinite, larger than that of every other run.
+    """
+    shares = [rms / sizes[c] for c, rms in metrics.rms_error.items()]
+    error = math.sqrt(math.fsum(s * s for s in shares) / len(shares))
+    return error if math.isfinite(error) else math.inf
+
+
+def outcome(run: Run, error: float) -> str:
+    """Return 'finished', 'diverged' or 'ended early'."""
+    if run.stop is not None:
+        return "ended early"
+    return "finished" if error <= DIVERGED else "diverged"
