@@ -339,7 +339,7 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
 
     Raises:
         InvalidProblem: an unknown name, no name, or a parameter that already has the name.
-        NotSupported: the disturbance of a state, which an inverse of the user's does not know.
+        NotSupported: a response that has a disturbance already.
     """
     mistakes = Mistakes("disturbed")
     responses = dict(zip(response_names(plant.face), plant.controlled_names, strict=True)) if plant.outputs else {}
@@ -352,11 +352,6 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
             mistakes.add(f"the plant has a parameter '{name}' already; rename it")
     mistakes.raise_if_any()
     coordinates = [n for n in names if n in plant.coordinates]
-    if plant.outputs and plant.inverse is not None and coordinates:
-        raise NotSupported(
-            f"disturbed: Plant(inverse=...) does not know the disturbance of {coordinates[0]}, of which outputs are expressions; "
-            f"leave the inverse out, or disturb an output ({', '.join(plant.outputs)})"
-        )
     units = {n: one.unit for n, one in plant.outputs.items()} | dict(
         zip(plant.names, plant.response_units, strict=True)
     )
@@ -365,14 +360,26 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
     added = {_disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
     next_states = None if plant.next is None else _next(plant, coordinates)
     response = _response(plant, coordinates) if next_states is None else _differences(plant, next_states)
-    return replace(
+    bare = replace(
         plant,
         parameters={**plant.parameters, **added},
         response=response,
         next=next_states,
-        inverse=None if plant.inverse is None else _inverse(plant, plant.inverse, names),
+        inverse=None,
         outputs={n: _output(plant, n, one, names) for n, one in plant.outputs.items()},
     )
+    given = plant.inverse
+    return bare if given is None or _mixed(bare, coordinates) else replace(bare, inverse=_inverse(plant, given, names))
+
+
+def _mixed(plant: Plant, coordinates: Sequence[str]) -> bool:
+    """Whether a coordinate's disturbance is in the response of another quantity, so that a user's inverse does not know it."""
+    x, u, p = plant.symbols()
+    own = [_disturbance_name(n) for n in coordinates]
+    pattern = ca.jacobian_sparsity(plant.controlled_response_function(x, u, p), p)
+    pairs = zip(*pattern.get_triplet(), strict=True)
+    parameters, controlled = plant.parameter.elements, plant.controlled_names
+    return any(parameters[k] in own and parameters[k] != _disturbance_name(controlled[i]) for i, k in pairs)
 
 
 def _disturbance_name(name: str) -> str:
@@ -435,9 +442,8 @@ def _inverse(
     plant: Plant, inverse: Callable[..., Mapping[str, Expression]], names: Sequence[str]
 ) -> Callable[..., Mapping[str, Expression]]:
     """The user's inverse for the response without its disturbance; that of an output itself changes no response."""
-    responses = zip(response_names(plant.face), plant.controlled_names, strict=True)
-    disturbs = dict(responses) if plant.outputs else dict.fromkeys(plant.names)
-    by = {disturbs[n] or n: _disturbance_name(n) for n in names if n in disturbs}
+    responses = dict(zip(response_names(plant.face), plant.controlled_names, strict=True))
+    by = {responses.get(n, n): _disturbance_name(n) for n in names if n in responses or n in plant.names}
 
     def undisturbed(*arguments: Named) -> Mapping[str, Expression]:
         *others, r, p = arguments
