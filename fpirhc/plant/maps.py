@@ -28,7 +28,6 @@ from typing import TypeVar, cast
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import expm
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.kinds import finite_number
@@ -139,6 +138,8 @@ def response_age(plant: Motion) -> int:
 
 def step_of(plant: Motion, matrix: np.ndarray, cycle: float) -> np.ndarray:
     """Return the matrix by which x' = A x moves in one control cycle, or delta x = A x in that of a map."""
+    from scipy.linalg import expm  # only here: the import takes longer than that of the whole package
+
     return np.asarray(expm(matrix * cycle)) if plant.step is None else np.eye(len(matrix)) + plant.sampling * matrix
 
 
