@@ -59,8 +59,7 @@ def check_live(
     short = replace(problem, duration=cycles * problem.period, measure_from=0.0)
     plain = simulator(short, controller, compiled=compiled).run(seed=0)
     tested = list(number_paths(problem, controller)) if paths is None else paths
-    together = _together(short, controller, tested, plain.log, compiled)
-    return together or tuple(_tried(short, controller, path, plain.log, compiled) for path in tested)
+    return _searched(short, controller, tested, plain.log, compiled)
 
 
 def number_paths(problem: Problem, controller: Controller) -> Iterator[str]:
@@ -79,40 +78,42 @@ def _paths(value: Any, start: str) -> Iterator[str]:
         yield from _paths(content, f"{start}{name}.")
 
 
-def _together(
+def _searched(
     problem: Problem, controller: Controller, paths: Sequence[str], plain: np.ndarray, compiled: bool
-) -> tuple[Tried, ...] | None:
-    """Change all numbers at once: two loops for all of them; None where each is to be tried alone, to find the lost one."""
-    tried: dict[str, Tried] = {}
-    ready = None
-    while ready is None and len(tried) < len(paths):
-        try:
-            ready = simulator(problem, controller, compiled=compiled, live=[p for p in paths if p not in tried])
-        except CompileError:
-            raise
-        except FpirhcError as error:
-            named = [p for p in paths if p not in tried and f"'{p}'" in str(error)]
-            if not named:
-                return None
-            tried |= {path: _tried(problem, controller, path, plain, compiled) for path in named}
-    if ready is None:
-        return tuple(tried[path] for path in paths)
-    changes: dict[str, float] = {}
-    for path in (p for p in paths if p not in tried):
-        factor = next((f for f in _FACTORS if _accepted(ready, {**changes, path: f * ready.live.start[path]})), None)
-        if factor is None:
-            tried[path] = _tried(problem, controller, path, plain, compiled)
-        else:
-            tried[path] = Tried(path, factor=factor)
-            changes[path] = factor * ready.live.start[path]
+) -> tuple[Tried, ...]:
+    """Try all numbers at once, and halves of them where one is refused or lost, so that few loops are built."""
+    if len(paths) < 2:
+        return tuple(_tried(problem, controller, path, plain, compiled) for path in paths)
+    apart = paths[: len(paths) // 2]
     try:
-        changed_problem, changed_controller, _ = ready.live.changed(changes)
-        rebuilt = simulator(changed_problem, changed_controller, compiled=compiled).run(seed=0)
-        pairs = ((ready.run(seed=0).log, plain), (ready.run(seed=0, settings=changes).log, rebuilt.log))
-    except FpirhcError:
-        return None
-    alike = all(np.array_equal(one, other, equal_nan=True) for one, other in pairs)
-    return tuple(tried[path] for path in paths) if alike else None
+        ready = simulator(problem, controller, compiled=compiled, live=paths)
+        together = _together(ready, paths, plain)
+        if together is not None:
+            return together
+    except CompileError:
+        raise
+    except FpirhcError as error:
+        named = [path for path in paths if f"'{path}'" in str(error)]
+        apart = named if 0 < len(named) < len(paths) else apart
+    rest = [path for path in paths if path not in apart]
+    tried = {t.path: t for part in (apart, rest) for t in _searched(problem, controller, part, plain, compiled)}
+    return tuple(tried[path] for path in paths)
+
+
+def _together(ready: Simulator, paths: Sequence[str], plain: np.ndarray) -> tuple[Tried, ...] | None:
+    """Change all numbers at once; None where the loop does not run as the one that is built with them."""
+    changes: dict[str, float] = {}
+    tried = []
+    for path in paths:
+        value = ready.live.start[path]
+        factor = next((f for f in _FACTORS if _accepted(ready, {**changes, path: value * f})), None)
+        if factor is not None:
+            changes[path] = value * factor
+        tried.append(Tried(path, factor=factor))
+    problem, controller, _ = ready.live.changed(changes)
+    rebuilt = simulator(problem, controller, compiled=ready.compiled).run(seed=0)
+    pairs = ((ready.run(seed=0).log, plain), (ready.run(seed=0, settings=changes).log, rebuilt.log))
+    return tuple(tried) if all(np.array_equal(one, other, equal_nan=True) for one, other in pairs) else None
 
 
 def _accepted(ready: Simulator, changes: dict[str, float]) -> bool:

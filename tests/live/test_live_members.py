@@ -127,7 +127,9 @@ def test_the_law_catches_a_lost_number():
             return request + 0.25 * (self.gain + nominal(self.gain)) * (response - desired), {}
 
     with pytest.raises(AssertionError, match=r"deformation\.gain.*differently"):
-        check_live(two_masses(), fp.ComputedTorque(TRACKING, Deaf(gain=-0.5)), paths=["deformation.gain"])
+        check_live(
+            two_masses(), fp.ComputedTorque(TRACKING, Deaf(gain=-0.5)), paths=["tracking.rate", "deformation.gain"]
+        )
 
 
 def test_a_symbol_turned_into_a_number_is_refused():
