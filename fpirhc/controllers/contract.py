@@ -29,7 +29,7 @@ from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
-from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.outside import External
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -302,9 +302,12 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
         NotSupported: a form of the deformation that cannot be used here; a
             response of the controller's own behind sensors or dead time.
     """
-    if not numbers_only and is_live(problem, controller):
-        checked(nominal(problem), nominal(controller))
-        return controller
+    build = nominal(controller)
+    ready = _checked(nominal(problem), build, numbers_only)
+    return ready if build is controller else controller
+
+
+def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
     check_outputs(problem, controller)
     ready = resolved(problem, controller)
     if numbers_only and ready.inner is None and ready.planner is not None:

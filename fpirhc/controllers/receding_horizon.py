@@ -42,9 +42,9 @@ from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
-from fpirhc.symbolic.functions import nan_where
+from fpirhc.symbolic.functions import nan_where, numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, is_live, live_numbers, nominal, settled
+from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, live_numbers, nominal, settled
 from fpirhc.task.outside import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_stage
 
@@ -218,7 +218,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         return Derived(signals, first, {name: _STALE[name] for name in signals})
 
     own = memory + Layout((scalar("plan_begun"),))
-    live = derived if ocp.settings or is_live(problem.limits) else None
+    live = derived if ocp.settings or ocp.live_bounds else None
     return Block("plan", _plan_reads(problem, ocp), Layout(writes), step, own, opaque=True, derived=live)
 
 
@@ -296,9 +296,7 @@ def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: S
 
 def _minus(ends: Sequence[float], shift: Expression) -> Expression:
     """Limits, which may be live, minus a column."""
-    if is_live(ends):
-        return ca.vertcat(*(end - shift[k] for k, end in enumerate(ends)))
-    return ca.DM(np.array(ends)) - shift
+    return numbers(ends, shift) - shift
 
 
 def _feedforward(problem: Problem) -> ca.Function:

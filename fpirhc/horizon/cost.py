@@ -22,7 +22,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Named
-from fpirhc.symbolic.live import DERIVED, is_live, live_number, nominal
+from fpirhc.symbolic.live import DERIVED, computed_from, nominal
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,9 +234,8 @@ class Quadratic(Cost):
             return _squares(self.terminal, view.output, view.reference)
         error = view.state.vector[: plant.state.size] - view.reference.vector
         entries = nominal(self).derived(plant, linearise)
-        live = is_live(self)
-        values = [live_number(name, value) if live else value for name, value in entries.items()]
-        return ca.bilin(ca.reshape(numbers(values), error.numel(), error.numel()), error, error)
+        values = numbers(computed_from(self, entries))
+        return ca.bilin(ca.reshape(values, error.numel(), error.numel()), error, error)
 
     def derived(self, plant: Plant, linearise: Callable[[], Linearisation]) -> dict[str, float]:
         """Return the entries of P, column by column, where `terminal` computes it."""

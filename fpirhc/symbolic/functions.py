@@ -13,7 +13,7 @@ from typing import TypeVar, cast
 import casadi as ca
 
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.live import LiveNumber, is_live
+from fpirhc.symbolic.live import LiveNumber, expressed, is_live
 
 SMOOTHING = 1e-6  # half width, in the unit of the argument, within which the power is rounded off around zero
 T = TypeVar("T")
@@ -55,9 +55,24 @@ def signed(size: float, sign: float) -> float:
     return math.copysign(1.0, sign) * abs(size)
 
 
-def numbers(values: Sequence[float | LiveNumber]) -> Expression:
-    """Return a column of numbers: constants, or an expression where some are live."""
-    return cast(Expression, ca.vertcat(*values) if is_live(values) else ca.DM(cast(list[float], list(values))))
+def numbers(values: Sequence[float | LiveNumber], beside: Expression | None = None) -> Expression:
+    """Return a column of numbers: constants, or an expression where some are live, of the kind of another one where it is given."""
+    if not is_live(values):
+        return cast(Expression, ca.DM(cast(list[float], list(values))))
+    return cast(Expression, ca.vertcat(*(values if beside is None else (expressed(value, beside) for value in values))))
+
+
+def overlaid(column: Expression, values: Sequence[float | LiveNumber]) -> list[Expression]:
+    """Return the entries of a column that holds some numbers, with the live ones themselves in their places."""
+    return [expressed(v, column) if isinstance(v, LiveNumber) else column[k] for k, v in enumerate(values)]
+
+
+def quotient(over: Expression, number: float | LiveNumber) -> Expression:
+    """Return an expression divided by a number, live or not; zero where the number is zero."""
+    if not isinstance(number, LiveNumber):
+        return over / number if number else 0 * over
+    under = expressed(number, over)
+    return ca.if_else(under == 0, 0 * over, over / ca.if_else(under == 0, 1, under))
 
 
 def sqrt(x: float) -> float:

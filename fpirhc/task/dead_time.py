@@ -53,15 +53,12 @@ class Wait:
         Raises:
             NotSupported: a live delay without room.
         """
-        if not is_live(self.cycles):
-            return math.ceil(max(float(self.cycles), self.room) - _WHOLE)
-        if self.room:
-            return math.ceil(self.room - _WHOLE)
-        path = next(iter(live_numbers(self.cycles)))
-        raise NotSupported(
-            f"setting '{path}' cannot be live without its longest value, which is the length of a queue; state "
-            f"DeadTime(longest={{'{path.rpartition('.')[2]}': ...}})"
-        )
+        for path in () if self.room else live_numbers(self.cycles):
+            raise NotSupported(
+                f"setting '{path}' cannot be live without its longest value, which is the length of a queue; state "
+                f"DeadTime(longest={{'{path.rpartition('.')[2]}': ...}})"
+            )
+        return math.ceil(max(nominal(self.cycles), self.room) - _WHOLE)
 
     def read(self, past: Expression) -> Expression:
         """Return what entered a queue `cycles` ago; the newest value is its first entry."""

@@ -20,7 +20,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import exp, power
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.live import is_live
+from fpirhc.symbolic.live import LiveNumber, live_numbers
 
 _GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
 _OWN = "_reference_own"  # the filters' state, what is given, and a live rate
@@ -57,15 +57,19 @@ class FilterBank:
         return Signal(_GIVEN, (*names, *later), units * self.nodes)
 
     @property
+    def _open(self) -> list[LiveNumber]:
+        """The rate where it is live: it passes through Functions as an entry of the own signal."""
+        return list(live_numbers(self.rate).values())
+
+    @property
     def own(self) -> Signal:
         """The signal from which the motion follows: the filters' state, the set-points, and the rate where it is live."""
-        rate = ("rate",) if is_live(self.rate) else ()
-        return Signal(_OWN, (*self.elements, *(f"{_GIVEN}.{name}" for name in self.given.elements), *rate))
+        rates = ("rate",) * len(self._open)
+        return Signal(_OWN, (*self.elements, *(f"{_GIVEN}.{name}" for name in self.given.elements), *rates))
 
     def gathered(self, s: Signals) -> Expression:
         """Return the own signal inside a step."""
-        rate = [cast(Expression, self.rate)] if is_live(self.rate) else []
-        return ca.vertcat(getattr(s, FILTER), getattr(s, _GIVEN), *rate)
+        return ca.vertcat(getattr(s, FILTER), getattr(s, _GIVEN), *(cast(Expression, rate) for rate in self._open))
 
     def advanced(self, s: Signals, period: float) -> Expression:
         """Return the filters' state one cycle later inside a step, with the set-points held."""
@@ -113,7 +117,8 @@ class FilterBank:
         """State of every filter, set-points (n, nodes), and rate, of the own signal."""
         size, count = len(self.elements), self.given.size
         points = ca.reshape(own[size : size + count], len(self.orders), self.nodes)
-        return self._split(own[:size]), points, own[size + count] if is_live(self.rate) else self.rate
+        rates: list[_Entry] = [own[size + count] for _ in self._open]
+        return self._split(own[:size]), points, (rates or [self.rate])[0]
 
     def _chains(self, z: Sequence[Expression], held: Expression, rate: _Entry) -> list[Expression]:
         """(y, y', ..., y^(m)) of every coordinate; of a map the divided differences."""

@@ -121,7 +121,7 @@ def bumpless(s: Signals, gains: Sequence[float]) -> tuple[Expression, dict[str, 
         s: signals of the law, with `gains_before` in its memory.
         gains: of the integral, one per controlled coordinate.
     """
-    if not is_live(gains):
+    if "integral_gain" not in vars(s):
         return s._integral_before, {}
     now = numbers(gains)
     factor = ca.if_else(now == 0, 1, s.integral_gain / ca.if_else(now == 0, 1, now))

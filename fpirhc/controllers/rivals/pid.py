@@ -32,8 +32,9 @@ from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
+from fpirhc.symbolic.functions import quotient
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import (
     Useful,
@@ -146,7 +147,8 @@ class PID(Controller):
             direct = [
                 total(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
             ]
-            starts = [_first_integral(k[0], d) if self.bumpless else 0 * d for k, d in zip(gains, direct, strict=True)]
+            # The integral with which the first command is zero.
+            starts = [quotient(-d, k[0]) if self.bumpless else 0 * d for k, d in zip(gains, direct, strict=True)]
             integral_before, remembered = bumpless(s, integral_gains)
             integral = ca.if_else(s.warm_up > 0.5, integral_before, ca.vertcat(*starts))
             command = ca.vertcat(*(k[0] * integral[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
@@ -167,14 +169,6 @@ class PID(Controller):
             plant.response_signal("_deformed_unclipped"),
         )
         return Block("pid", Layout(reads), Layout(writes), step, gains_before(face, integral_gains))
-
-
-def _first_integral(gain: float, direct: Expression) -> Expression:
-    """The integral with which the first command is zero; zero without an integral gain, which may change where it is live."""
-    if not is_live(gain):
-        return -direct / gain if gain else 0 * direct
-    without = ca.SX(gain) == 0
-    return ca.if_else(without, 0 * direct, -direct / ca.if_else(without, 1, gain))
 
 
 EXAMPLES = (

@@ -40,7 +40,7 @@ from fpirhc.sensing.base import quantities, response_names
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.following import Following, following
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
-from fpirhc.symbolic.live import is_live, live_numbers, nominal, settled
+from fpirhc.symbolic.live import live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
 _STALE = "the filter stays stable, and keeps the bandwidth of the old deviations"
@@ -175,7 +175,7 @@ class DisturbanceKalman(Estimator):
         """Prediction by the model, and the correction by the gain."""
         model = problem.plant
         advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
-        fixed = None if is_live(self) else ca.DM(self.gain(problem))
+        fixed = ca.DM(self.gain(problem)) if self.following(problem) is None else None
         shown = self._shown_function(model)
         places = [model.parameter.elements.index(n) for n in self.learned()]
 

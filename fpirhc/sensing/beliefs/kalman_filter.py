@@ -28,8 +28,9 @@ from fpirhc.sensing.base import values_of
 from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
 from fpirhc.sensing.noises import covariance_entries, first_covariance, name_mistakes, require_named
 from fpirhc.sensing.observability import unobservable
+from fpirhc.symbolic.functions import overlaid
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import expressed, is_live, nominal
+from fpirhc.symbolic.live import nominal
 
 _STATE, _COVARIANCE, _VARIANCES = "belief_state", "belief_covariance", "belief_variances"
 
@@ -135,7 +136,7 @@ class KalmanFilter(Belief):
 
     def _variances(self, remembered: Expression) -> tuple[Expression, Expression]:
         """Variances of the noises and of the sensors; those of live settings, else the remembered ones."""
-        every = [expressed(d * d, remembered) if is_live(d) else remembered[k] for k, d in enumerate(self._deviations)]
+        every = overlaid(remembered, [d * d for d in self._deviations])
         return ca.vertcat(*every[: len(self.noise)]), ca.vertcat(*every[len(self.noise) :])
 
     def _spread_function(self, model: Model) -> ca.Function:
