@@ -11,8 +11,8 @@ import numpy as np
 import fpirhc as fp
 from fpirhc.controllers.contract import checked
 from fpirhc.review.grid import review_grid
-from fpirhc.review.linear import LinearLoop
-from fpirhc.review.loops import loops_along
+from fpirhc.review.loops import loops_along, points_of
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.loop import close_loop
 
 
@@ -51,6 +51,12 @@ def coupled(period: float = 1e-3) -> fp.Problem:
 def linear_loop(problem: fp.Problem, controller: fp.ComputedTorque) -> LinearLoop:
     """The closed loop per cycle, tracking law and deformation in it."""
     return loops_along(review_grid(problem, 0.0, 0), controller).loops[0]
+
+
+def linear_pair(problem: fp.Problem, controller: fp.ComputedTorque, gains: tuple[float, float]) -> list[np.ndarray]:
+    """The closed loops per cycle of two effective gains, in the same coordinates."""
+    points = points_of(review_grid(problem, 0.0, 0), controller)
+    return [one.dynamics for one in points.between(0, 0, gains, held=False)]
 
 
 def errors_after_request(problem: fp.Problem, controller: fp.ComputedTorque, requests, cycles: int) -> np.ndarray:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 import fpirhc as fp
+from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
 PERIOD = 1e-3  # s
 
@@ -25,7 +27,7 @@ def mass(**settings) -> fp.Problem:
         "period": PERIOD,
         "duration": 4.0,
     }
-    return fp.Problem(plant=plant, **(settings_in_use | settings))
+    return fp.Problem(**({"plant": plant} | settings_in_use | settings))
 
 
 def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.ComputedTorque:
@@ -41,3 +43,10 @@ def answers(problem: fp.Problem, controller=None, mismatch: float = 0.0) -> dict
 def about(result: dict[str, fp.Answer], words: str) -> fp.Answer:
     [question] = [q for q in result if words in q]
     return result[question]
+
+
+def linear(dynamics: Any, entry: Any, arriving: Any, state: Any, period: float) -> LinearLoop:
+    """A linear loop of one cycle by its matrices, with the numbers of the plant's states among its entries; every mode counts."""
+    shown = np.eye(len(dynamics))[list(state)]
+    cycle = LinearCycle(np.asarray(dynamics), np.asarray(entry), np.asarray(arriving), shown)
+    return LinearLoop((cycle,), np.zeros((0, len(dynamics))), shown.T, period)

@@ -22,14 +22,14 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
 from fpirhc.review.maps import largest_product
 from fpirhc.review.neighbourhood import eigenvalues_near
+from fpirhc.review.planned import is_planned
 from fpirhc.review.stages import stiff_advice
-from fpirhc.review.stand_in import is_planned
 from fpirhc.review.wording import per_cycle
 from fpirhc.review.zero_dynamics import zero_dynamics_modes
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 QUESTION = "Does the deformation converge?"
 _SURE = math.log(100)
@@ -117,11 +117,11 @@ def _without(loop: LinearLoop, rates: np.ndarray) -> float:
     """Largest |pole| where each decaying rate takes away the pole that is nearest to it."""
     poles = loop.poles[~loop.hidden]
     for one in rates[rates.real < 0]:
-        exact = np.exp(one * loop.period)
+        exact = np.exp(one * loop.period * len(loop.cycles))
         nearest = int(np.argmin(np.abs(poles - exact))) if poles.size else 0
         if poles.size and abs(poles[nearest]) < 1 and abs(poles[nearest] - exact) < _NEAR * abs(1 - exact):
             poles = np.delete(poles, nearest)
-    return float(np.abs(poles).max(initial=0.0))
+    return float(np.abs(poles).max(initial=0.0) ** (1 / len(loop.cycles)))
 
 
 def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:

@@ -12,11 +12,10 @@ from fpirhc.plant.maps import growth_of
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import response_slopes
 from fpirhc.review.plan_feedback import PlanGain, longer
 from fpirhc.review.plan_of_outputs import gains_at
 from fpirhc.review.stages import stiff_advice
-from fpirhc.review.state_matrix import state_matrices
+from fpirhc.review.state_slopes import state_slopes
 from fpirhc.summary import in_percent
 
 QUESTION = "Is the horizon long enough?"
@@ -98,5 +97,5 @@ def _model(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:
     """A and B of the model's state at the start of the reference."""
     plant = grid.problem.plant
     needed = grid.needed(plant.approximate)[0]
-    slopes = response_slopes(plant)(grid.states[0], needed, plant.approximate)
-    return state_matrices(plant, *(np.asarray(m.full()) for m in slopes))
+    slopes = state_slopes(plant, grid.states[0], needed, plant.approximate)
+    return slopes.a, slopes.b

@@ -1,26 +1,36 @@
-"""The linear closed loop of a controller at points of the reference."""
+"""The linear closed loop of a controller at points of the reference, asked of the loop itself.
+
+At every point the loop starts on the reference with the inputs that it needs there. The plant is led along the reference until
+what the controller remembers has found its place, also in a loop that does not converge; then the loop's own step is linearised.
+"""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import Planner, without_deformation
-from fpirhc.errors import FpirhcError, InvalidName, NotSupported
+from fpirhc.controllers.contract import without_deformation
+from fpirhc.describe import describe
+from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.late import is_late, scaled
-from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices
-from fpirhc.review.plan_feedback import PlanGain, no_gain
-from fpirhc.review.plan_of_outputs import gains_at
-from fpirhc.review.stand_in import linear_stand_in
-from fpirhc.review.straight import straightened
+from fpirhc.simulation.linearise.asked_loop import AskedLoop
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.simulation.linearise.linear_map import near_fixed_point
+from fpirhc.task.problem import Problem
 
-_WORK = 2e7  # entries^3 of all loops together: large ones are evaluated at fewer points
-_FEWEST = 3
-_DRAWN = 24  # draws of the parameters, of all points together
+T = TypeVar("T")
+
+_POINTS, _POINTS_OF_PLANS = 7, 3
+_DRAWN, _DRAWN_OF_PLANS = 16, 5  # draws of the parameters, of all points together
+_MOST_KEPT = 8
+_CYCLES = 400  # of the run to a point, at most
+_SMALL = 1e-3  # feedback of a point at a limit, as a share of the others'
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +38,13 @@ class Loops:
     """Linear loops of a controller along the reference, or the reason why there are none.
 
     Args:
-        places: indices of the loops' points among the reference's points.
+        places: indices of the loops' points among the reference's points, those at a limit left out: there nothing is fed back.
         loops: loops of the plant with its exact parameters, one for every place.
         ideal: loop of the controller without deformation whose model is the plant: the outer loop by itself.
         drawn: loops of plants from the box of parameters, and with the shortest and the longest dead time of the box.
         reason: why there are no loops; else empty.
-        learns: whether the controller changes its model on line; then the loops are those of its first model.
+        learns: whether the controller changes on line what the loops have as it is at their points: a model, or gains.
+        draws: points and draws of the parameters of those in `drawn` that differ in nothing else.
     """
 
     places: tuple[int, ...]
@@ -42,6 +53,7 @@ class Loops:
     drawn: tuple[LinearLoop, ...] = ()
     reason: str = ""
     learns: bool = False
+    draws: tuple[tuple[int, int], ...] = ()
 
     @property
     def radii(self) -> np.ndarray:
@@ -52,11 +64,7 @@ class Loops:
 def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
     """Return the controller's linear loops along the reference, or the reason why there are none."""
     try:
-        return replace(_loops(grid, controller), learns=controller.learns)
-    except InvalidName as error:
-        # The names of the plant's parameters mean nothing on a linearised plant, whose parameters are matrices.
-        learned = f"{type(controller).__name__} learns parameters by name, which a linearised plant does not have"
-        return Loops((), (), None, reason=learned if controller.learns else str(error), learns=controller.learns)
+        return _loops(grid, controller)
     except FpirhcError as error:
         return Loops((), (), None, reason=str(error), learns=controller.learns)
     except np.linalg.LinAlgError as error:
@@ -64,32 +72,101 @@ def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
 
 
 def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
-    problem, plant = grid.problem, grid.problem.plant
-    believed = controller.plant_model(problem).parameters(plant)
-    stand_in, plan = linear_stand_in(problem, controller)
-    matrices = loop_matrices(problem, stand_in)
-    usable = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
-    if not usable:
-        raise NotSupported("the inverse does not exist along the reference")
-    places = _thinned(usable, int(_WORK / max(len(matrices.rest), 1) ** 3))
-    gains = dict(zip(places, plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed), strict=True))
-
-    straight = straightened(problem)
-
-    def at(place: int, draw: int) -> LinearLoop:
-        here = (grid.drawn_states[draw, place], grid.commands[draw, place])
-        slopes = straight.slopes_on(here[0], grid.draws[draw])
-        feedback = straight.feedback_on(gains[place], *here, grid.draws[draw], believed)
-        own, model = (linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[draw], believed))
-        return matrices.at(own, model)
-
-    first = (grid.states[places[0]], grid.commands[0, places[0]])
-    feedback = straight.feedback_on(gains[places[0]], *first, believed, believed)
-    model = linear_parameters(straight.slopes_on(first[0], believed), *first, believed, feedback)
-    ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
-    drawn = [at(k, d) for k, d in _pairs(grid, places) if np.isfinite(grid.commands[d, k]).all()]
+    points = points_of(grid, controller)
+    quick = points.asked.quick
+    sought = thinned(usable(grid), _POINTS if quick else _POINTS_OF_PLANS)
+    every = {k: points.at(k) for k in sought}
+    strongest = np.max([_fed_back(one) for one in every.values()], axis=0)
+    places = tuple(k for k, one in every.items() if (_fed_back(one) > _SMALL * strongest).all())
+    if not places:
+        raise NotSupported("the command stands at a limit all along the reference")
+    pairs = _pairs(grid, places, _DRAWN if quick else _DRAWN_OF_PLANS)
+    drawn = {pair: points.at(*pair) for pair in pairs if np.isfinite(grid.commands[pair[::-1]]).all()}
+    drawn = {pair: one for pair, one in drawn.items() if (_fed_back(one) > _SMALL * strongest).all()}
     late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, places[:: max(1, len(places) // 2)])]
-    return Loops(tuple(places), tuple(at(k, 0) for k in places), ideal, (*drawn, *late))
+    ideal = ideal_loops(grid, controller, 1)[0]
+    loops, learns = tuple(every[k] for k in places), controller.learns and points.asked.keeps_learned
+    return Loops(places, loops, ideal, (*drawn.values(), *late), learns=learns, draws=tuple(drawn))
+
+
+def _fed_back(loop: LinearLoop) -> np.ndarray:
+    """The size of what each command depends on, (nu,)."""
+    return np.asarray(np.max([np.abs(one.arriving).max(axis=1, initial=0.0) for one in loop.cycles], axis=0))
+
+
+class Points:
+    """A closed loop at points of the reference, with its map as it is near the fixed point."""
+
+    def __init__(self, grid: ReviewGrid, controller: Controller, problem: Problem | None = None) -> None:
+        """Compose the loop, of the grid's problem or of the same one with its reality."""
+        self.grid, self.asked = grid, AskedLoop(problem or grid.problem, near_fixed_point(controller))
+        self._loops: dict[tuple[int, int], LinearLoop] = {}
+        self._quiets: dict[tuple[int, int], np.ndarray] = {}
+
+    def at(self, place: int, draw: int = 0) -> LinearLoop:
+        """Return the linear loop at a point, with the parameters of a draw; draw 0 are the exact ones."""
+        if (place, draw) not in self._loops:
+            self._loops[place, draw] = self.asked.at(self.quiet(place, draw))
+        return self._loops[place, draw]
+
+    def between(self, place: int, draw: int, gains: tuple[float, float], *, held: bool) -> tuple[LinearLoop, ...]:
+        """Return the linear loops of two gains of the map at a point, in the same coordinates; held: plans are held for ever."""
+        return self.asked.between(self.quiet(place, draw), gains, held=held)
+
+    def ideal(self, place: int) -> LinearLoop:
+        """Return the linear loop at a point where the plant is the model."""
+        believed = self.asked.controller.plant_model(self.grid.problem).parameters(self.grid.problem.plant)
+        quiet = self._quiet(place, self.grid.states[place], self.grid.needed(believed)[place], believed)
+        return self.asked.at(quiet)
+
+    def quiet(self, place: int, draw: int = 0) -> np.ndarray:
+        """Return the memory at a point, with the parameters of a draw."""
+        if (place, draw) not in self._quiets:
+            grid = self.grid
+            states = grid.states if draw == 0 else grid.drawn_states[draw]
+            at = self._quiet(place, states[place], grid.commands[draw, place], grid.draws[draw])
+            self._quiets[place, draw] = at
+        return self._quiets[place, draw]
+
+    def _quiet(self, place: int, state: np.ndarray, command: np.ndarray, exact: np.ndarray) -> np.ndarray:
+        grid, asked, plant = self.grid, self.asked, self.grid.problem.plant
+        reality = asked.problem.symbolic_reality
+        start = asked.start(
+            time=float(grid.times[place]),
+            state=dict(zip(plant.state.elements, map(float, state), strict=True)),
+            before=dict(zip(plant.inputs, map(float, command), strict=True)),
+            exact=exact if reality is None else None,
+        )
+        times = grid.times[place] + grid.problem.period * np.arange(1, _CYCLES + 1)
+        led = grid.states_at(times) + (state - grid.states[place])
+        if reality is not None:  # what the model lacks moves by itself
+            known = reality.shared(plant)
+            whole = np.full((_CYCLES, asked.problem.real_plant.state.size), np.nan)
+            whole[:, list(known.values())] = led[:, list(known)]
+            led = whole
+        return asked.quietest(asked.run(start, _CYCLES, led, self._fixed_point(state, command)))
+
+    def _fixed_point(self, state: np.ndarray, command: np.ndarray) -> np.ndarray | None:
+        """The request for which the model computes a command; None where the deformation acts on something else."""
+        controller, plant = self.asked.controller, self.grid.problem.plant
+        if controller.deforms != "response" or controller.response(self.grid.problem) is not None:
+            return None
+        believed = controller.plant_model(self.grid.problem).parameters(plant)
+        return np.asarray(plant.controlled_response_function(state, command, believed).full()).ravel()
+
+
+def points_of(grid: ReviewGrid, controller: Controller) -> Points:
+    """Return the closed loop at the grid's points; the last ones are kept, because several questions ask the same loop."""
+    key = (id(grid.problem), id(grid.states), repr((type(controller), describe(near_fixed_point(controller)))))
+    if key not in _KEPT:
+        while len(_KEPT) >= _MOST_KEPT:
+            _KEPT.popitem(last=False)
+        _KEPT[key] = Points(grid, controller)
+    _KEPT.move_to_end(key)
+    return _KEPT[key]
+
+
+_KEPT: OrderedDict[tuple[int, int, str], Points] = OrderedDict()
 
 
 def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) -> list[LinearLoop]:
@@ -97,51 +174,45 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
 
     Raises:
         NotSupported: no linear loop.
-        FpirhcError: every error that the controller raises about a linear plant.
+        FpirhcError: every error that the controller raises about the problem.
     """
-    problem, plant = grid.problem, grid.problem.plant
-    believed = controller.plant_model(problem).parameters(plant)
-    stand_in, plan = linear_stand_in(problem, controller)
-    feedbacks = plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed)
-    matrices, straight = loop_matrices(problem, stand_in), straightened(problem)
-    loops = []
-    for k, gain in zip(places, feedbacks, strict=True):
-        here = (grid.states[k], grid.commands[0, k])
-        slopes = straight.slopes_on(here[0], grid.draws[0])
-        feedback = straight.feedback_on(gain, *here, grid.draws[0], believed)
-        loops.append(matrices.at(*(linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[0], believed))))
-    return loops
+    points = points_of(grid, controller)
+    return [points.at(k) for k in places]
 
 
-def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tuple[LinearLoop, np.ndarray]]:
+def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[LinearLoop]:
     """Return the loops of plant = model without deformation at `count` points of the reference.
-
-    Returns:
-        Pairs of a loop and the model's gain from inputs to responses of the controlled coordinates there, (n, nu).
 
     Raises:
         NotSupported: no linear loop, or no point where the model's inverse is finite.
         FpirhcError: every error that the controller raises.
     """
-    problem, plant = grid.problem, grid.problem.plant
-    believed = controller.plant_model(problem).parameters(plant)
-    stand_in, plan = linear_stand_in(problem, controller)
+    points = points_of(grid, without_deformation(controller))
+    return [
+        points.ideal(k)
+        for k in ideal_places(grid, controller.plant_model(grid.problem).parameters(grid.problem.plant), count)
+    ]
+
+
+def ideal_places(grid: ReviewGrid, believed: np.ndarray, count: int) -> list[int]:
+    """Return points of the reference at which a model with these parameters has a finite inverse.
+
+    Raises:
+        NotSupported: there is none.
+    """
     needed = grid.needed(believed)
-    usable = [k for k in range(len(grid.times)) if np.isfinite(needed[k]).all()]
-    if not usable:
+    finite = [k for k in range(len(grid.times)) if np.isfinite(needed[k]).all()]
+    if not finite:
         raise NotSupported("the model's inverse does not exist along the reference")
-    places = _thinned(usable, count)
-    feedbacks = plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed)
-    matrices = loop_matrices(problem, without_deformation(stand_in))
-    straight = straightened(problem)
-    loops = []
-    for k, gain in zip(places, feedbacks, strict=True):
-        slopes = straight.slopes_on(grid.states[k], believed)
-        feedback = straight.feedback_on(gain, grid.states[k], needed[k], believed, believed)
-        model = linear_parameters(slopes, grid.states[k], needed[k], believed, feedback)
-        effect = controlled_gain(straight.plant, straight.slopes, grid.states[k], needed[k], believed)
-        loops.append((matrices.at(model, model), effect))
-    return loops
+    return thinned(finite, count)
+
+
+def usable(grid: ReviewGrid) -> list[int]:
+    """Return the points of the reference whose command is finite."""
+    finite = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
+    if not finite:
+        raise NotSupported("the inverse does not exist along the reference")
+    return finite
 
 
 def _late(grid: ReviewGrid) -> list[ReviewGrid]:
@@ -151,27 +222,16 @@ def _late(grid: ReviewGrid) -> list[ReviewGrid]:
     return [replace(grid, problem=scaled(grid.problem, percent)) for percent in (-grid.mismatch, grid.mismatch)]
 
 
-def _pairs(grid: ReviewGrid, places: list[int]) -> list[tuple[int, int]]:
+def _pairs(grid: ReviewGrid, places: Sequence[int], most: int) -> list[tuple[int, int]]:
     """Pairs of a point and a draw; every point has draws of its own, and few points have few draws."""
-    count = min(len(grid.draws) - 1, _DRAWN, 2 * len(places))
+    count = min(len(grid.draws) - 1, most)
     if count <= 0:
         return []
     draws = np.unique(np.linspace(1, len(grid.draws) - 1, count).astype(int))
     return [(places[i % len(places)], int(d)) for i, d in enumerate(draws)]
 
 
-def _thinned(places: list[int], most: int) -> list[int]:
-    count = min(len(places), max(_FEWEST, most))
-    return [places[int(k)] for k in np.unique(np.linspace(0, len(places) - 1, count).astype(int))]
-
-
-def plan_gains_at(grid: ReviewGrid, plan: Planner | None, times: list[float], believed: np.ndarray) -> list[PlanGain]:
-    """Return the feedback of a plan at some times; no gain without a plan."""
-    problem = grid.problem
-    if plan is None:
-        return [no_gain(problem.plant)] * len(times)
-    cost = plan.cost or problem.cost
-    assert problem.horizon is not None
-    assert cost is not None
-    consistent = plan.starts_consistent(problem.plant)
-    return gains_at(problem, problem.horizon, cost, times, believed, grid.states_at, consistent=consistent)
+def thinned(places: Sequence[T], most: int) -> list[T]:
+    """Return at most so many of some points."""
+    some = np.unique(np.linspace(0, len(places) - 1, min(len(places), most)).astype(int))
+    return [places[int(k)] for k in some]

@@ -1,85 +1,79 @@
 """The linear loops of a controller for every gain of its map: their matrices are affine in the gain, so two gains give all.
 
-F(a) = F(a1) + (a - a1) / (a1 - a2) (F(a1) - F(a2)),      a the effective gain; G and C likewise.
+F(a) = F(a1) + (a - a1) / (a1 - a2) (F(a1) - F(a2)),      a the effective gain; G and C likewise, in every cycle of a period.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from typing import TypeAlias
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop
-from fpirhc.review.loops import Loops, loops_along
+from fpirhc.review.loops import Loops, Points, points_of, thinned
+from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
-_LOWER = 0.9  # gain of the second loops, as a share of that of the first
-_SHARES = (1.0, 0.5, 0.1)  # of the map's own gain, at which the first loops are sought
+_LOWER = 0.9  # the lower gain, as a share of the map's own
+
+Pair: TypeAlias = tuple[LinearLoop, LinearLoop]
 
 
 class LoopsByGain:
-    """Loops of a map at its own gain and at a lower one.
+    """Loops of a map at its own gain and at a lower one, in the same coordinates.
 
     Args:
-        own: loops of the map.
-        lower: loops at the lower gain.
+        points: of the loop.
+        own: points and draws that are looked at.
         gain: effective gain of the map.
     """
 
-    def __init__(self, own: Loops, lower: Loops, gain: float) -> None:
-        self.own, self.lower, self.gain = own, lower, gain
-        self.gains = _LOWER * gain, gain
+    def __init__(self, points: Points, own: Loops, gain: float) -> None:
+        self._points, self._own, self.gains = points, own, (_LOWER * gain, gain)
+        self._pair = cache(self._between)
 
-    def along(self, most: int) -> list[tuple[LinearLoop, LinearLoop]]:
+    def along(self, most: int) -> list[Pair]:
         """Return (lower, own) at no more than so many points of the reference, with the exact parameters."""
-        return _some(list(zip(self.lower.loops, self.own.loops, strict=True)), most)
+        return [self._pair(k, 0, False) for k in thinned(self._own.places, most)]
 
-    def over_box(self, most: int) -> list[tuple[LinearLoop, LinearLoop]]:
+    def held(self, most: int) -> list[Pair]:
+        """Return (lower, own) at no more than so many points of the reference, with plans that are held for ever."""
+        return [self._pair(k, 0, True) for k in thinned(self._own.places, most)]
+
+    def over_box(self, most: int) -> list[Pair]:
         """Return (lower, own) for no more than so many draws of the parameters."""
-        return _some(list(zip(self.lower.drawn, self.own.drawn, strict=True)), most)
+        return [self._pair(*one, False) for one in thinned(self._own.draws, most)]
 
-    def at(self, gain: float, pair: tuple[LinearLoop, LinearLoop]) -> LinearLoop:
+    def at(self, gain: float, pair: Pair) -> LinearLoop:
         """Return the loop at another effective gain."""
         low, own = pair
-        share = (gain - self.gain) / (self.gain - self.gains[0])
+        share = (gain - self.gains[1]) / (self.gains[1] - self.gains[0])
+        cycles = (_mixed(one, other, share) for one, other in zip(own.cycles, low.cycles, strict=True))
+        return replace(own, cycles=tuple(cycles))
 
-        def mixed(name: str) -> np.ndarray:
-            first, second = getattr(own, name), getattr(low, name)
-            return np.asarray(first + share * (first - second))
-
-        return replace(own, dynamics=mixed("dynamics"), entry=mixed("entry"), arriving=mixed("arriving"))
+    def _between(self, place: int, draw: int, held: bool) -> Pair:
+        low, own = self._points.between(place, draw, self.gains, held=held)
+        return low, own
 
 
 def loops_by_gain(grid: ReviewGrid, controller: Controller, own: Loops) -> LoopsByGain | None:
-    """Return the loops for every gain; None without loops, and for a map that changes or has no gain to set.
-
-    A gain that the linearised plants refuse has no loops, so there those of smaller gains are taken.
-    """
-    if not controller.deformation.adapts or not controller.deformation.iteration.constant:
+    """Return the loops for every gain; None without loops, and for a map that changes or has no gain to set."""
+    if not controller.deformation.adapts or not controller.deformation.iteration.constant or not own.places:
         return None
-    gain = controller.deformation.effective_gain()
-    for share in _SHARES:
-        first = own if share == 1 else _at(grid, controller, share * gain)
-        lower = _at(grid, controller, _LOWER * share * gain) if first.loops else first
-        if lower.loops and _sizes(lower) == _sizes(first):
-            return LoopsByGain(first, lower, share * gain)
-    return None
-
-
-def _at(grid: ReviewGrid, controller: Controller, gain: float) -> Loops:
-    """The loops at another effective gain; none where it cannot be set."""
+    loops = LoopsByGain(points_of(grid, controller), own, controller.deformation.effective_gain())
     try:
-        return loops_along(grid, controller.with_deformation(controller.deformation.with_effective_gain(gain)))
-    except FpirhcError as error:
-        return Loops((), (), None, reason=str(error))
+        loops.along(1)
+    except (FpirhcError, np.linalg.LinAlgError):
+        return None
+    return loops
 
 
-def _sizes(loops: Loops) -> list[tuple[int, ...]]:
-    """Shapes of all loops; they differ where a gain leaves other entries of the memory at rest."""
-    return [one.dynamics.shape for one in (*loops.loops, *loops.drawn)]
+def _mixed(first: LinearCycle, second: LinearCycle, share: float) -> LinearCycle:
+    def mixed(name: str) -> np.ndarray:
+        one, other = getattr(first, name), getattr(second, name)
+        return np.asarray(one + share * (one - other))
 
-
-def _some(pairs: list[tuple[LinearLoop, LinearLoop]], most: int) -> list[tuple[LinearLoop, LinearLoop]]:
-    return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, most).astype(int))] if pairs else []
+    return replace(first, dynamics=mixed("dynamics"), entry=mixed("entry"), arriving=mixed("arriving"))

@@ -4,8 +4,8 @@ With z+ = F z + G w and v = C z (commands that arrive) the loop of input i is op
 
     L_i(zeta) = -C_i (zeta I - F + G_i C_i)^-1 G_i,
 
-all other loops closed. The deformation, dead time and prediction are in it. Plans that are not made in every cycle are judged over
-the whole period from plan to plan, see `fpirhc.review.plan_period`.
+all other loops closed. The deformation, dead time and prediction are in it. A loop with plans every n cycles has no such function;
+there the command is multiplied by factors until a pole of the whole period reaches the unit circle.
 
 References: K. J. Astrom, R. M. Murray, Feedback Systems, 2008, section 9.3, for the margins.
 """
@@ -13,18 +13,16 @@ References: K. J. Astrom, R. M. Murray, Feedback Systems, 2008, section 9.3, for
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 import scipy.linalg
+from scipy.optimize import brentq
 
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
-from fpirhc.review.neutral import NEUTRAL
-from fpirhc.review.plan_period import period_margins
 from fpirhc.review.wording import duration
-from fpirhc.simulation.linearise.linear_loop import LinearLoop as OverPeriod
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
 from fpirhc.task.problem import Problem
 
 QUESTION = "Has the linear loop enough margin?"
@@ -33,43 +31,41 @@ LEAST_PHASE = 25.0  # degrees
 _LARGEST = 400  # states of a loop whose margins are computed
 _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
+_DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
+_STEPS = 60
 
 
-def margins_enough(
-    problem: Problem, loops: Loops, *, adapts: bool, planned: bool, whole: Sequence[OverPeriod] = ()
-) -> Answer:
+def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: bool) -> Answer:
     """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is.
+
+    Where plans are not made in every cycle they are those of all points.
 
     Args:
         problem: the problem.
         loops: linear loops of the controller.
         adapts: whether the controller has a deformation.
         planned: whether the controller is a plan, which has weights in place of a rate.
-        whole: loops over a whole period of plans that are not made in every cycle; they are judged then.
     """
-    every = whole or loops.loops
-    if not every:
+    if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
-    radii = np.array([one.radius for one in every])
-    radius = float(radii.max())
+    first, radius = loops.loops[0], float(loops.radii.max())
     text = f"largest closed-loop pole magnitude {radius:.6g}"
-    if not whole and len(loops.loops[0].dynamics) > _LARGEST:
-        text += f"; no margins of a loop of {len(loops.loops[0].dynamics)} states"
+    if len(first.dynamics) > _LARGEST:
+        text += f"; no margins of a loop of {len(first.dynamics)} states"
         return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
     if radius >= 1:  # there is no margin to lose
-        return _outside(radii, text, {"radius": radius}, learns=loops.learns)
-    places, inputs = sorted({0, int(np.argmax(radii))}), range(len(problem.plant.inputs))
-    if whole:
-        all_margins = [period_margins(whole[k], i) for k in places for i in inputs]
-        text += f" per cycle, over the {len(whole[0].cycles)} cycles from plan to plan"
-    else:
-        all_margins = [margins(loops.loops[k], i) for k in places for i in inputs]
-    gain, phase, delay = (min(column) for column in zip(*all_margins, strict=True))
+        return _outside(loops.radii, text, {"radius": radius}, learns=loops.learns)
+    # Loops of plans are few, and differ more.
+    places = range(len(loops.loops)) if len(first.cycles) > 1 else sorted({0, int(np.argmax(loops.radii))})
+    sizes = [margins(loops.loops[k], i) for k in places for i in range(len(problem.plant.inputs))]
+    gain, phase, delay = (min(column) for column in zip(*sizes, strict=True))
+    if len(first.cycles) > 1:
+        text += f" per cycle, over the {len(first.cycles)} cycles from plan to plan"
     numbers = {"radius": radius, "gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
     text += f"; {_sizes(gain, phase, delay, problem)}"
     if loops.learns:
         text += ", before the controller has learned anything"
-    if any(one.hidden.any() for one in every):
+    if any(one.hidden.any() for one in loops.loops):
         text += "; neutral modes that no judged coordinate shows are left out"
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     gentler = "weigh the inputs more" if planned else "lower the rate"
@@ -106,29 +102,77 @@ def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
     Returns:
         Gain margin as a factor of at least 1, up or down; phase margin, degrees; delay margin, in the unit of time.
     """
-    import control  # slow to import, and only margins need it
-
+    if len(loop.cycles) > 1:
+        return _of_a_period(loop, place)
     nyquist = math.pi / loop.period
-    frequencies = nyquist * np.geomspace(_LOWEST, 0.9999, _FREQUENCIES)
-    values = _response(loop, place, np.append(frequencies, nyquist))
-    opened = control.FrequencyResponseData(values[:-1], frequencies, loop.period)
-    gains, phases, _, _, crossings, _ = control.stability_margins(opened, returnall=True)
+    frequencies = np.append(nyquist * np.geomspace(_LOWEST, 0.9999, _FREQUENCIES), nyquist)
+    opened = _response(loop, place)
+    values = np.array([opened(w) for w in frequencies])
+    turned = [opened(w) for w in _roots(lambda w: opened(w).imag, frequencies[:-1], values[:-1].imag)]
     # At the Nyquist frequency, where most sampled loops leave the unit circle, L is real and crosses no phase.
-    ends = [-1 / values[-1].real] if values[-1].real < 0 else []
-    factors = [max(m, 1 / m) for m in [*np.atleast_1d(gains), *ends] if m > 0 and math.isfinite(m)]
-    pairs = [
-        (float(p), float(w)) for p, w in zip(np.atleast_1d(phases), np.atleast_1d(crossings), strict=True) if w > 0
-    ]
-    angles = [abs((p + 180) % 360 - 180) for p, _ in pairs]
-    delays = [math.radians(p % 360) / w for p, w in pairs]
-    return min(factors, default=math.inf), min(angles, default=math.inf), min(delays, default=math.inf)
+    gains = [-1 / value.real for value in (*turned, values[-1]) if value.real < 0]
+    factors = [max(gain, 1 / gain) for gain in gains]
+    crossings = _roots(lambda w: abs(opened(w)) - 1, frequencies, np.abs(values) - 1)
+    phases = [np.angle(-opened(w)) for w in crossings]
+    delays = [(phase % (2 * math.pi)) / w for phase, w in zip(phases, crossings, strict=True)]
+    least = min((abs(math.degrees(phase)) for phase in phases), default=math.inf)
+    return min(factors, default=math.inf), least, min(delays, default=math.inf)
 
 
-def _response(loop: LinearLoop, place: int, frequencies: np.ndarray) -> np.ndarray:
-    """L_i on the unit circle; from the matrices, because polynomials of so many states lose all digits."""
-    g, c = loop.entry[:, place], loop.arriving[place]
-    generator = loop.dynamics - np.outer(g, c)
-    points = np.exp(1j * frequencies * loop.period)
-    form, turn = scipy.linalg.schur(generator, output="complex")
+def _roots(function: Callable[[float], float], at: np.ndarray, values: np.ndarray) -> list[float]:
+    """Arguments at which a function is zero, one between each pair of neighbours of different signs."""
+    changes = np.flatnonzero(np.sign(values[1:]) * np.sign(values[:-1]) < 0)
+    return [float(brentq(function, at[k], at[k + 1], rtol=1e-9)) for k in changes]
+
+
+def _response(loop: LinearLoop, place: int) -> Callable[[float], complex]:
+    """Function frequency -> L_i; from the matrices, because polynomials of so many states lose all digits."""
+    [one] = loop.cycles
+    g, c = one.entry[:, place], one.arriving[place]
+    form, turn = scipy.linalg.schur(loop.dynamics - np.outer(g, c), output="complex")
     left, right, unit = c @ turn, turn.conj().T @ g, np.eye(len(form))
-    return np.array([-left @ scipy.linalg.solve_triangular(point * unit - form, right) for point in points])
+
+    def opened(frequency: float) -> complex:
+        point = np.exp(1j * frequency * loop.period)
+        return complex(-left @ scipy.linalg.solve_triangular(point * unit - form, right))
+
+    return opened
+
+
+def _of_a_period(loop: LinearLoop, place: int) -> tuple[float, float, float]:
+    """Margins of a loop with plans every n cycles: the smallest factor of the command, real or on the unit circle, with |pole| = 1.
+
+    A mode turns by at most pi in a period, so the delay of a turned command follows from the turn of the mode.
+    """
+    up = _first(lambda x: _turned(loop, place, math.exp(x)), _DECADES)
+    down = _first(lambda x: _turned(loop, place, math.exp(-x)), _DECADES)
+    angle = _first(lambda x: _turned(loop, place, np.exp(-1j * x)), math.pi)
+    poles = _turned(loop, place, np.exp(-1j * angle)) if math.isfinite(angle) else np.ones(1)
+    turns = np.angle(poles[np.abs(np.abs(poles) - 1) < 1e-3])
+    fastest = float(np.abs(turns).max(initial=0.0)) / (len(loop.cycles) * loop.period)
+    return math.exp(min(up, down)), math.degrees(angle), angle / fastest if fastest else math.inf
+
+
+def _turned(loop: LinearLoop, place: int, factor: complex) -> np.ndarray:
+    """Poles of a period in which a command is multiplied by a factor, without those that are no fault of the loop."""
+    whole: np.ndarray = np.eye(loop.dynamics.shape[1])
+    for one in loop.cycles:
+        more = (factor - 1) * np.outer(one.entry[:, place], one.arriving[place])
+        whole = (one.dynamics + more) @ whole
+    poles = np.asarray(np.linalg.eigvals(whole))
+    for hidden in loop.poles[loop.hidden]:
+        poles = np.delete(poles, int(np.argmin(np.abs(poles - hidden))))
+    return poles
+
+
+def _first(poles: Callable[[float], np.ndarray], most: float) -> float:
+    """The smallest argument up to `most` where a pole leaves the unit circle; infinite where none does."""
+
+    def outside(x: float) -> float:
+        return float(np.abs(poles(x)).max(initial=0.0)) - 1
+
+    steps = np.linspace(0, most, _STEPS + 1)
+    beyond = next((k for k, x in enumerate(steps) if outside(float(x)) >= 0), None)
+    if beyond is None:
+        return math.inf
+    return float(brentq(outside, steps[beyond - 1], steps[beyond], rtol=1e-6)) if beyond else 0.0

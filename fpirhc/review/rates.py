@@ -10,10 +10,10 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
 from fpirhc.review.maps import dead_cycles
-from fpirhc.review.neutral import NEUTRAL
+from fpirhc.review.planned import is_planned
 from fpirhc.review.stages import stiff_advice
-from fpirhc.review.stand_in import is_planned
 from fpirhc.review.zero_dynamics import zero_dynamics_rate
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL
 
 _BESIDE = 1.1  # the growth of the zero dynamics is that of the plant, and the nominal loop is that of the model
 QUESTION = "Is the sampling fast enough for the tracking law?"

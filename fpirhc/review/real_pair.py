@@ -1,17 +1,14 @@
-"""The real pair near the reference: the reality and the model as linear plants in one loop, and the modes that the model lacks.
+"""The real pair near the reference: its linear loops, and the modes that the model lacks.
 
 At a point of the reference the reality's own states z are where they settle, and the input is what the reference needs then,
 
     0 = z'(x^N, z, u),        r^N = y^(r)(x^N, z, u).
-
-The loop is the library's own around both linearisations, so the integrator, the sensors' estimator and the dead times are in it.
 """
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -21,15 +18,12 @@ from scipy.optimize import linear_sum_assignment
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
-from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.review.carried import carrying
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop, cycle_of, linear_parameters, linear_problem, matrices_of, response_slopes
-from fpirhc.review.loops import plan_gains_at
+from fpirhc.review.loops import Points, thinned, usable
 from fpirhc.review.reduced import outer_slopes, reduced
-from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.sensing.base import response_names
-from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.task.problem import Problem
 from fpirhc.task.reality import Reality
 
@@ -92,39 +86,18 @@ def real_points(grid: ReviewGrid) -> tuple[RealPoint, ...]:
     return tuple(points)
 
 
-def real_loops(grid: ReviewGrid, controller: Controller, points: Sequence[RealPoint]) -> list[LinearLoop]:
-    """Return the linear loop of the real pair at some points.
+def real_loops(grid: ReviewGrid, controller: Controller) -> list[LinearLoop]:
+    """Return linear loops of the real pair at some points of the reference.
 
     Raises:
         NotSupported: no linear loop; a controller whose model is the reality.
-        FpirhcError: every error that the controller raises about a linear plant.
+        FpirhcError: every error that the controller raises about the problem.
     """
     assert grid.real is not None
-    problem, model, reality = grid.real, grid.problem.plant, _reality(grid.real)
-    if model.outputs:
-        raise NotSupported("a reality beside outputs has other inner states than the model; simulate it")
-    if controller.plant_model(problem).plant is not model:
+    if controller.plant_model(grid.real).plant is not grid.problem.plant:
         raise NotSupported("its model is the reality")
-    hidden = [c for c in problem.judged_names if reality.true_name(c) not in reality.plant.coordinates]
-    if hidden:
-        raise NotSupported(f"{', '.join(hidden)} of the reality are outputs and no coordinates; simulate it")
-    believed = controller.plant_model(grid.problem).parameters(model)
-    stand_in, plan = linear_stand_in(grid.problem, controller)
-    linear = linear_problem(grid.problem, stand_in)
-    plant = linear_reality(reality.plant)
-    integrator = linear.integrator if problem.real_integrator.opaque else problem.real_integrator
-    still = dict.fromkeys(plant.state.elements, 0.0)
-    whole = replace(linear, reality=Reality(plant, start=still, integrator=integrator, seen=reality.seen))
-    judged = tuple(plant.state.elements.index(reality.true_name(c)) for c in problem.judged_names)
-    matrices = matrices_of(whole, stand_in, judged)
-    own, slopes = _entries(reality.plant), response_slopes(model)
-    feedbacks = plan_gains_at(grid, plan, [float(grid.times[p.place]) for p in points], believed)
-    loops = []
-    for point, feedback in zip(points, feedbacks, strict=True):
-        exact = np.asarray(own(point.real, point.command, reality.plant.exact).full()).ravel()
-        of_model = linear_parameters(slopes, grid.states[point.place], point.command, believed, feedback)
-        loops.append(matrices.at(exact, of_model))
-    return loops
+    points = Points(grid, controller, grid.real)
+    return [points.at(k) for k in thinned(usable(grid), _POINTS)]
 
 
 def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Extra:
@@ -148,46 +121,6 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     by_input = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(model.controlled_response_function(x, u, p), u)])
     assumed = np.asarray(by_input(grid.states[point.place], point.command, believed).full())
     return Extra(modes, np.linalg.eigvals(gain @ np.linalg.inv(assumed)))
-
-
-def linear_reality(plant: Plant) -> Plant:
-    """Return a plant of the same coordinates and inputs whose parameters are the slopes of its responses.
-
-    Slopes that are zero by structure are left out, so that an input reaches the same coordinates as in the plant itself.
-    """
-    places = _places(plant)
-    parameters = {f"s{i}_{j}": Parameter(0.0, 0.0, "1") for i, j in places}
-
-    def response(*arguments: Named) -> Mapping[str, Expression]:
-        *derivatives, u, p = arguments
-        by_name = {c + "'" * k: d[c] for k, d in enumerate(derivatives) for c in d}
-        column = [*(by_name[e] for e in plant.state.elements), *(u[name] for name in plant.inputs)]
-        sums: list[Expression] = [ca.SX(0)] * len(plant.names)
-        for i, j in places:
-            sums[i] = sums[i] + p[f"s{i}_{j}"] * column[j]
-        return dict(zip(plant.names, sums, strict=True))
-
-    kind = inspect.Parameter.POSITIONAL_ONLY
-    names = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
-    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(name, kind) for name in names])
-    order = dict(zip(plant.names, plant.orders, strict=True))
-    names_and_units = plant.coordinates, plant.inputs, parameters, response, order, plant.controlled
-    return Plant(*names_and_units, time_unit=plant.time_unit, step=cycle_of(plant))
-
-
-def _places(plant: Plant) -> list[tuple[int, int]]:
-    """Rows and columns of the slopes of the responses by (state, input) that are not zero by structure."""
-    x, u, p = plant.symbols()
-    sparsity = ca.jacobian(plant.response_function(x, u, p), ca.vertcat(x, u)).sparsity()
-    rows, columns = sparsity.get_triplet()
-    return sorted(zip(rows, columns, strict=True))
-
-
-def _entries(plant: Plant) -> ca.Function:
-    """Function (state, input, parameters) -> parameters of `linear_reality`."""
-    x, u, p = plant.symbols()
-    slopes = ca.jacobian(plant.response_function(x, u, p), ca.vertcat(x, u))
-    return ca.Function("fpirhc_entries", [x, u, p], [ca.vertcat(*(slopes[i, j] for i, j in _places(plant)))])
 
 
 def _settling(problem: Problem, free: list[int]) -> Settling:

@@ -24,10 +24,9 @@ from fpirhc.contraction.gains import ContractionReport
 from fpirhc.contraction.large_errors import two_cycle_limit
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
-from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops_by_gain import LoopsByGain
 from fpirhc.review.margins import LEAST_GAIN, LEAST_PHASE, margins
-from fpirhc.review.neutral import NEUTRAL
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
 
 MARGIN = 2.0
 SECANT, TWO_CYCLE = "the map's steepest secant", "a two-cycle of the whole loop"
@@ -95,9 +94,12 @@ def recommended_gain(
 
 
 def secant_limit(loops: LoopsByGain) -> float | None:
-    """Return the smallest secant gain with which the loop has a two-cycle along the reference; None where it is not known."""
+    """Return the smallest secant gain with which the loop has a two-cycle along the reference; None where it is not known.
+
+    Between plans a loop alternates from cycle to cycle, so plans are held.
+    """
     try:
-        return min(two_cycle_limit(low.dynamics, own.dynamics, loops.gains) for low, own in loops.along(_ALONG))
+        return min(two_cycle_limit(low.dynamics, own.dynamics, loops.gains) for low, own in loops.held(_ALONG))
     except (FpirhcError, np.linalg.LinAlgError):
         return None
 
@@ -141,7 +143,7 @@ def _with_margins(loops: LoopsByGain, gain: float) -> float:
 
 
 def _keeps_margins(loop: LinearLoop) -> bool:
-    sizes = [margins(loop, i)[:2] for i in range(loop.entry.shape[1])]
+    sizes = [margins(loop, i)[:2] for i in range(loop.cycles[0].entry.shape[1])]
     return all(gain >= LEAST_GAIN and phase >= LEAST_PHASE for gain, phase in sizes)
 
 

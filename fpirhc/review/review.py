@@ -31,7 +31,7 @@ from fpirhc.review.null_test import leaves_right_model_alone
 from fpirhc.review.of_order_zero import controls_order_zero, review_of_order_zero
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
-from fpirhc.review.plan_period import loops_of_periods, plans_seldom
+from fpirhc.review.planned import is_planned
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
 from fpirhc.review.rates import rates_inside
 from fpirhc.review.reach import range_enough
@@ -39,7 +39,6 @@ from fpirhc.review.schedule import schedule_stable
 from fpirhc.review.signs import one_sign
 from fpirhc.review.slew import slew_enough
 from fpirhc.review.speed import bears_lag, fast_enough
-from fpirhc.review.stand_in import is_planned
 from fpirhc.review.two_cycles import free_of_two_cycles
 from fpirhc.review.well_posed import well_posed
 from fpirhc.review.zero_dynamics import zero_dynamics, zero_dynamics_rate
@@ -143,12 +142,7 @@ def _zero_dynamics(case: Case) -> Answer | None:
 
 def _margins(case: Case) -> Answer | None:
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
-    stable = bool(case.loops.loops) and bool(
-        case.loops.radii.max() < 1
-    )  # a loop of plans in every cycle; else it cannot be run
-    seldom = stable and plans_seldom(case.problem, case.controller)
-    whole = loops_of_periods(case.grid, case.controller) if seldom else ()
-    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, whole=whole)
+    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned)
 
 
 def _more(case: Case) -> list[Answer]:

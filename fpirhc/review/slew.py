@@ -12,11 +12,10 @@ import numpy as np
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.chain import derivatives_function
-from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop, controlled_gain
-from fpirhc.review.straight import straightened
+from fpirhc.review.state_slopes import state_slopes
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
 SPARE = 2.0  # how many times faster than the reference the map should be
@@ -71,27 +70,22 @@ def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
 def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop) -> float:
     """Largest |d r/dt| of the plan's feedback from the problem's start."""
     plant = grid.problem.plant
-    z = np.zeros(len(ideal.dynamics))
-    straight = straightened(grid.problem)
-    z[ideal.state] = _start_deviation(grid, straight.plant)
-    commands = np.empty((_CYCLES, len(plant.inputs)))
-    for k in range(_CYCLES):
-        commands[k] = ideal.arriving @ z
-        z = ideal.dynamics @ z
     command = np.nan_to_num(grid.commands[0, 0])
-    gain = controlled_gain(straight.plant, straight.slopes, grid.states[0], command, believed)
-    changes = np.linalg.norm(np.diff(commands, axis=0) @ gain.T, axis=1)
-    return float(changes.max() / grid.problem.period)
+    slopes = state_slopes(plant, grid.states[0], command, believed)
+    commands = ideal.carried(ideal.placed @ _start_deviation(grid, slopes.y), _CYCLES)[1]
+    count = len(ideal.cycles)  # plans move the command in steps
+    changes = np.linalg.norm((commands[count:] - commands[:-count]) @ slopes.d.T, axis=1)
+    return float(changes.max() / (count * grid.problem.period))
 
 
-def _start_deviation(grid: ReviewGrid, straight: Plant) -> np.ndarray:
-    """Deviation of the start from the reference, in the coordinates of the linear loop; inner states of outputs have none."""
-    problem = grid.problem
-    if not problem.plant.outputs:
+def _start_deviation(grid: ReviewGrid, shown: np.ndarray) -> np.ndarray:
+    """Deviation of the first state from the reference; with outputs the smallest one that explains theirs."""
+    problem, plant = grid.problem, grid.problem.plant
+    if not plant.outputs:
         return problem.start_state - grid.states[0]
-    reference = np.asarray(problem.reference.function(problem.plant)(0.0)[0].full()).ravel()
-    errors = dict(zip(problem.plant.output.elements, problem.start_output - reference, strict=True))
-    return np.array([errors.get(e, 0.0) for e in straight.state.elements])
+    reference = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
+    places = [k for k, e in enumerate(plant.output.elements) if e.rstrip("'") in plant.controlled_names]
+    return np.asarray(np.linalg.pinv(shown) @ (problem.start_output - reference)[places])
 
 
 def effect(grid: ReviewGrid, name: str) -> float:

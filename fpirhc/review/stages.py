@@ -16,8 +16,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import response_slopes
-from fpirhc.review.state_matrix import state_matrices
+from fpirhc.review.state_slopes import state_slopes
 
 CLOSE = 0.05  # distance of a pole of the step from exp(pole of the plant x step)
 _FINER = (2, 4, 8, 16, 32, 64)  # times the sub-steps in use
@@ -70,8 +69,7 @@ def step_poles(plant: Plant, integrator: Integrator, step: float, place: Place) 
     Raises:
         LinAlgError: the linearisation is not finite.
     """
-    slopes = response_slopes(plant)(place.state, place.command, place.parameters)
-    rates = np.linalg.eigvals(state_matrices(plant, *(np.asarray(m.full()) for m in slopes))[0])
+    rates = np.linalg.eigvals(state_slopes(plant, place.state, place.command, place.parameters).a)
     poles = np.linalg.eigvals(_matrix(plant, integrator, step, place))
     exact = np.exp(rates * step)
     apart = float(max(np.abs(poles - one).min() for one in exact))

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from fpirhc.by_name import FoundByName
 from fpirhc.contraction.noise import filter_pole
@@ -24,10 +23,9 @@ from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.review.grid import review_grid
-from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import loops_along
 from fpirhc.review.noise_along import Noisy, noisy_points
-from fpirhc.review.straight import straightened
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
@@ -173,8 +171,7 @@ def _floor(ideal: LinearLoop | None, noisy: Noisy, problem: Problem) -> dict[str
     plant = problem.plant
     if ideal is None or ideal.radius >= 1:
         return dict.fromkeys(plant.controlled_names, math.nan)
-    entry = ideal.entry @ noisy.inverses[0]
-    spread = scipy.linalg.solve_discrete_lyapunov(ideal.dynamics, entry @ noisy.covariance @ entry.T)
-    elements = straightened(problem).plant.state.elements
-    places = [ideal.state[elements.index(c)] for c in plant.controlled_names]
-    return {c: float(np.sqrt(spread[k, k])) for c, k in zip(plant.controlled_names, places, strict=True)}
+    spread = ideal.spread(noisy.inverses[0] @ noisy.covariance @ noisy.inverses[0].T)
+    sizes = np.sqrt(np.diag(ideal.errors @ spread @ ideal.errors.T))
+    judged = dict(zip(problem.judged_names, map(float, sizes), strict=True))
+    return {c: judged.get(c, math.nan) for c in plant.controlled_names}

@@ -34,9 +34,9 @@ from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.review.grid import each, review_grid
-from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import ideal_loops
 from fpirhc.review.prediction import NominalRun, exactly, nominal_run, response_errors
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.simulate import simulate
 from fpirhc.task.problem import Problem, cycles_per_stage
 
@@ -126,7 +126,7 @@ def _predicted(problem: Problem, controller: Controller, plants: np.ndarray, wid
     cycles, stages = cycles_per_stage(problem.horizon, problem.period), problem.horizon.stages
     loops = ideal_loops(review_grid(problem, 0.0, 0), nominal.controller, _POINTS)
     deviations = [_deviations(nominal, p) for p in plants]
-    reached = np.max([_reached(loop, cycles * stages, d) for loop, _ in loops for d in deviations], axis=0)
+    reached = np.max([_reached(loop, cycles * stages, d) for loop in loops for d in deviations], axis=0)
     rows = widen * reached[cycles - 1 :: cycles]
     places = {e: k for k, e in enumerate(problem.plant.state.elements)}
     return {e: tuple(map(float, rows[:, places[e]])) for e in hard}
@@ -170,12 +170,10 @@ def _reached(loop: LinearLoop, cycles: int, deviations: np.ndarray) -> np.ndarra
     """Largest over k of the sum of |H_l d_(k-l)| over l < 1 ... cycles: shape (cycles, nx)."""
     if loop.radius >= 1:
         raise NotSupported("no margins: the loop does not converge even with the right model")
-    memory = np.zeros((len(loop.dynamics), len(loop.state)))
-    memory[loop.state, np.arange(len(loop.state))] = 1.0
+    after = loop.carried(loop.placed, cycles)[0]
     sums, total = [], np.zeros_like(deviations)
-    for late in range(cycles):
+    for late, matrix in enumerate(after):
         if late < len(deviations):
-            total[late:] += np.abs(deviations[: len(deviations) - late] @ memory[loop.state].T)
+            total[late:] += np.abs(deviations[: len(deviations) - late] @ matrix.T)
         sums.append(total.max(axis=0))
-        memory = loop.dynamics @ memory
     return np.array(sums)

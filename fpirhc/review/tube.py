@@ -22,10 +22,11 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.errors import NotSupported
-from fpirhc.review.grid import review_grid
-from fpirhc.review.linear import LinearLoop
-from fpirhc.review.loops import ideal_loops
+from fpirhc.review.grid import ReviewGrid, review_grid
+from fpirhc.review.loops import ideal_loops, ideal_places
 from fpirhc.review.prediction import NominalRun, ResponseErrors
+from fpirhc.review.state_slopes import state_slopes
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 _POINTS = 5  # of the reference, whose impulse responses are compared
 _GONE = 1e-6  # share of its largest value below which an impulse response is over
@@ -51,7 +52,9 @@ def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.nda
         raise NotSupported("no tube: a coordinate that is not controlled moves by itself")
     force = majorant(nominal, errors, gain, exact) + np.abs(errors.force - errors.error)
     grid = review_grid(nominal.problem, 0.0, 0)
-    answers = [_impulses(*one, nominal.cycles) for one in ideal_loops(grid, nominal.controller, _POINTS)]
+    loops = ideal_loops(grid, nominal.controller, _POINTS)
+    effects = [_effect(grid, nominal, k) for k in ideal_places(grid, nominal.believed, _POINTS)]
+    answers = [_impulses(*one, nominal.cycles) for one in zip(loops, effects, strict=True)]
     longest = max(len(a) for a in answers)
     largest = np.max([np.pad(a, ((0, longest - len(a)), (0, 0), (0, 0))) for a in answers], axis=0)
     bound = np.zeros((nominal.cycles + 1, largest.shape[1]))
@@ -77,19 +80,21 @@ def majorant(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np
     return bound
 
 
+def _effect(grid: ReviewGrid, nominal: NominalRun, place: int) -> np.ndarray:
+    """The model's gain (n, nu) from inputs to responses at a point."""
+    at = grid.states[place], grid.needed(nominal.believed)[place], nominal.believed
+    return state_slopes(grid.problem.plant, *at).d
+
+
 def _impulses(loop: LinearLoop, gain: np.ndarray, cycles: int) -> np.ndarray:
     """|h_j| (j, nx, n): the motion of the states after a unit of the responses over one cycle."""
     if loop.radius >= 1:
         raise NotSupported("no tube: the loop does not converge even with the right model")
-    memory = loop.entry @ np.linalg.inv(gain)
-    sizes, largest = [], 0.0
-    for _ in range(cycles):
-        sizes.append(np.abs(memory[loop.state]))
-        largest = max(largest, float(np.abs(memory).max()))
-        if np.abs(memory).max() < _GONE * largest:
-            break
-        memory = loop.dynamics @ memory
-    return np.array(sizes)
+    count, by_response = len(loop.cycles), np.linalg.inv(gain)
+    after = [loop.carried(one.entry @ by_response, cycles, k + 1)[0] for k, one in enumerate(loop.cycles)]
+    sizes = np.max(np.abs(after), axis=0)  # of all cycles of a period in which the unit may come
+    lasting = sizes.max(axis=(1, 2)) >= _GONE * sizes.max()
+    return np.asarray(sizes[: int(np.flatnonzero(lasting).max(initial=0)) + count])
 
 
 def _convolved(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -1,24 +1,22 @@
 """Are the zero dynamics stable? They are the motion of the other states while the controlled ones stay on the reference.
 
-With x' = A x + B u and the responses y^(r) = A_c x + B_c u of the controlled coordinates at zero, u = -B_c^-1 A_c x, the states
-that are no derivative of a controlled coordinate move by themselves.
+With x' = A x + B u and the responses y^(r) = C x + D u of the controlled coordinates at zero, u = -D^-1 C x, the states that leave
+the derivatives below them at zero move by themselves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import casadi as ca
 import numpy as np
+from scipy.linalg import null_space
 
 from fpirhc.plant.maps import growth_of
-from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
-from fpirhc.review.neutral import NEUTRAL
-from fpirhc.review.state_matrix import state_matrices
-from fpirhc.review.straight import straightened
+from fpirhc.review.state_slopes import StateSlopes, state_slopes
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 
@@ -32,34 +30,26 @@ def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
 
     Of a map it is the largest rate with which one of its modes grows; minus infinity where all end within a few cycles.
     """
-    if not _inside(straightened(grid.problem).plant):
+    plant = grid.problem.plant
+    orders = dict(zip(plant.face.names, plant.face.orders, strict=True))
+    if sum(orders[name] for name in plant.controlled_names) == plant.state.size:
         return None
     modes = zero_dynamics_modes(grid, [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()])
-    growth = growth_of(grid.problem.plant)
+    growth = growth_of(plant)
     return max((float(growth(one).max()) for one in modes), default=float("nan"))
 
 
 def zero_dynamics_modes(grid: ReviewGrid, places: Sequence[int]) -> list[np.ndarray]:
     """Return the eigenvalues of the zero dynamics at points of the reference, per unit of time; none where all is controlled."""
-    straight = straightened(grid.problem)
-    plant, exact, inside = straight.plant, grid.problem.plant.exact, _inside(straight.plant)
-    if not inside:
-        return [np.zeros(0)] * len(places)
-    points = [(grid.states[k], grid.commands[0, k]) for k in places]
-    return [_modes(plant, straight.slopes_on(x, exact)(x, u, exact), inside) for x, u in points]
+    plant = grid.problem.plant
+    return [_modes(state_slopes(plant, grid.states[k], grid.commands[0, k], plant.exact)) for k in places]
 
 
-def _inside(plant: Plant) -> list[int]:
-    """Places of the states that are no derivative of a controlled coordinate."""
-    return [k for k, e in enumerate(plant.state.elements) if e.rstrip("'") not in plant.controlled_names]
-
-
-def _modes(plant: Plant, slopes: tuple[ca.DM, ca.DM], inside: list[int]) -> np.ndarray:
-    rows, gains = (np.asarray(m.full()) for m in slopes)
-    controlled = list(plant.controlled_indices)
-    a, b = state_matrices(plant, rows, gains)
-    internal = (a - b @ np.linalg.solve(gains[controlled], rows[controlled]))[np.ix_(inside, inside)]
-    return np.asarray(np.linalg.eigvals(internal))
+def _modes(slopes: StateSlopes) -> np.ndarray:
+    """Eigenvalues of A - B D^-1 C on the states that leave all derivatives below the responses at zero, Y x = 0."""
+    inside = null_space(slopes.y)
+    motion = slopes.a - slopes.b @ np.linalg.solve(slopes.d, slopes.c)
+    return np.asarray(np.linalg.eigvals(inside.T @ motion @ inside))
 
 
 def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Loops) -> Answer:

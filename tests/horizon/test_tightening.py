@@ -8,12 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from reviewed import linear
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.review.linear import LinearLoop
 from fpirhc.review.tightening import _reached
 
 LIMIT = 0.8
@@ -104,7 +104,7 @@ def test_margins_for_a_box_of_parameters_are_at_least_those_of_the_plant():
 def test_predicted_margins_are_those_of_the_deviations_in_their_order():
     """A single jump counts once, and what comes after it as the loop carries it on; one in every cycle counts every time."""
     dynamics = np.array([[0.9, 0.1], [-0.4, 0.7]])
-    loop = LinearLoop(dynamics, np.zeros((2, 1)), np.zeros((1, 2)), np.arange(2), 0.01)
+    loop = linear(dynamics, np.zeros((2, 1)), np.zeros((1, 2)), np.arange(2), 0.01)
     once = np.zeros((40, 2))
     once[3] = (0.0, 1.0)
     powers = [np.abs(np.linalg.matrix_power(dynamics, k)[:, 1]) for k in range(10)]

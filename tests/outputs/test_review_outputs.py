@@ -15,9 +15,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.plan_of_outputs import output_plan_gains
 from fpirhc.review.slew import effect, slew_enough
-from fpirhc.review.straight import straightened
 
 LEVEL = 3.0  # mg/l
 CONVERGED = fp.RecedingHorizon(fp.FixedPoint(iterations=8, tolerance=1e-9))
@@ -41,35 +39,6 @@ def resting(**settings: Any) -> fp.Problem:
     return replace(sedated(hill(5.5)), **{**changes, **settings})
 
 
-def test_the_feedback_of_a_plan_is_what_a_plan_does() -> None:
-    """The slopes of the first command of converged plans by the state and by the input before."""
-    problem, size = resting(), 1e-3
-    assert problem.horizon is not None
-    assert problem.cost is not None
-    plant = problem.plant
-    states = problem.start_state[None, :]
-    [gain] = output_plan_gains(problem, problem.horizon, problem.cost, [0.0], states, plant.approximate)
-    straight = straightened(problem)
-    assert straight.change is not None
-    assert gain.outputs is not None
-    feedback = straight.feedback_on(gain, problem.start_state, np.array([LEVEL]), plant.exact, plant.approximate)
-    change = straight.change(problem.start_state, plant.exact).full()
-
-    def first(**settings: Any) -> float:
-        short = replace(problem, duration=0.2, **settings)
-        return float(simulated(short, CONVERGED)["command"][0, 0])
-
-    slopes = [
-        (first(start={**problem.start, n: LEVEL + size}) - first(start={**problem.start, n: LEVEL - size})) / (2 * size)
-        for n in ("C", "E")
-    ]
-    assert np.allclose((feedback.state @ change).ravel(), slopes, rtol=1e-5)
-    assert np.abs(gain.outputs[0, 0]) > 1  # the wrong curve counts, and its slope is not extrapolated
-    assert gain.outputs[0, 1] == 0
-    before = (first(input_before={"u": LEVEL + size}) - first(input_before={"u": LEVEL - size})) / (2 * size)
-    assert feedback.before.item() == pytest.approx(before, rel=1e-5)
-
-
 @pytest.mark.parametrize("form", [fp.ModelReferenced(fp.Affine(-1.0))])
 def test_the_linear_loop_of_a_plan_is_the_decay_of_a_small_deviation(form: Deformation) -> None:
     problem, controller = resting(), replace(CONVERGED, deformation=form)
@@ -82,14 +51,14 @@ def test_the_linear_loop_of_a_plan_is_the_decay_of_a_small_deviation(form: Defor
 
 
 def test_the_linear_loop_of_plans_on_outputs_that_are_coordinates_is_that_of_plans_on_coordinates() -> None:
-    """Rates are weighed in both: a deviation from a feedforward needs references of states."""
+    """Rates are weighed in both: a deviation from a feedforward needs references of states. Motions of outputs are interpolated."""
     start = {"q1": 2.2, "q2": 5.4, "q1'": 0.6, "q2'": 0.9}
     cost = fp.Quadratic(states={"q1": 1e3, "q2": 1e3, "q1'": 1.0, "q2'": 1.0}, rate={"Q1": 1e-4, "Q2": 1e-4})
     plain = replace(TWO_MASS.problem, start=start, cost=cost, duration=1.0, measure_from=0.0)
     controller = fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-3), fp.Affine(-0.5))
     one, other = (loops_along(review_grid(p, 0.0, 0), controller) for p in (plain, on_outputs(plain)))
     assert one.loops
-    assert np.allclose(one.radii, other.radii, atol=1e-6)
+    assert np.allclose(one.radii, other.radii, atol=1e-4)
 
 
 def answers(problem: fp.Problem, controller: Controller) -> dict[str, Answer]:
@@ -167,7 +136,7 @@ def test_the_effect_of_a_disturbance_is_that_on_the_outputs() -> None:
 
 
 def test_the_lag_of_a_reality_is_found_beside_outputs() -> None:
-    """N Lambda tau with the pump's lag, and what has no linear loop says so."""
+    """N Lambda tau with the pump's lag, and the loop around the pump: its run comes to rest as the pole says."""
     tau = 0.02  # min
     real = fp.Plant.of_states(
         states={"C": "mg/l", "E": "mg/l", "pump": "mg/l/min"},
@@ -182,7 +151,10 @@ def test_the_lag_of_a_reality_is_found_beside_outputs() -> None:
     room = asked["Does the tracking law leave room for the lag of the reality?"]
     assert room.numbers["lag"] == pytest.approx(tau, rel=0.02)
     assert room.numbers["room"] == pytest.approx(3 * tau, rel=0.02)
-    assert "simulate it" in asked["Does the loop with the reality converge?"].evidence
+    assert asked["Does the loop with the reality converge?"].verdict == "yes"
+    run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.Affine(-1.0)), seed=0, compiled=False)
+    errors = np.abs(run["error"][:, 0])
+    assert errors[-50:].max() < 0.1 * errors.max()
 
 
 def test_a_plan_on_the_hand_of_an_arm_has_a_linear_loop() -> None:

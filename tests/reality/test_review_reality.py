@@ -59,7 +59,7 @@ def answer(problem: fp.Problem, controller: fp.ComputedTorque, question: str) ->
 def radius(problem: fp.Problem, controller: fp.ComputedTorque) -> float:
     """The largest pole of the real pair."""
     grid = review_grid(problem, 0.0, 0)
-    return max(one.radius for one in real_loops(grid, controller, real_points(grid)))
+    return max(one.radius for one in real_loops(grid, controller))
 
 
 def test_real_pair_of_the_same_plant_is_the_plant_itself():
@@ -68,7 +68,7 @@ def test_real_pair_of_the_same_plant_is_the_plant_itself():
     controller = adapted(6.0, 0.3)
     expected = np.sort(np.abs(loops_along(review_grid(plain, 0.0, 0), controller).loops[0].poles))
     grid = review_grid(real, 0.0, 0)
-    poles = np.sort(np.abs(real_loops(grid, controller, real_points(grid))[0].poles))
+    poles = np.sort(np.abs(real_loops(grid, controller)[0].poles))
     assert np.allclose(poles, expected, atol=1e-9)
 
 

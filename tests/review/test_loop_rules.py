@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chains import chain, coupled, errors_after_request, linear_loop
+from chains import chain, coupled, errors_after_request, linear_loop, linear_pair
 from sampled import edge, lag, poles, resonance
 
 import fpirhc as fp
@@ -135,7 +135,7 @@ def test_automatic_scale_covers_the_basin():
 
 
 def cycle_limit(problem: fp.Problem, rate: float) -> float:
-    low, high = [linear_loop(problem, torque(rate, fp.Affine(gain=-2 * a))).dynamics for a in (0.3, 0.6)]
+    low, high = linear_pair(problem, torque(rate, fp.Affine(gain=-1.0)), (0.3, 0.6))
     return two_cycle_limit(low, high, (0.3, 0.6))
 
 
@@ -180,7 +180,7 @@ def test_no_two_cycle_below_the_limit():
 
 def test_two_cycle_limit_of_a_gain_of_the_other_sign():
     """A model with the wrong sign and a map with a negative gain make the same loop."""
-    low, high = [linear_loop(chain(2, 1.5), torque(6.0, fp.Affine(gain=-2 * a))).dynamics for a in (0.3, 0.6)]
+    low, high = linear_pair(chain(2, 1.5), torque(6.0, fp.Affine(gain=-1.0)), (0.3, 0.6))
     assert two_cycle_limit(low, high, (-0.3, -0.6)) == pytest.approx(two_cycle_limit(low, high, (0.3, 0.6)))
     assert two_cycle_limit(np.eye(2), np.eye(2), (0.3, 0.6)) == math.inf
 

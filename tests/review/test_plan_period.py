@@ -14,7 +14,8 @@ import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import review_grid
-from fpirhc.review.plan_period import loops_of_periods, period_margins, plans_seldom
+from fpirhc.review.loops import loops_along
+from fpirhc.review.margins import margins
 
 
 class Multiplied:
@@ -62,9 +63,8 @@ def test_a_command_multiplied_by_less_than_the_gain_margin_is_calm_and_by_more_i
     """The margin is 3.96 on the two masses, where a plan in every cycle would have 39.5; that of the last one is downwards."""
     problem = task.problem if duration is None else replace(task.problem, duration=duration, measure_from=0.0)
     one, grid = task.controllers[controller], review_grid(task.problem, 0.0, 0)
-    assert plans_seldom(problem, one)
-    loops = loops_of_periods(grid, resolved(grid.problem, one))
-    margin = min(period_margins(loop, i)[0] for loop in loops for i in range(len(problem.plant.inputs)))
+    loops = loops_along(grid, resolved(grid.problem, one)).loops
+    margin = min(margins(loop, i)[0] for loop in loops for i in range(len(problem.plant.inputs)))
     factors = (0.85 * margin, 1.3 * margin) if up else (1 / (0.85 * margin), 1 / (1.3 * margin))
     calm, wild = (movement(multiplied(problem, factor), one) for factor in factors)
     assert wild > 5 * calm
@@ -76,11 +76,3 @@ def test_the_answer_is_that_of_the_whole_period() -> None:
     answer = next(a for a in answers if a.question == "Has the linear loop enough margin?")
     assert "per cycle, over the 10 cycles from plan to plan" in answer.evidence
     assert answer.numbers["gain_margin"] == pytest.approx(3.96, rel=0.02)
-
-
-def test_plans_in_every_cycle_and_laws_have_no_period() -> None:
-    task = fp.load_problem("two_mass")
-    assert task.problem.horizon is not None
-    every = replace(task.problem, horizon=replace(task.problem.horizon, step=task.problem.period))
-    assert not plans_seldom(every, task.controllers["RHC"])
-    assert not plans_seldom(task.problem, task.controllers["CTC"])

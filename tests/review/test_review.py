@@ -140,7 +140,8 @@ def test_margins_are_where_the_loop_loses_its_stability():
     """More gain than the gain margin, or more delay than the delay margin, puts a pole outside the unit circle, less does not."""
     [loop, *_] = loops_along(review_grid(mass(), 0.0, 0), torque()).loops
     gain, phase, delay = margins(loop, 0)
-    f, g, c = loop.dynamics, loop.entry[:, [0]], loop.arriving[[0]]
+    [one] = loop.cycles
+    f, g, c = one.dynamics, one.entry[:, [0]], one.arriving[[0]]
 
     def radius(matrix: np.ndarray) -> float:
         return float(np.abs(np.linalg.eigvals(matrix)).max())

@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from reviewed import linear
 
 import fpirhc as fp
 from fpirhc.contraction.gains import assess_gain
@@ -18,12 +19,12 @@ from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges
 from fpirhc.review.gain import gain_admissible
 from fpirhc.review.grid import ReviewGrid, review_grid
-from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.recommended_gain import recommended_gain
 from fpirhc.review.slew import slew_enough
 from fpirhc.review.wording import duration, per_cycle
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 PERIOD, CYCLES = 0.1, 100
 EDGE = math.log(100) / CYCLES  # of the logarithm of a factor per cycle
@@ -50,7 +51,7 @@ def grid() -> ReviewGrid:
 def loop(radius: float) -> LinearLoop:
     """A loop with one mode."""
     one = np.array([[radius]])
-    return LinearLoop(one, one, one, np.array([0]), PERIOD)
+    return linear(one, one, one, np.array([0]), PERIOD)
 
 
 def loops(*radii: float, ideal: float | None = 0.5, **more: Any) -> Loops:
@@ -107,12 +108,12 @@ def test_poles_and_times_are_in_the_units_of_the_field():
 def test_margins_of_an_integrator_by_hand(grid):
     """x+ = x + w, w = -0.1 x: L(-1) = -1/20; |z - 1| = 0.1 at 0.10004 rad a cycle, where the phase is -90 - 2.87 deg."""
     one = np.eye(1)
-    integrator = LinearLoop(0.9 * one, one, -0.1 * one, np.array([0]), PERIOD)
+    integrator = linear(0.9 * one, one, -0.1 * one, np.array([0]), PERIOD)
     answer = margins_enough(grid.problem, Loops((0,), (integrator,), integrator), adapts=True, planned=False)
     assert answer.evidence == (
         "largest closed-loop pole magnitude 0.9; gain margin 20 (26 dB), phase margin 87.1 deg, delay margin 1.52 s (15.2 cycles)"
     )
-    unstable = LinearLoop(1.1 * one, one, 0.1 * one, np.array([0]), PERIOD)
+    unstable = linear(1.1 * one, one, 0.1 * one, np.array([0]), PERIOD)
     lost = margins_enough(grid.problem, Loops((0,), (unstable,), unstable), adapts=True, planned=False)
     assert (lost.verdict, lost.numbers) == ("no", {"radius": 1.1})
     assert lost.evidence == (
@@ -271,7 +272,7 @@ def test_disturbances_ask_for_speed_as_well():
 
 def test_a_start_off_the_reference_asks_for_speed():
     """Commands 6 (1/2)^k N per metre off: the first change, 3 N or 2 m/s2 of the model, in a period of 0.1 s is 20 per second."""
-    plan = LinearLoop(np.diag([0.5, 0.5]), np.eye(2), np.array([[6.0, 0.0]]), np.array([0, 1]), PERIOD)
+    plan = linear(np.diag([0.5, 0.5]), np.eye(2), np.array([[6.0, 0.0]]), np.array([0, 1]), PERIOD)
     one = slew(mass(start={"q": 1.0, "q'": 1.5}), 1.0, plan)
     assert one.numbers["needed"] == pytest.approx(20.0)
     assert one.evidence.startswith("the request changes by up to 20 per s after the start, the map")
@@ -297,7 +298,7 @@ def test_effects_of_an_input_are_those_at_the_first_command():
     """A newton more than 2 N is 27 - 8 of the plant; the model's slope is 3 x 4 / 2, so 3 N in a period are 180 per second."""
     jump = slew(cubed(disturbances={"u": fp.Step(at=1.0, size=1.0)}), 1.0)
     assert jump.numbers["jump"] == pytest.approx(19.0)
-    plan = LinearLoop(np.diag([0.5, 0.5]), np.eye(2), np.array([[6.0, 0.0]]), np.array([0, 1]), PERIOD)
+    plan = linear(np.diag([0.5, 0.5]), np.eye(2), np.array([[6.0, 0.0]]), np.array([0, 1]), PERIOD)
     assert slew(cubed(start={"y": 1.0}), 1.0, plan).numbers["needed"] == pytest.approx(180.0)
 
 

@@ -7,10 +7,13 @@ from typing import Any
 
 import abroad
 import casadi as ca
+import numpy as np
 import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
+from fpirhc.deformation.base import with_inner
 
 
 def answer(problem: fp.Problem, controllers: dict[str, Controller], words: str) -> fp.Answer | None:
@@ -139,14 +142,17 @@ def test_without_such_limits_the_question_is_not_asked():
 # Reasons
 
 
-def test_a_learning_controller_has_a_reason_that_is_about_it():
-    """No list of a linearised plant's entries, and no name that the user should have meant."""
+def test_a_learning_controller_has_the_loop_of_its_first_model():
+    """Its poles are those of inverse dynamics with that model, and decide nothing, because it learns another one."""
     task = fp.load_problem("planar_arm")
-    one = answer(task.problem, {"AID": task.controllers["AID"]}, "margin")
+    learning = task.controllers["AID"]
+    assert isinstance(learning, fp.AdaptiveInverseDynamics)
+    plain = fp.ComputedTorque(learning.tracking)
+    one, other = (answer(task.problem, {"it": c}, "margin") for c in (learning, plain))
     assert one is not None
-    assert one.evidence == (
-        "no linear loop: AdaptiveInverseDynamics learns parameters by name, which a linearised plant does not have"
-    )
+    assert other is not None
+    assert one.numbers["radius"] == pytest.approx(other.numbers["radius"], rel=1e-4)
+    assert (one.verdict, one.numbers["radius"] > 1) == ("unknown", True)
 
 
 def test_advice_for_a_controller_without_a_map_names_no_gain():
@@ -155,3 +161,19 @@ def test_advice_for_a_controller_without_a_map_names_no_gain():
     one = answer(task.problem, {"RHC": task.controllers["RHC"]}, "margin")
     assert one is not None
     assert (one.verdict, one.change) == ("unknown", "Weigh the inputs more.")
+
+
+def test_a_map_has_all_cycles_between_two_plans_for_a_jump_of_the_plan():
+    """Plans every 20 cycles move the request by 50 m/s2 after the start, three steps of the map; no run without bound is better."""
+    task = fp.load_problem("delayed_mass")
+    controller = resolved(task.problem, task.controllers["RHC+FPI"])
+    one = answer(task.problem, {"it": controller}, "fast enough for reference")
+    assert one is not None
+    assert one.verdict == "yes"
+    deformation = controller.deformation
+    unbounded = with_inner(deformation, fp.Affine(gain=-2 * deformation.effective_gain()))
+    errors = [
+        fp.simulate(task.problem, c, seed=0, compiled=False)["error"]
+        for c in (controller, controller.with_deformation(unbounded))
+    ]
+    assert np.linalg.norm(errors[0]) < 1.02 * np.linalg.norm(errors[1])

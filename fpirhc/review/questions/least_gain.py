@@ -64,7 +64,7 @@ def _least_factor(case: Case) -> float | None:
     factors, pairs = np.geomspace(_SMALLEST, _LARGEST, _STEPS), loops.along(_POINTS)
 
     def stable(factor: float) -> bool:
-        return all(np.abs(loops.at(factor * loops.gain, pair).poles).max() < 1 for pair in pairs)
+        return all(loops.at(factor * loops.gains[1], pair).radius < 1 for pair in pairs)
 
     first = next((k for k, factor in enumerate(factors) if stable(float(factor))), None)
     if first is None:

@@ -6,8 +6,8 @@ import numpy as np
 
 from fpirhc.review.answer import Answer
 from fpirhc.review.discretisation import stage_follows
+from fpirhc.review.planned import is_planned
 from fpirhc.review.question import Case, ControllerQuestion
-from fpirhc.review.stand_in import is_planned
 
 TEXT = "Does the discretisation of the horizon follow the controller's own model?"
 

@@ -11,9 +11,9 @@ import numpy as np
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.neutral import NEUTRAL
 from fpirhc.review.question import Case, ControllerQuestion
-from fpirhc.review.real_pair import real_loops, real_points
+from fpirhc.review.real_pair import real_loops
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL
 
 TEXT = "Does the loop with the reality converge?"
 
@@ -22,12 +22,9 @@ def real_pair_converges(case: Case) -> Answer | None:
     """Return the largest pole of the real pair along the reference; None without a reality that is a plant."""
     if case.grid.real is None:
         return None
-    points = real_points(case.grid)
-    if not points:
-        return Answer(TEXT, Verdict.UNKNOWN, "the reality nowhere settles on the reference")
     try:
-        adapted = max(one.radius for one in real_loops(case.grid, case.controller, points))
-        bare = max(one.radius for one in real_loops(case.grid, without_deformation(case.controller), points))
+        adapted = max(one.radius for one in real_loops(case.grid, case.controller))
+        bare = max(one.radius for one in real_loops(case.grid, without_deformation(case.controller)))
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return Answer(TEXT, Verdict.UNKNOWN, f"no linear loop of the real pair: {error}")
     text = f"the slowest or fastest growing mode is multiplied by {adapted:.6g} per cycle, without adaptation by {bare:.6g}"

@@ -6,21 +6,18 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.neutral import NEUTRAL
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.reality_loop import TEXT
-from fpirhc.review.real_pair import real_loops, real_points
+from fpirhc.review.real_pair import real_loops
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL
 
 
 def plain_pair_converges(case: Case) -> Answer | None:
     """Return the largest pole of the real pair; None for adaptive controllers, and where there is no such loop to judge."""
     if case.grid.real is None or case.controller.deformation.adapts:
         return None
-    points = real_points(case.grid)
-    if not points:
-        return None
     try:
-        radius = max(one.radius for one in real_loops(case.grid, case.controller, points))
+        radius = max(one.radius for one in real_loops(case.grid, case.controller))
     except (FpirhcError, np.linalg.LinAlgError):
         return None
     text, numbers = f"the slowest or fastest growing mode is multiplied by {radius:.6g} per cycle", {"radius": radius}

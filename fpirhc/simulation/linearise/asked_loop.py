@@ -20,6 +20,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.gain_check import any_gain
 from fpirhc.errors import NotSupported
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
+from fpirhc.simulation.linearise.linear_map import GAIN
 from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.symbolic.block import Composite
@@ -71,12 +72,19 @@ class AskedLoop:
         self._errors = self.loop.trace.slice("true_error" if "true_error" in names else "error")
         self._state = self.loop.memory.slice("_state_before")
         self._request = [k for k, c in enumerate(self.loop.memory.columns) if "_deformed_last." in c]
+        self._phases = [k for k, c in enumerate(self.loop.memory.columns) if c.endswith("_phase")]
+        self._gains = [k for k, c in enumerate(self.loop.memory.columns) if c.split(".")[-1] == GAIN]
         self._inputs = len(self.problem.plant.inputs)
 
     @property
     def quick(self) -> bool:
         """Whether a step has neither a plan nor a solver in it."""
         return self._step.scalar
+
+    @property
+    def keeps_learned(self) -> bool:
+        """Whether a model or gains that change on line stay in the linear loop what they are at its point."""
+        return any(_LEARNED.search(column) for column in self.loop.memory.columns)
 
     @cached_property
     def repeats(self) -> int:
@@ -90,6 +98,7 @@ class AskedLoop:
         state: Mapping[str, float] | None = None,
         before: Mapping[str, float] | None = None,
         exact: np.ndarray | None = None,
+        gain: float | None = None,
     ) -> np.ndarray:
         """Return the memory of a loop that is started.
 
@@ -98,12 +107,25 @@ class AskedLoop:
             state: first state of the model; None: that of the problem.
             before: inputs before; None: those of the problem.
             exact: parameters of the plant that moves; None: its own.
+            gain: of a `LinearMap`; None: its own.
         """
         memory = start_memory(self.loop, _started(self.problem, state, before), self.controller)
         memory[self.loop.memory.slice("cycle")] = round(time / self.problem.period)
         if exact is not None and exact.size:  # an empty signal has one entry
             memory[self.loop.memory.slice("_exact")] = exact
-        return memory
+        return memory if gain is None else self.with_gain(memory, gain)
+
+    def with_gain(self, memory: np.ndarray, gain: float) -> np.ndarray:
+        """Return the memory with another gain of a `LinearMap`.
+
+        Raises:
+            NotSupported: the loop has no such map.
+        """
+        if not self._gains:
+            raise NotSupported("the gain is no part of the loop's memory")
+        changed = memory.copy()
+        changed[self._gains] = gain
+        return changed
 
     def run(
         self, memory: np.ndarray, cycles: int, led: np.ndarray | None = None, request: np.ndarray | None = None
@@ -139,7 +161,8 @@ class AskedLoop:
     def quietest(self, passage: Passage) -> np.ndarray:
         """Return the memory in the quietest part of a run: where commands differ least from those of the period before.
 
-        Cycles at a limit are left out as long as there are others: there a command has no slope.
+        Plans are in the same phase there as at the beginning of the run. Cycles at a limit are left out as long as there are
+        others: there a command has no slope.
 
         Raises:
             NotSupported: a run that is not finite from its first cycles on.
@@ -154,34 +177,37 @@ class AskedLoop:
         change = (np.abs(commands[n:] - commands[:-n]) / sizes).max(axis=1)
         quiet = np.logical_and(inside[n:], inside[:-n])
         quiet[: min(self._warm, len(quiet) - 1)] = False
-        change = np.where(quiet, change, np.inf) if quiet.any() else change
+        memories = passage.memories[n : n + len(quiet)]
+        phased = (memories[:, self._phases] == passage.memories[0, self._phases]).all(axis=1)
+        change = np.where(quiet & phased if (quiet & phased).any() else phased, change, np.inf)
         return np.asarray(passage.memories[n + len(change) - 1 - int(np.argmin(change[::-1]))])
 
     def at(self, memory: np.ndarray) -> LinearLoop:
         """Return the linear loop of the period that begins at a memory."""
-        return self._among((self,), self._period(memory))[0]
+        return self._among([self._period(memory)])[0]
 
-    def beside(self, other: AskedLoop, memory: np.ndarray, *, held: bool = False) -> tuple[LinearLoop, LinearLoop]:
-        """Return its linear loop and that of another loop with the same memory, in the same coordinates z.
+    def between(self, memory: np.ndarray, gains: tuple[float, float], *, held: bool = False) -> tuple[LinearLoop, ...]:
+        """Return the linear loops of two gains of a `LinearMap` in the same coordinates.
 
         Args:
-            other: with the same memory, such as one with another gain.
             memory: at which both are linearised.
+            gains: the effective gains.
             held: whether plans are held for ever, as far as there are cycles between them.
         """
         period = self._period(memory)
-        one, second = self._among((self, other), period[1:2] or period if held else period)
-        return one, second
+        some = period[1:2] or period if held else period
+        return self._among([[self.with_gain(one, gain) for one in some] for gain in gains])
 
-    def _among(self, loops: tuple[AskedLoop, ...], memories: list[np.ndarray]) -> tuple[LinearLoop, ...]:
-        memory, scales = memories[0], self._scales(memories[0])
-        ways = [[one._step.way(at, scales) for one in loops] for at in memories]
-        places, whole = np.arange(self._state.start, self._state.stop), np.eye(memory.size)[:, self._free]
+    def _among(self, periods: list[list[np.ndarray]]) -> tuple[LinearLoop, ...]:
+        """The linear loops along several periods, in the same coordinates."""
+        scales = self._scales(periods[0][0])
+        ways = [[self._step.way(at, scales) for at in together] for together in zip(*periods, strict=True)]
+        places = np.arange(self._state.start, self._state.stop)
         if self.quick:
-            directions = [along(some, whole, self._inputs) for some in ways]
+            directions = [along(some, np.eye(len(scales))[:, self._free], self._inputs) for some in ways]
         else:
             directions = reached(ways, self._free, places, self._inputs)
-        return tuple(self._linear([at[k] for at in ways], directions, k, scales[places]) for k in range(len(loops)))
+        return tuple(self._linear([at[k] for at in ways], directions, k, scales[places]) for k in range(len(periods)))
 
     def _linear(self, ways: list[Way], directions: list[Directions], number: int, scales: np.ndarray) -> LinearLoop:
         """The linear loop of one of the ways of every cycle."""
@@ -207,11 +233,10 @@ class AskedLoop:
 
     def _period(self, memory: np.ndarray) -> list[np.ndarray]:
         """The memories of as many cycles as pass until the phases of plans are the same again."""
-        phases = np.array([column.endswith("_phase") for column in self.loop.memory.columns])
         memories = [memory]
         while True:
             memory_next, _ = self._step(memories[-1])
-            if np.array_equal(memory_next[phases], memory[phases]):
+            if np.array_equal(memory_next[self._phases], memory[self._phases]):
                 return memories
             memories.append(memory_next)
 
@@ -221,6 +246,7 @@ class AskedLoop:
         fixed = np.array([bool(_COUNTS.search(c) or _LEARNED.search(c)) for c in self.loop.memory.columns])
         for name in ("_exact", "parameters"):
             fixed[self.loop.memory.slice(name)] = True
+        fixed[self._gains] = True
         return ~fixed
 
     def _scales(self, memory: np.ndarray) -> np.ndarray:

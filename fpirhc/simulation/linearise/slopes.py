@@ -113,7 +113,7 @@ def reached(ways: Sequence[Sequence[Way]], free: np.ndarray, first: np.ndarray, 
         NotSupported: more directions than a loop should need.
     """
     still, calm, count = np.zeros(free.size), np.zeros(inputs), len(ways)
-    waiting = [(0, np.eye(free.size)[k]) for k in first]
+    waiting = [(0, np.where(np.arange(free.size) == k, 1.0, 0.0)) for k in first]
     for k, some in enumerate(ways):
         moved = [way(still, one)[0] * free for way in some for one in np.eye(inputs)]
         waiting += [((k + 1) % count, one / (np.linalg.norm(one) or 1.0)) for one in moved]

@@ -1,0 +1,77 @@
+"""A map as it is near its fixed point, r+ = r - a (f - d), with the gain a in its memory.
+
+Every map is this one to first order. The loop of one map for every gain is then one loop with other memories, affine in a.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Self
+
+from fpirhc.controllers.base import Controller
+from fpirhc.deformation.base import Deformation, Iteration, with_inner
+from fpirhc.errors import FpirhcError
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+
+GAIN = "map_gain"  # in the memory
+
+
+@dataclass(frozen=True)
+class LinearMap(Deformation):
+    """r+ = r - a (f - d).
+
+    Args:
+        gain: a at the start.
+    """
+
+    gain: float
+
+    @property
+    def iteration(self) -> Iteration:
+        """Of no limit, because a gain that a run refuses has poles too."""
+        return Iteration(limited=False)
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        """The gain."""
+        del elements
+        return Layout((scalar(GAIN, start=self.gain),))
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return r - a (f - d)."""
+        return request - memory[GAIN] * (response - desired), {GAIN: memory[GAIN]}
+
+    def effective_gain(self) -> float:
+        """The gain a."""
+        return self.gain
+
+    def secant_gain(self) -> float:
+        """The gain a."""
+        return self.gain
+
+    def largest_step(self) -> float:
+        """Infinite."""
+        return float("inf")
+
+    def with_effective_gain(self, gain: float) -> Self:
+        """Return the map with another gain."""
+        return replace(self, gain=gain)
+
+
+def near_fixed_point(controller: Controller) -> Controller:
+    """Return the controller with its map as it is near the fixed point; itself where the map changes on line, or does not adapt."""
+    deformation = controller.deformation
+    if not deformation.adapts or not deformation.iteration.constant:
+        return controller
+    try:
+        return controller.with_deformation(_linear(deformation))
+    except FpirhcError:  # a controller whose map cannot be replaced
+        return controller
+
+
+def _linear(deformation: Deformation) -> Deformation:
+    if deformation.inner is None:
+        return LinearMap(deformation.effective_gain())
+    return with_inner(deformation, _linear(deformation.inner))
