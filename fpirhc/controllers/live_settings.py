@@ -22,7 +22,7 @@ from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.given import described
 from fpirhc.fields.kinds import real_number
 from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
-from fpirhc.symbolic.constants import holds_nan
+from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, copied, live_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in, paths_to

@@ -16,8 +16,7 @@ import casadi as ca
 
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.symbolic.chain_rule import ChainRule, chain_rule
-from fpirhc.symbolic.tangents import slopes_function, tangent_code
+from fpirhc.symbolic.chain_rule import ChainRule, chain_rule, slopes_function, tangent_code
 
 _MANY = 16  # directions from which on loops over all of them beat scalar code: 24 directions took .76 of the time, 12 took 1.03
 

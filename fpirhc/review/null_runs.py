@@ -15,9 +15,8 @@ from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.review.grid import each
 from fpirhc.review.nominal_runs import CYCLES
 from fpirhc.review.prediction import NominalRun, exactly
-from fpirhc.simulation.believed_way import with_believed_way
 from fpirhc.simulation.error_pair import ErrorPair
-from fpirhc.simulation.model_as_plant import shortened
+from fpirhc.simulation.model_as_plant import shortened, with_believed_way
 from fpirhc.simulation.simulate import simulate
 from fpirhc.task.outside import as_told
 from fpirhc.task.problem import Problem

@@ -21,8 +21,8 @@ from fpirhc.review.null_runs import null_runs
 from fpirhc.review.pays import ROUNDING, nominal_size, rms
 from fpirhc.review.prediction import NominalRun, errors_without_adaptation, response_errors
 from fpirhc.review.question import Case
-from fpirhc.simulation.believed_way import with_believed_way
 from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
+from fpirhc.simulation.model_as_plant import with_believed_way
 
 QUESTION_TEXT = "Does adaptation leave a right model alone?"
 _PRACTICAL = 100  # times, by which a period may be shortened in earnest

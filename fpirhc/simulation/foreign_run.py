@@ -7,8 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fpirhc.simulation.dropped_steps import Dropped
-from fpirhc.simulation.ranges import physical_ranges
+from fpirhc.simulation.ranges import Dropped, physical_ranges
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem

@@ -97,7 +97,7 @@ class Run(Log):
 
     def plot(self) -> Figure:
         """Return errors, commands and responses over time as a matplotlib Figure."""
-        from fpirhc.simulation.run_figure import run_figure
+        from fpirhc.simulation.drawing import run_figure
 
         return run_figure(self)
 

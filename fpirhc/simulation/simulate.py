@@ -20,10 +20,9 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
-from fpirhc.simulation.dropped_steps import Dropped
 from fpirhc.simulation.foreign_run import Patch, run_foreign, stopped
 from fpirhc.simulation.loop import close_loop, start_memory
-from fpirhc.simulation.ranges import ranges_of
+from fpirhc.simulation.ranges import Dropped, ranges_of
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
 from fpirhc.simulation.set_points import Setpoints, set_point_record, set_point_table

@@ -19,16 +19,13 @@ from fpirhc.controllers.plausible import plausible_range
 from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import Checked
 from fpirhc.simulation.clock import MEMORY as CLOCK
-from fpirhc.simulation.deadline import Clock, Deadline
+from fpirhc.simulation.clock import Clock, Deadline, missed_cycles, most_missed
 from fpirhc.simulation.harm_warning import warn_of_harm, with_recommended_gain
-from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch
-from fpirhc.simulation.missed import missed_cycles, most_missed
-from fpirhc.simulation.numbers_now import NumbersNow
+from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, composed_step, measures, refuse_unbounded
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
 from fpirhc.simulation.set_points import SetpointsNow
-from fpirhc.simulation.step_arguments import NOT_WRITTEN, NOTHING, StepArguments
-from fpirhc.simulation.step_composition import composed_step, measures, refuse_unbounded
+from fpirhc.simulation.step_arguments import NOT_WRITTEN, NOTHING, NumbersNow, StepArguments
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
 from fpirhc.task.limits import Interval

@@ -8,10 +8,12 @@ optimisers) is typed as MX. This module is the only place where one kind passes 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias, TypeVar, cast
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.errors import nearest
 
@@ -68,3 +70,18 @@ def pair(results: Expression) -> tuple[Expression, Expression]:
     """Return the two results of a call; CasADi's stub has calls with one result only."""
     first, second = results
     return first, second
+
+
+def holds_nan(function: ca.Function) -> bool:
+    """Whether a Function, or one that it calls, holds the constant NaN."""
+    return any(_has_nan(f) for f in (function, *function.find_functions()))
+
+
+def _has_nan(function: ca.Function) -> bool:
+    if not function.is_a("SXFunction") and not function.is_a("MXFunction"):
+        return False
+    places = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CONST]
+    if function.is_a("SXFunction"):
+        return any(math.isnan(function.instruction_constant(k)) for k in places)
+    matrices = (function.instruction_MX(k).to_DM() for k in places)
+    return any(bool(np.isnan(np.asarray(m.full())).any()) for m in matrices)

@@ -31,9 +31,8 @@ from pathlib import Path
 import casadi as ca
 
 from fpirhc.errors import CompileError, NotSupported
-from fpirhc.symbolic.driver import substitute
+from fpirhc.symbolic.driver import substitute, with_less_work
 from fpirhc.symbolic.private_folder import BUILDING, own_name, private_folder, read_own
-from fpirhc.symbolic.work_vector import with_less_work
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
 # -z defs: a missing symbol must fail here and not end the process at the first call.

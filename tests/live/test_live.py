@@ -21,7 +21,7 @@ from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.tuning.tune import tune
-from fpirhc.symbolic.constants import holds_nan
+from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.live import live_number
 from fpirhc.symbolic.native import generate
 

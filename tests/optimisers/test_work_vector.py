@@ -11,8 +11,8 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.base import compose_controller
+from fpirhc.symbolic.driver import with_less_work
 from fpirhc.symbolic.native import find_compiler, generate
-from fpirhc.symbolic.work_vector import with_less_work
 
 REAL = ctypes.POINTER(ctypes.c_double)
 GUARD = -1.2345e-77
@@ -47,7 +47,8 @@ def test_a_controller_with_twenty_stages_needs_and_touches_no_more(name, most, t
     step = ctypes.CDLL(str(library)).fpirhc_native
     problem, f = task.problem, composite.function
     values = [composite.memory.start(), np.zeros(1), problem.start_state, np.zeros(f.size1_in(3))]
-    values = [np.array(v, dtype=float) for v in (*values, task.controllers["RHC+FPI"].parameters(problem.plant))]
+    believed = task.controllers["RHC+FPI"].plant_model(problem).parameters(problem.plant)
+    values = [np.array(v, dtype=float) for v in (*values, believed)]
     results = [np.zeros(f.numel_out(k)) for k in range(f.n_out())]
     pointers = [(REAL * 400)(*(v.ctypes.data_as(REAL) for v in arrays)) for arrays in (values, results)]
     integers = np.zeros(max(f.sz_iw(), 1), dtype=np.int64)

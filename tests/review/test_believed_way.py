@@ -12,7 +12,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.plant.behind_actuators import behind_actuators
-from fpirhc.simulation.believed_way import with_believed_way
+from fpirhc.simulation.model_as_plant import with_believed_way
 
 GALLERY = Path(__file__).parents[2] / "problems" / "gallery"
 LAG = 0.02  # s

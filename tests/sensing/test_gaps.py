@@ -18,7 +18,7 @@ from fpirhc.learning.estimators.uncertain import Uncertain
 from fpirhc.members import examples
 from fpirhc.sensing.base import DerivativeEstimator
 from fpirhc.sensing.belief import Belief
-from fpirhc.simulation.missed import missed_cycles
+from fpirhc.simulation.clock import missed_cycles
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, bridged
 from fpirhc.symbolic.finite import FINITE

@@ -11,7 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
 from fpirhc.errors import FpirhcError, InvalidValue
-from fpirhc.simulation.deadline import Deadline
+from fpirhc.simulation.clock import Deadline
 
 PROBLEM = two_masses()
 LIMIT = 1e-3

@@ -22,8 +22,8 @@ from fpirhc.controllers.step_outcome import FAILED, PATIENCE
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.members import Example, examples
-from fpirhc.simulation.dropped_steps import Dropped
 from fpirhc.simulation.loop import close_loop
+from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import Expression

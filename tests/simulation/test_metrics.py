@@ -13,7 +13,7 @@ from plants import linear
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidValue
-from fpirhc.simulation.metrics import discovery, known_metrics, with_own_metrics
+from fpirhc.simulation.metrics import known_metrics, measuring, with_own_metrics
 from fpirhc.simulation.metrics.columns import columns
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout, Signal
@@ -253,8 +253,8 @@ def test_metrics_of_an_installed_package_are_found(monkeypatch):
         SimpleNamespace(load=lambda: OVERSHOOT),
         SimpleNamespace(load=lambda: (replace(OVERSHOOT, name="other"),)),
     ]
-    monkeypatch.setattr(discovery, "entry_points", lambda group: points if group == "fpirhc.metrics" else [])
-    names = [m.name for m in discovery.known_metrics.__wrapped__()]
+    monkeypatch.setattr(measuring, "entry_points", lambda group: points if group == "fpirhc.metrics" else [])
+    names = [m.name for m in measuring.known_metrics.__wrapped__()]
     assert {"overshoot", "other"} == set(names) - {m.name for m in known_metrics()}
 
 

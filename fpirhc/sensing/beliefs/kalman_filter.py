@@ -25,8 +25,18 @@ import numpy as np
 from fpirhc.fields.kinds import Deviation
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import values_of
-from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
-from fpirhc.sensing.noises import covariance_entries, first_covariance, name_mistakes, require_named
+from fpirhc.sensing.belief import (
+    Belief,
+    Correct,
+    Evidence,
+    Model,
+    Predict,
+    Remembered,
+    covariance_entries,
+    first_covariance,
+    name_mistakes,
+    require_named,
+)
 from fpirhc.sensing.observability import unobservable
 from fpirhc.symbolic.functions import overlaid
 from fpirhc.symbolic.layout import Expression, Layout, Signal

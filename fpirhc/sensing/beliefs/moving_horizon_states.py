@@ -29,11 +29,20 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
-from fpirhc.sensing.interior import Interior
-from fpirhc.sensing.noises import covariance_entries, first_covariance, name_mistakes, require_named
+from fpirhc.sensing.belief import (
+    Belief,
+    Correct,
+    Evidence,
+    Model,
+    Predict,
+    Remembered,
+    covariance_entries,
+    first_covariance,
+    name_mistakes,
+    require_named,
+)
 from fpirhc.sensing.observability import unobservable
-from fpirhc.sensing.smoother import Smoother
+from fpirhc.sensing.smoother import Interior, Smoother
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 MOST = 500  # samples of a window: the memory has a fixed size

@@ -5,7 +5,6 @@ A file of the folder `entries` that defines `METRICS`, a tuple of `Metric`, adds
 """
 
 from fpirhc.simulation.metrics.base import Better, Metric
-from fpirhc.simulation.metrics.discovery import known_metrics, with_own_metrics
-from fpirhc.simulation.metrics.measuring import Metrics, measure
+from fpirhc.simulation.metrics.measuring import Metrics, known_metrics, measure, with_own_metrics
 
 __all__ = ["Better", "Metric", "Metrics", "known_metrics", "measure", "with_own_metrics"]
