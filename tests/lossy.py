@@ -11,7 +11,7 @@ import numpy as np
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.sensing.base import values_of
-from fpirhc.simulation.loop import true_response
+from fpirhc.simulation.path import true_response
 from fpirhc.status import Status
 
 

@@ -15,7 +15,7 @@ from fpirhc.controllers.own_reference import own_signals
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.simulation.loop import REALITY_STATE
+from fpirhc.simulation.path import REALITY_STATE
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, scalar

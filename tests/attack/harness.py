@@ -12,7 +12,7 @@ from attack.faults import FIRST, Cycle, Fault
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.errors import FpirhcError
 from fpirhc.sensing.base import response_names
-from fpirhc.simulation.loop import true_response
+from fpirhc.simulation.path import true_response
 from fpirhc.status import Status
 
 _GONE = 1e12  # size of a state that no plant comes back from

@@ -17,7 +17,8 @@ from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.sensing.base import response_names
-from fpirhc.simulation.loop import close_loop, true_response
+from fpirhc.simulation.loop import close_loop
+from fpirhc.simulation.path import true_response
 from fpirhc.tracking.base import Tracking
 
 PROBLEM = replace(two_masses(), duration=6.0)

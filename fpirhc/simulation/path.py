@@ -1,0 +1,337 @@
+"""The one path of a run: from the command to what moves, and from there to what the controller is given.
+
+    command -> dead time -> what moves, for one cycle -> its motion and response -> sensors -> dead time -> controller
+
+What moves is a reality, the model itself with its exact parameters, or a body outside, which is sent inputs and answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import Response, error_signal, like, rename
+from fpirhc.controllers.face import measured_signals, on_face
+from fpirhc.controllers.own_reference import own_signals
+from fpirhc.controllers.seeing import first_estimates, first_shown
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import backward_difference, combine, response_names
+from fpirhc.simulation.outside_blocks import real_name
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, Value, expression
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.task.dead_time import MEASUREMENT, Wait, delay_block
+from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, logged_signal
+from fpirhc.task.problem import Problem
+
+Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
+REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates
+SENT = "_acting"  # signal of the inputs that a foreign reality is sent
+_RAW, _HELD = "_foreign", "_foreign_held"
+_PAST, _FULL = "_outputs_past", "_outputs_known"
+
+
+def sensing_blocks(problem: Problem, other: Response | None, *, predicts: bool) -> list[Block]:
+    """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
+    plant, response = problem.plant, other or true_response(problem)
+    if problem.sees_plant:
+        sense = [_sense_block(problem, measured_signals(plant), response)]
+        return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
+    true, shown = _true_blocks(problem, response)
+    if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
+        return true  # with coordinates measured in place of others
+    return [*true, *_late_blocks(problem, shown)]
+
+
+def acting_blocks(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
+    """Blocks of the command's way to the plant, and of the plant over one period."""
+    if not set(problem.plant.inputs) & set(problem.dead_time.queued):
+        return [_advance_block(problem, disturbed, problem.plant.input)]
+    plant, waits = problem.plant, [problem.dead_time.wait(name, problem.period) for name in problem.plant.inputs]
+    arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
+    return [
+        delay_block("send_command", problem.plant.input, arriving, waits),
+        _advance_block(problem, disturbed, arriving),
+    ]
+
+
+def true_motion(problem: Problem) -> tuple[Signal, ...]:
+    """Return the signals of state and outputs, with the states that what moves has; without any, no state."""
+    plant, foreign = problem.plant, problem.foreign
+    state, *outputs = measured_signals(plant)
+    shown = problem.truth.shown(plant)
+    if foreign is not None and plant.outputs:
+        shown = tuple(e for e in state.elements if e in foreign.measures)
+    if shown == state.elements:
+        return (state, *outputs)
+    units = dict(zip(state.elements, state.entry_units, strict=True))
+    return (*([replace(state, elements=shown, units=tuple(units[e] for e in shown))] if shown else []), *outputs)
+
+
+def true_response(problem: Problem) -> Response:
+    """The response of what the controller controls, of the plant that moves."""
+    plant = problem.plant
+    return Response(plant.response_signal("realised"), problem.truth.function(response_names(plant.face)))
+
+
+def motion_delays(problem: Problem) -> list[Delay]:
+    """What a plant that moves carries from cycle to cycle: state, acting input, and forcing."""
+    plant, start = problem.real_plant, tuple(map(float, problem.real_start))
+    acting = tuple(map(float, problem.inputs_before))
+    return [
+        Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
+        Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
+        Delay(_forcing(plant, "_forcing_before"), "_forcing"),
+    ]
+
+
+def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
+    """Return the signal of all disturbances in the order of the problem, or nothing when there are none."""
+    if not problem.disturbances:
+        return ()
+    return (disturbance_signal(problem),)
+
+
+def foreign_signals(problem: Problem) -> tuple[Signal, ...]:
+    """Return the signals that a loop reads from a foreign reality: its answer, and whether this is the last good one held."""
+    if problem.foreign is None:
+        return ()
+    measures = problem.foreign.measures
+    return vector(_RAW, tuple(measures), tuple(measures.values())), scalar(_HELD)
+
+
+def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Shown]:
+    """Blocks of the true motion, response and error; and the signals that sensors see."""
+    motion = true_motion(problem)
+    hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response.signal, "_seen")
+    if problem.foreign is not None and not shows_truth(problem):
+        return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
+    true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
+    sense = _sense_block(problem, true[0], Response(true[1], response.function))
+    if problem.sensing.estimator.of_steps:
+        sense = with_true_response(problem, sense, true[0][-1], true[1])
+    blocks = [sense, _truth_block(problem, true[0][-1])]
+    if not problem.truth.seen:
+        return blocks, true
+    direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
+    shown = (motion, response.signal) if direct else hidden
+    return [*blocks, _seen_block(problem, shown)], shown
+
+
+def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
+    """Blocks of sensors and their dead time, from what the sensors see to what the controller is given.
+
+    Sensors are those of the outputs where the plant has some; its state then comes with the dead time alone.
+    """
+    plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
+    first, resting = first_estimates(problem)
+    starts = (problem.start_state, first) if plant.outputs else (first,)
+    states_pass = sensing.belief is None  # a believed state is the controller's own
+    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if states_pass else []
+    if not sensing.ideal:
+        others = states[:-1]
+        all_shown = first_shown(problem)
+        sensors = [*_late_states(others, late), *sensing.blocks(plant, all_shown, late, (*shown[0], shown[1]))]
+        if sensing.estimates:
+            return sensors
+        raw = sensing.raw(plant, all_shown, late)
+        return [*sensors, on_face(plant, sensing.estimator.block(plant.face, problem.period, first, raw))]
+    assert late is not None
+    realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
+    return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
+
+
+def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Wait | None) -> list[Block]:
+    """Blocks of the dead time from true signals to measured ones, with the values before the run."""
+    if late is None:
+        return [rename(f"see_{to.name}", true, to) for true, to, _ in states]
+    return [
+        delay_block(f"see_{to.name}", true, replace(to, start=tuple(map(float, start))), [late] * to.size)
+        for true, to, start in states
+    ]
+
+
+def _truth_block(problem: Problem, motion: Signal) -> Block:
+    """Block (time, true state or outputs) -> true error of the judged ones."""
+    plant = problem.plant
+    places = [plant.output.elements.index(c) for c in problem.judged_names]
+    own = [motion.elements.index(c) for c in problem.judged_names]  # what moves may not have every state of the model
+    writes = Layout((error_signal(problem, "true_error"),))
+    if own_signals(problem):
+        reads = Layout((like(plant.output, "reference"), motion))
+        return Block(
+            "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
+        )
+    function = problem.reference.function(plant)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        return {"true_error": function(s.time)[0][places] - getattr(s, motion.name)[own]}
+
+    return Block("truth", Layout((plant.time, motion)), writes, step, opaque=problem.reference.opaque)
+
+
+def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response) -> Block:
+    """Block -> the true state and outputs, and the true response just before this cycle's command; with a reality also its state.
+
+    The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
+    Runge-Kutta evaluation of this cycle. Outputs are those of the moving plant, with its exact parameters.
+    """
+    if problem.foreign is not None:
+        return foreign_block(problem, motion, response.signal)
+    reads, writes, truth = _real_signals(problem), (*motion, response.signal), problem.truth
+    own = () if problem.symbolic_reality is None else (like(truth.plant.state, REALITY_STATE),)
+    shown = {signal.name: truth.function(signal.elements) for signal in motion}
+    shifts = bool(problem.disturbed_outputs)
+    if shifts:
+        reads, writes = (*reads, disturbance_signal(problem)), (*writes, logged_signal(problem))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
+        values = {response.signal.name: response.function(*now)}
+        values |= {name: function(*now) for name, function in shown.items()}
+        if shifts:
+            below, answered = added(problem, s.disturbance)
+            sums = {response.signal.name: answered, motion[-1].name: below}
+            values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
+        return {**values, **{signal.name: s._state_before for signal in own}}
+
+    return Block("sense", Layout(reads), Layout((*writes, *own)), step)
+
+
+def _seen_block(problem: Problem, shown: Shown) -> Block:
+    """Block -> the state and the response that are measured in place of the true ones."""
+    state = problem.truth.function(shown[0][0].elements, seen=True)
+    response = problem.truth.function(response_names(problem.plant.face), seen=True)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
+        return {shown[0][0].name: state(*now), shown[1].name: response(*now)}
+
+    return Block("seen", Layout(_real_signals(problem)), Layout((*shown[0], shown[1])), step)
+
+
+def _real_signals(problem: Problem) -> tuple[Signal, ...]:
+    """What the plant that moves carries over a cycle: state, acting input, parameters, forcing."""
+    plant = problem.real_plant
+    names = "_state_before", "_acting_before", "_exact"
+    signals = (like(s, n) for s, n in zip((plant.state, plant.input, plant.parameter), names, strict=True))
+    return (*signals, _forcing(plant, "_forcing_before"))
+
+
+def _forcing(plant: Plant, name: str) -> Signal:
+    """Signal of what disturbances add to the response of every coordinate."""
+    return Signal(name, plant.names, plant.response_units)
+
+
+def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
+    """Block of the plant that moves over one period with the arriving command held; a foreign reality is sent its inputs."""
+    if problem.foreign is not None:
+        return sending_block(problem, disturbed, arriving)
+    plant = problem.real_plant
+    advance = problem.real_integrator.step(plant, problem.period)
+    state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
+    if problem.symbolic_reality is not None:  # its state is none of the model's
+        state = like(plant.state, REALITY_STATE)
+    exact = like(plant.parameter, real_name(problem))
+    reads = (state, arriving, exact, *disturbed)
+    writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
+        if disturbed:
+            adds = dict(zip(disturbed[0].elements, ca.vertsplit(s.disturbance), strict=True))
+            u = u + ca.vertcat(*(adds.get(name, 0) for name in plant.inputs))
+            w = ca.vertcat(*(adds.get(name, 0) for name in plant.names))
+        return {
+            "_state_after": advance(getattr(s, state.name), u, getattr(s, exact.name), w),
+            "_acting": u,
+            "_forcing": w,
+        }
+
+    return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)
+
+
+def shows_truth(problem: Problem) -> bool:
+    """Whether a foreign reality measures everything that is judged: the model's whole state or outputs, and their responses."""
+    if problem.foreign is None:
+        return False
+    plant = problem.plant
+    return {*plant.output.elements, *response_names(plant.face)} <= set(problem.foreign.measures)
+
+
+def foreign_block(problem: Problem, motion: Sequence[Signal], response: Signal) -> Block:
+    """Block (answer) -> motion and response in the model's order, and the answer as it came; what is not measured is zero."""
+    assert problem.foreign is not None
+    names, answered = list(problem.foreign.measures), response_names(problem.plant.face)
+    raw, held = foreign_signals(problem)
+    wanted = {**{signal.name: signal.elements for signal in motion}, response.name: answered}
+
+    def step(s: Signals) -> dict[str, Expression]:
+        answer = s._foreign
+        shown = {
+            signal: ca.vertcat(*(answer[names.index(n)] if n in names else 0 for n in elements))
+            for signal, elements in wanted.items()
+        }
+        return {**shown, "foreign": answer, "foreign_held": s._foreign_held}
+
+    writes = (*motion, response, like(raw, "foreign"), scalar("foreign_held"))
+    return Block("sense", Layout((raw, held)), Layout(writes), step)
+
+
+def sending_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
+    """Block (arriving command, disturbances of inputs) -> the inputs that the reality is sent."""
+    plant = problem.plant
+
+    def step(s: Signals) -> dict[str, Expression]:
+        u = getattr(s, arriving.name)
+        if disturbed:
+            added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
+            u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
+        return {SENT: u}
+
+    return Block("send", Layout((arriving, *disturbed)), Layout((like(plant.input, SENT),)), step)
+
+
+def with_true_response(problem: Problem, sense: Block, motion: Signal, response: Signal) -> Block:
+    """Return the block of the true motion, with the true response of a map in place of the one that it writes.
+
+    Args:
+        problem: with a map.
+        sense: block that writes `motion` and `response`.
+        motion: signal of the state, or of the outputs where the plant has some.
+        response: signal of the response.
+    """
+    face, period = problem.plant.face, problem.period
+    orders = problem.plant.response_orders
+    if not any(orders.values()):
+        return sense  # a response of order 0 is the output, and no difference
+    places = {c: face.state.elements.index(c) for c in orders}
+    entries = [(c, j) for c, order in orders.items() for j in range(1, order + 1)]
+    past = Signal(_PAST, tuple(f"{c}@{j}" for c, j in entries))
+    known = Signal(_FULL)
+
+    def step(s: Signals) -> dict[str, Value]:
+        values = dict(sense.step(s))
+        before = dict(zip(entries, ca.vertsplit(getattr(s, _PAST)), strict=True))
+        now = expression(values[motion.name])
+        samples = {c: [now[k], *(before[c, j] for j in range(1, orders[c] + 1))] for c, k in places.items()}
+        enough = getattr(s, _FULL)
+        values[response.name] = ca.vertcat(
+            *(
+                ca.if_else(enough > order - 0.5, _difference(samples[c], order) / period**order, 0)
+                for c, order in orders.items()
+            )
+        )
+        values[f"{_PAST}_next"] = ca.vertcat(*(samples[c][j - 1] for c, j in entries))
+        values[f"{_FULL}_next"] = ca.fmin(enough + 1, max(orders.values()))
+        return values
+
+    return replace(sense, step=step, memory=sense.memory + Layout((past, known)))
+
+
+def _difference(samples: Sequence[Expression], order: int) -> Expression:
+    return combine(backward_difference(order), samples)
