@@ -175,16 +175,16 @@ def reference_block(problem: Problem) -> Block:
     """Block (time, state or outputs) -> (their reference, response of the controlled ones, error of the judged ones)."""
     plant, seen = problem.plant, problem.plant.output
     function = motion_of(problem)
-    at_end = motion_of(problem, ahead=problem.period) if plant.instant_names else None
     places = [seen.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
         own = own_values(problem, s)
         state, response = function(s.time, *own)
-        later = at_end(s.time, *own)[0] if at_end is not None else None
         return {
             "reference": state,
-            "_reference_response": nominal_responses(plant, state, response, later),
+            "_reference_response": nominal_responses(
+                plant, state, response, lambda: motion_of(problem, ahead=problem.period)(s.time, *own)[0]
+            ),
             "error": state[places] - getattr(s, seen.name)[places],
         }
 

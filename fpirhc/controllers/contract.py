@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.demands import plan_demand, reference_demand
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.form_check import check_form, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
 from fpirhc.deformation.base import Deformation, automatic, with_inner
@@ -128,7 +129,9 @@ class Planner:
 
     def starts_consistent(self, plant: Plant) -> bool:
         """Return whether plans start where the model has the measured outputs (`fpirhc.horizon.consistent_state`)."""
-        return bool(plant.outputs) and (self.corrects(plant) if self.consistent is None else self.consistent)
+        return len(measured_signals(plant)) > 1 and (
+            self.corrects(plant) if self.consistent is None else self.consistent
+        )
 
     def planned(self, problem: Problem) -> Problem:
         """Return the problem with the cost and the margins of the plans, and with limits that hold for the measured state."""

@@ -92,9 +92,8 @@ class Gate:
     def memory(self) -> Layout:
         """The last command, what is kept of the last good sample, the count of doubted ones, and the controller's memory."""
         plant = self.problem.plant
-        starts = {"state": tuple(map(float, self.problem.start_state)), TAKEN: (-FINITE,)}
-        if plant.outputs:
-            starts["output"] = tuple(map(float, self.problem.start_output))
+        starts = {plant.output.name: tuple(map(float, self.problem.start_output)), TAKEN: (-FINITE,)}
+        starts[plant.state.name] = tuple(map(float, self.problem.start_state))
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(map(float, first)))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]

@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from fpirhc.controllers.reference_states import reference_states
+from fpirhc.horizon.nominal import known_on_reference
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
@@ -41,10 +42,10 @@ class Scale:
 def largest_response(problem: Problem) -> tuple[float, ...]:
     """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
 
-    For outputs it is infinite too: the states that belong to their reference are not known before a run.
+    It is infinite too where the states that belong to the reference are not known before a run.
     """
     free = (float("inf"),) * len(problem.plant.controlled_names)
-    return free if problem.plant.outputs else response_scale(problem).largest
+    return response_scale(problem).largest if known_on_reference(problem.plant) else free
 
 
 @lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison

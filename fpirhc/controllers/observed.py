@@ -14,9 +14,10 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.reference_states import nominal_motion
 from fpirhc.controllers.sample_time import SampleTime
 from fpirhc.errors import NotSupported
-from fpirhc.horizon.nominal import nominal_run
+from fpirhc.horizon.nominal import known_on_reference, nominal_run, reference_state
 from fpirhc.plant.maps import growth_of
 from fpirhc.sensing.base import values_of
 from fpirhc.sensing.observability import members, slowest
@@ -138,21 +139,17 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
 
 
 def _points(problem: Problem) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """States and inputs of the model along the reference; with outputs those of a simulation in which they follow it."""
+    """States and inputs of the model along the reference, or of a simulation where it does not give the states."""
     plant = problem.plant
-    if plant.outputs:
-        yield from _points_of_outputs(problem)
+    if known_on_reference(plant):
+        reference, needed = nominal_motion(problem), problem.inputs_before
+        for t in np.linspace(0.0, problem.duration, _INSTANTS):
+            outputs, response = reference(t)
+            state = reference_state(plant, outputs)
+            if len(plant.controlled_names) == len(plant.inputs):
+                needed = np.asarray(plant.inverse_function(state, response, plant.approximate).full())
+            yield np.asarray(state.full()).ravel(), needed.ravel()
         return
-    reference, needed = problem.reference.function(plant), problem.inputs_before
-    for t in np.linspace(0.0, problem.duration, _INSTANTS):
-        state, response = reference(t)
-        if len(plant.controlled_names) == len(plant.inputs):
-            function = plant.inverse_function
-            needed = np.asarray(function(state, response[list(plant.controlled_indices)], plant.approximate).full())
-        yield np.asarray(state.full()).ravel(), needed.ravel()
-
-
-def _points_of_outputs(problem: Problem) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     states, inputs = nominal_run(problem.plant, problem.reference, *nominal_start(problem))
     for k in np.unique(np.linspace(0, states.shape[1] - 1, _INSTANTS).astype(int)):
         yield states[:, k], inputs[:, k]

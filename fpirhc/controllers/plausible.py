@@ -29,6 +29,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.largest_response import response_scale
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.controllers.seeing import given_states, raw_signal
@@ -147,7 +148,7 @@ def _behind_outputs(problem: Problem) -> dict[str, Interval]:
 def _columns(problem: Problem) -> dict[str, str]:
     """Column of the sample by the name of the measured quantity."""
     plant, raw = problem.plant, raw_signal(problem)
-    given = given_states(problem) if raw is not None else (plant.state,) if plant.outputs else ()
+    given = given_states(problem) if raw is not None else measured_signals(plant)[:-1]
     beside = {e: f"{signal.name}.{e}" for signal in given for e in signal.elements}
     if raw is not None:
         return beside | dict(zip(raw.elements, raw.columns, strict=True))

@@ -22,6 +22,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.consistent_start import at_consistent_start, consistent_start
 from fpirhc.controllers.contract import Planner
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.first_plan import built_first_memory, first_memory
 from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
@@ -123,14 +124,15 @@ class RecedingHorizon(Controller):
 def _check_states_of_plans(plant: Plant, replanning: Replanning, on_failure: OnFailure) -> None:
     """Raise where a way of replanning, or of failing, needs states that the outputs do not give."""
     reason = ""
-    if plant.instant_names:
-        reason = f"{', '.join(plant.instant_names)} depends on the command too (order 0), and plans are for functions of the state"
+    instant = [name for name, order in plant.output_orders.items() if not order]
+    if instant:
+        reason = f"{', '.join(instant)} depends on the command too (order 0), and plans are for functions of the state"
     elif plant.outputs and replanning.law is not None:
         reason = f"{type(replanning).__name__} tracks the planned motion of the model's states; use FromMeasurement"
     elif on_failure.uses_feedforward and not known_on_reference(plant):
         reason = f"{type(on_failure).__name__} needs references of states that no output gives; use HoldPlan"
     if reason:
-        what = ", ".join(plant.outputs)
+        what = ", ".join(plant.face.names)
         raise NotSupported(
             f"RecedingHorizon does not cover outputs that are expressions of the state ({what}): {reason}"
         )
@@ -183,8 +185,9 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         own = own_values(problem, s)
         motion = () if preview is None else preview(*own)
         data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, optimiser, ocp, s))
-        if plant.outputs:
-            data = shifted_reference(plant, ocp.data, ocp.stages + 1)(data, s._plan_state, s.output, s.parameters)
+        for seen in measured_signals(plant)[1:]:  # outputs that are given beside the state
+            shifted = shifted_reference(plant, ocp.data, ocp.stages + 1)
+            data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters)
         if horizon.measured:
             data = offset_limits(plant, horizon, ocp.data)(data, s._plan_state, s.state)
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
@@ -250,7 +253,7 @@ def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
     plant = problem.plant
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
     assert problem.horizon is not None
-    own, outputs = own_signals(problem), (plant.output,) if plant.outputs else ()
+    own, outputs = own_signals(problem), measured_signals(plant)[1:]
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
     return Layout((plant.time, start, *outputs, plant.parameter, *last, *_derived_signals(ocp), *own))

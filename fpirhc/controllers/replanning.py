@@ -23,7 +23,7 @@ from fpirhc.controllers.base import like
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.integrators import runge_kutta_4
-from fpirhc.plant.outputs import without_disturbances
+from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals

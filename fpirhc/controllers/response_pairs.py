@@ -34,13 +34,13 @@ class ResponsePairs:
     Args:
         problem: with the plant that is measured.
         dead_time: that is believed.
-        outputs: whether the measured outputs of that instant belong to a pair.
+        with_outputs: whether the measured outputs of that instant belong to a pair.
         age: cycles by which the state is older; a map's response belongs to the state of the cycle before (`response_age`).
     """
 
     problem: Problem
     dead_time: DeadTime
-    outputs: bool = False
+    with_outputs: bool = False
     age: int = 0
 
     @property
@@ -76,7 +76,7 @@ class ResponsePairs:
         problem = self.problem
         states = _past(_STATES, problem.plant.state.elements, problem.start_state.tolist(), self._states.length)
         commands = _past(_COMMANDS, problem.plant.input.elements, problem.inputs_before.tolist(), self._commands.length)
-        if not self.outputs:
+        if not self.with_outputs:
             return (*states, *commands)
         first = problem.start_output.tolist()
         return (*states, *commands, *_past(_OUTPUTS, problem.plant.output.elements, first, self._states.length))
@@ -91,7 +91,7 @@ class ResponsePairs:
         if not self.gaps:
             return s
         now = {_STATES: getattr(s, self.state.name)}
-        now |= {_OUTPUTS: getattr(s, self.seen.name)} if self.outputs else {}
+        now |= {_OUTPUTS: getattr(s, self.seen.name)} if self.with_outputs else {}
         return Signals({**vars(s), **{n: straightened(getattr(s, n), value, s.gap) for n, value in now.items()}})
 
     def waited(self, s: Signals, newest: Expression) -> tuple[Expression, dict[str, Expression]]:
@@ -99,7 +99,7 @@ class ResponsePairs:
         command, remembered = _queued(s, _COMMANDS, self._commands, newest)
         plant = self.problem.plant
         for name, size in ((_STATES, plant.state.size), (_OUTPUTS, plant.output.size)):
-            if self.gaps and (name == _STATES or self.outputs):
+            if self.gaps and (name == _STATES or self.with_outputs):
                 remembered |= _queued(s, name, self._states, getattr(s, name)[:size])[1]
         return command, remembered
 
@@ -117,7 +117,7 @@ class ResponsePairs:
 
     def output(self, s: Signals) -> tuple[Expression | None, dict[str, Expression]]:
         """Return the measured outputs of that instant, and what is remembered; None where they do not belong to a pair."""
-        if not self.outputs:
+        if not self.with_outputs:
             return None, {}
         return _queued(s, _OUTPUTS, self._states, getattr(s, self.seen.name))
 

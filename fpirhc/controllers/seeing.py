@@ -63,7 +63,7 @@ def _composed(problem: Problem, controller: Controller) -> Composite:
 def given_states(problem: Problem) -> tuple[Signal, ...]:
     """Return the signal of the state where it is given beside raw measurements: these are of outputs, and nothing is believed."""
     estimated = problem.sensing.estimates and problem.sensing.belief is None
-    return (problem.plant.state,) if problem.plant.outputs and estimated else ()
+    return measured_signals(problem.plant)[:-1] if estimated else ()
 
 
 def raw_signal(problem: Problem) -> Signal | None:

@@ -43,8 +43,6 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
     Raises:
         NotSupported: the plant has states that no output shows.
     """
-    if not plant.outputs:
-        return outputs
     hidden = [e for e, place in zip(plant.state.elements, plant.known_by_outputs, strict=True) if place < 0]
     if hidden:
         raise NotSupported(

@@ -36,7 +36,7 @@ def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mista
 def _view_of_symbols(plant: Plant) -> View:
     state, command, parameter = plant.state, plant.input, plant.parameter
     x = Named(state.elements, ca.SX.sym("x", state.size), "state")
-    elements, what = plant.output.elements, "output" if plant.outputs else "state"
+    elements, what = plant.output.elements, plant.output.name
 
     def inputs(name: str) -> Named:
         return Named(command.elements, ca.SX.sym(name, command.size), "input")
@@ -49,5 +49,5 @@ def _view_of_symbols(plant: Plant) -> View:
         inputs("feedforward"),
         Named(parameter.elements, ca.SX.sym("p", parameter.size), "parameter"),
         ca.SX.sym("t"),
-        Named(elements, ca.SX.sym("y", len(elements)), what) if plant.outputs else x,
+        Named(elements, ca.SX.sym("y", len(elements)), what),
     )

@@ -131,7 +131,7 @@ def _transcribed(
         settings=settings,
         live_bounds=tuple(live_numbers(limits.inputs)),
         derive=derive,
-        inner=tuple(zip(plant.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)) if plant.outputs else (),
+        inner=tuple(zip(plant.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
         runaway=lambda: spurious_growth(
             plant, horizon.discretisation, horizon.step, nodes[0][: plant.state.size, :-1], nodes[1]
         ),
@@ -284,7 +284,7 @@ def _view(
     feedforward = data["feedforward"] if cost.uses_feedforward else ca.SX.nan(len(inputs))
     return View(
         state=Named(plant.state.elements, s[:nx], "state"),
-        reference=Named(plant.output.elements, data["reference"], "output" if plant.outputs else "state"),
+        reference=Named(plant.output.elements, data["reference"], plant.output.name),
         input=Named(inputs, u, "input"),
         input_before=Named(inputs, before, "input"),
         feedforward=Named(inputs, feedforward, "input"),
@@ -296,10 +296,8 @@ def _view(
 
 def _outputs(plant: Plant, x: Expression, p: Expression) -> Named:
     """The model's outputs and their derivatives at a stage; the state without outputs."""
-    if not plant.outputs:
-        return Named(plant.state.elements, x, "state")
     still = ca.SX.zeros(plant.input.size), ca.SX.zeros(len(plant.names))  # neither reaches these derivatives
-    return Named(plant.output.elements, plant.output_function(x, still[0], p, still[1]), "output")
+    return Named(plant.output.elements, plant.output_function(x, still[0], p, still[1]), plant.output.name)
 
 
 def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
@@ -360,7 +358,7 @@ def _nodes(
         first = np.zeros(plant.state.size) if start is None else start
         bounds = nominal(limits).input_bounds(plant)
         states, inputs = nominal_motion(plant, reference, _advance(plant, horizon), first, bounds, data[0])
-    elif plant.outputs:
+    else:
         states = states[list(plant.known_by_outputs)]
     states = np.vstack([states, inputs[: extra[0]], np.zeros((extra[1], data.shape[1]))])
     return states, inputs[:, : horizon.stages], data

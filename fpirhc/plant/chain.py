@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-from fpirhc.plant.outputs import Symbols, lie_derivatives, output_expression
+from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 

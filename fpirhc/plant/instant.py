@@ -7,25 +7,29 @@ and has a reference like any other.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import casadi as ca
 
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Matrix
 
 
-def nominal_responses(plant: Plant, outputs: Matrix, responses: Matrix, later: Matrix | None = None) -> Matrix:
+def nominal_responses(
+    plant: Plant, outputs: Matrix, responses: Matrix, later: Callable[[], Matrix] | None = None
+) -> Matrix:
     """Return the nominal responses of the controlled quantities: highest derivatives, or the outputs of order 0 themselves.
 
     Args:
         plant: the plant.
         outputs: nominal outputs and their derivatives, in the order of `Plant.output`; without outputs the state.
         responses: nominal highest derivatives of the face.
-        later: the outputs at the end of the cycle; None: `outputs`.
+        later: gives the outputs at the end of the cycle, where one is of order 0; None: `outputs`.
     """
-    face, instant = plant.face, plant.instant_names
+    face, instant = plant.face, [name for name, order in plant.response_orders.items() if not order]
     if not instant:
         return responses[list(face.controlled_indices)]
-    ahead = outputs if later is None else later
+    ahead = outputs if later is None else later()
     places = [plant.output.elements.index(name) if name in instant else -1 for name in plant.controlled_names]
     entries = (responses[k] if at < 0 else ahead[at] for k, at in zip(face.controlled_indices, places, strict=True))
     return ca.vertcat(*entries)

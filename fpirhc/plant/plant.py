@@ -24,18 +24,18 @@ import casadi as ca
 from fpirhc.errors import Mistakes
 from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.inverse import affine, inverse_function
+from fpirhc.plant.lie_derivatives import (
+    believed_disturbance,
+    check_outputs,
+    lie_derivatives,
+    light_plant,
+    output_expression,
+    output_order,
+)
 from fpirhc.plant.maps import Differences, check_map
 from fpirhc.plant.maps import over as map_over
 from fpirhc.plant.motion import Motion
 from fpirhc.plant.output import Output
-from fpirhc.plant.outputs import (
-    believed_disturbance,
-    check_outputs,
-    face_of,
-    instant_outputs,
-    lie_derivatives,
-    output_expression,
-)
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
 from fpirhc.plant.structural_order import structural_order
@@ -199,20 +199,26 @@ class Plant(Motion):
         """The plant as reference, tracking law, judging and sensors take it: its coordinates are the outputs; else itself."""
         if not self.outputs:
             return self
-        face = face_of(self)
-        vars(face)["instant_names"] = self.instant_names  # a light plant has no expressions to find them from
+        units = {name: one.unit for name, one in self.outputs.items()}
+        face = light_plant(self, units, {n: max(r, 1) for n, r in self.output_orders.items()}, self.controlled_names)
+        vars(face)["output_orders"] = self.output_orders  # a light plant has no expressions to find them from
         return face
 
     @cached_property
-    def instant_names(self) -> tuple[str, ...]:
-        """Outputs of order 0, which the command moves at once."""
-        return instant_outputs(self)
+    def output_orders(self) -> dict[str, int]:
+        """Relative order of every output, or coordinate: the derivative that the command moves at once; 0 for the output itself.
+
+        An output that no input reaches has the order one.
+        """
+        if not self.outputs:
+            return dict(zip(self.names, self.orders, strict=True))
+        found = {name: output_order(self, name) for name in self.outputs}
+        return {name: 1 if order is None else order for name, order in found.items()}
 
     @cached_property
     def response_orders(self) -> dict[str, int]:
-        """Relative order of every controlled coordinate or output: the derivative that the command moves at once."""
-        face, instant = self.face, self.instant_names
-        return {name: 0 if name in instant else face.orders[face.names.index(name)] for name in self.controlled_names}
+        """Those of the controlled ones."""
+        return {name: self.output_orders[name] for name in self.controlled_names}
 
     @cached_property
     def output(self) -> Signal:
@@ -302,8 +308,7 @@ class Plant(Motion):
 def plant_facts(plant: Plant) -> tuple[str, ...]:
     """Return what sums up a plant: its coordinates or outputs with their orders, its inputs, the number of its parameters."""
     if plant.outputs:
-        face = zip(plant.face.names, _orders(plant), strict=True)
-        shown = ", ".join(f"{name} of relative order {order}" for name, order in face)
+        shown = ", ".join(f"{name} of relative order {order}" for name, order in plant.output_orders.items())
         states = f"{plant.state.size} states"
         return f"outputs {shown}", states, f"inputs {', '.join(plant.inputs)}", f"{len(plant.parameters)} parameters"
     orders = ", ".join(f"{name} of order {order}" for name, order in zip(plant.names, plant.orders, strict=True))
@@ -316,8 +321,8 @@ def _plant_table(plant: Plant) -> str:
         (name, f"coordinate, order {order}", unit, "", "")
         for (name, unit), order in zip(plant.coordinates.items(), plant.orders, strict=True)
     ]
-    face = zip(plant.face.coordinates.items(), _orders(plant), strict=True) if plant.outputs else ()
-    rows += [(name, f"output, relative order {order}", unit, "", "") for (name, unit), order in face]
+    for name, one in plant.outputs.items():
+        rows.append((name, f"output, relative order {plant.output_orders[name]}", one.unit, "", ""))
     rows += [(name, "input", unit, "", "") for name, unit in plant.inputs.items()]
     rows += [
         (
@@ -333,9 +338,3 @@ def _plant_table(plant: Plant) -> str:
     if plant.controlled is not None:
         notes.append(f"Controlled: {', '.join(plant.controlled)}.")
     return table("Plant", ("name", "is", "unit", "model", "plant"), rows, notes)
-
-
-def _orders(plant: Plant) -> list[int]:
-    """Relative orders of the outputs."""
-    face = zip(plant.face.names, plant.face.orders, strict=True)
-    return [0 if name in plant.instant_names else order for name, order in face]

@@ -16,7 +16,7 @@ from functools import cached_property
 import casadi as ca
 
 from fpirhc.errors import InvalidName, NotInvertible, NotSupported, nearest
-from fpirhc.plant.outputs import output_expression
+from fpirhc.plant.lie_derivatives import output_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.structural_order import structural_order
 

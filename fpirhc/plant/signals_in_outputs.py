@@ -21,6 +21,6 @@ def differentiated_signals(plant: Plant) -> tuple[str, ...]:
         return ()
     x, u, p = plant.symbols()
     motion = plant.output_function(x, u, p, ca.SX.zeros(len(plant.names)))
-    differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if e not in plant.instant_names]
+    differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if plant.output_orders.get(e, 1)]
     places = {name: plant.parameter.elements.index(name) for name in plant.signal_names}
     return tuple(name for name, place in places.items() if ca.depends_on(ca.vertcat(*differentiated), p[place]))

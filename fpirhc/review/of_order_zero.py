@@ -30,7 +30,7 @@ _LIMIT = 2.0  # of effective gain times eigenvalue, once everything has settled
 def controls_order_zero(grid: ReviewGrid) -> bool:
     """Return whether an output of order 0 is controlled."""
     plant = grid.problem.plant
-    return bool(set(plant.controlled_names) & set(plant.instant_names))
+    return 0 in plant.response_orders.values()
 
 
 def review_of_order_zero(grid: ReviewGrid, controllers: Mapping[str, Controller]) -> Review:

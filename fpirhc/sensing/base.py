@@ -123,7 +123,7 @@ def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:
 
 def names_of_responses(plant: Plant, signal: Signal) -> tuple[str, ...]:
     """Names of the entries of a signal of responses: highest derivatives of coordinates, and others as they are."""
-    orders = {**dict(zip(plant.names, plant.orders, strict=True)), **dict.fromkeys(plant.instant_names, 0)}
+    orders = plant.output_orders
     return tuple(e + "'" * orders.get(e, 0) for e in signal.elements)
 
 

@@ -63,7 +63,7 @@ def settled_maps(
 def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
     instant = _instant(model)
-    at_once = bool(instant) and set(instant) == set(model.controlled or model.outputs)  # no derivative is looked for
+    at_once = bool(instant) and set(instant) == set(model.controlled or model.face.names)  # no derivative is looked for
     if reality is not None and reality.plant.step is not None and model.step is None and not at_once:
         mistakes.add(
             "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write the "
@@ -96,7 +96,7 @@ def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes
 
 def _instant(plant: Plant) -> tuple[str, ...]:
     """Controlled outputs that the command moves at once; their response is the output itself."""
-    return tuple(name for name in plant.controlled or plant.outputs if name in plant.instant_names)
+    return tuple(name for name in plant.controlled or plant.face.names if not plant.output_orders[name])
 
 
 def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:

@@ -26,6 +26,6 @@ def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -
         judged: names whose errors are judged beside the controlled ones; None: no other need be there.
     """
     if sensing.belief is None:
-        return frozenset((*plant.coordinates, *plant.outputs))
+        return frozenset((*plant.coordinates, *plant.face.coordinates))
     measured = (name.rstrip("'") for name in needed_measurements(plant, sensing))
     return frozenset((*measured, *(judged or ()), *(plant.outputs or plant.controlled_names)))

@@ -208,8 +208,7 @@ class Problem(Checked):
     def disturbed_outputs(self) -> Mapping[str, int]:
         """Relative orders of the disturbed outputs by name; a name of a coordinate of the moving plant is none."""
         plant, moved = self.plant, self.real_plant.coordinates
-        orders = dict(zip(plant.face.names, plant.face.orders, strict=True)) if plant.outputs else {}
-        orders |= dict.fromkeys(plant.instant_names, 0)
+        orders = plant.output_orders
         return {n: orders[n] for n in self.disturbances if n in orders and n not in moved}
 
     @property
@@ -217,7 +216,7 @@ class Problem(Checked):
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
         if self.reality is None:
             return self
-        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.outputs}
+        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.face.coordinates}
         disturbances = {name: one for name, one in self.disturbances.items() if name in known}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)
@@ -385,7 +384,7 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
             f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives nobody states; state it in "
             "steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
         )
-    if len(plant.inputs) == len(plant.controlled or plant.outputs):
+    if len(plant.inputs) == len(plant.controlled or plant.face.names):
         states, inputs = nominal_run(plant, problem.reference, *nominal_start(problem))
         singular = singular_gain(plant, states, inputs, problem.period)
         if singular:

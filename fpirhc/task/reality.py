@@ -23,7 +23,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
 from fpirhc.plant.integrators import Integrator
-from fpirhc.plant.outputs import output_order
+from fpirhc.plant.lie_derivatives import output_order
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
@@ -244,7 +244,7 @@ class Reality(Checked):
 
 def _quantities_of(plant: Plant) -> dict[str, str]:
     """Return the units of what a reality can show: its coordinates and its outputs."""
-    return {**plant.coordinates, **{name: one.unit for name, one in plant.outputs.items()}}
+    return {**plant.coordinates, **plant.face.coordinates}
 
 
 def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
@@ -273,7 +273,7 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
     own, units, unit = seen.get(name, name), _quantities_of(plant), model.coordinates[name]
     if own not in units:
         if name not in seen:
-            followed = not model.outputs and name in (model.controlled or model.names)
+            followed = name in (model.controlled or model.face.names)
             believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
             mistakes.add(
                 f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
@@ -290,7 +290,7 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
             f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
             f"the order {order}; give the model this order, or the reality a coordinate of its own"
         )
-    elif not model.outputs and name in (model.controlled or model.names) and _order(plant, own) is None:
+    elif name in (model.controlled or model.face.names) and _order(plant, own) is None:
         mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
 
 
@@ -302,7 +302,7 @@ def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
 
 def _check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes) -> None:
     """Add what is wrong with the output, or coordinate, of a reality of the name of an output of the model."""
-    unit = model.outputs[name].unit
+    unit = model.face.coordinates[name]
     units = _quantities_of(plant)
     if name not in units:
         mistakes.add(
@@ -312,10 +312,8 @@ def _check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes)
         return
     if units[name] != unit:
         mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
-    if name in model.instant_names:
-        return
-    order = model.face.orders[model.face.names.index(name)]
-    at_once = input_reaches_at(plant, name, order - 1)
+    order = model.output_orders[name]
+    at_once = input_reaches_at(plant, name, order - 1) if order else None
     if at_once is not None:
         mistakes.add(
             f"its derivative {name}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "

@@ -130,7 +130,7 @@ def test_outputs_of_order_zero_are_left_out() -> None:
             "now": fp.Output("1", lambda x, u, p: u.v + x.x),
         },
     )
-    assert both.instant_names == ("now",)
+    assert both.output_orders["now"] == 0
     y = np.zeros(both.output.size)
     y[both.output.elements.index("y")] = 1.0
     start = found(both, [0.4, 0.8], y)

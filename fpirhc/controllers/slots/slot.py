@@ -17,7 +17,7 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.outputs import light_plant
+from fpirhc.plant.lie_derivatives import light_plant
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.relative_order import OutputChain, output_chain
 from fpirhc.symbolic.block import Block, Delay

@@ -169,7 +169,7 @@ def _estimate_block(
             **others,
         }
 
-    outputs = (pairs.seen,) if pairs.outputs else ()
+    outputs = (pairs.seen,) * pairs.with_outputs
     reads = Layout((pairs.state, *outputs, plant.response_signal("realised"), plant.parameter, acted))
     writes = Layout((believed, estimate))
     if lost:

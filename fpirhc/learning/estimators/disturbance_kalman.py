@@ -90,8 +90,8 @@ class DisturbanceKalman(Estimator):
         return all("'" in name for name in self.drift)
 
     def reads_outputs(self, plant: Plant) -> bool:
-        """Whether some output, or a derivative below its response, is measured."""
-        return bool(plant.outputs) and any(n in plant.output.elements for n in self.measured)
+        """Whether some output that is no state, or a derivative below its response, is measured."""
+        return any(n in plant.output.elements and n not in plant.state.elements for n in self.measured)
 
     def reads_response(self, plant: Plant) -> bool:
         """Whether some response is measured."""
@@ -106,8 +106,7 @@ class DisturbanceKalman(Estimator):
         """
         mistakes = Mistakes("DisturbanceKalman")
         plant = problem.plant
-        what = "state, output or response" if plant.outputs else "state or response"
-        mistakes.unknown(f"measured: {what}", self.measured, quantities(plant))
+        mistakes.unknown("measured: state, output or response", self.measured, quantities(plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
         mistakes.raise_if_any()
         late = problem.sensing.delay(plant.face, problem.period) + response_age(plant)

@@ -96,21 +96,6 @@ def output_order(plant: Motion, name: str) -> int | None:
     return None
 
 
-def instant_outputs(plant: Motion) -> tuple[str, ...]:
-    """Return the names of the outputs of order 0, y = h(x, u, p), which the command moves at once."""
-    return tuple(name for name in plant.outputs if output_order(plant, name) == 0)
-
-
-def face_of(plant: _Motion) -> _Motion:
-    """Return the light plant whose coordinates are the outputs.
-
-    An output that no input reaches has the order one, and so has one of order 0 (see `fpirhc.plant.instant`).
-    """
-    orders = {name: output_order(plant, name) or 1 for name in plant.outputs}
-    units = {name: one.unit for name, one in plant.outputs.items()}
-    return light_plant(plant, units, orders, plant.controlled_names)
-
-
 def light_plant(
     plant: _Motion,
     coordinates: Mapping[str, str],
