@@ -144,7 +144,8 @@ class Fractional(Tracking):
         weights, stiffness = ca.DM(self.weights(cycles)), (self.rate * period) ** self.order
 
         def step(s: Signals) -> dict[str, Expression]:
-            errors = error_chains(plant, s._target - s.state)
+            error = s._target - s.state
+            errors = error_chains(plant, error)
             running = s.warm_up > 0.5
             integral = ca.if_else(running, s._integral_before, 0)
             measured, drift = self._decaying(integral, errors)
@@ -161,7 +162,7 @@ class Fractional(Tracking):
             summed = ca.vertcat(*(ca.dot(weights, queue) for queue in queues))
             next_decaying = -(summed + stiffness * first) / (1 + stiffness)
             return {
-                "_target_error": ca.vertcat(*own_errors(plant, s._target - s.state)),
+                "_target_error": ca.vertcat(*own_errors(plant, error)),
                 "desired": s.nominal + drift - (next_decaying - (decaying - first)) / period,
                 "_integral_used": integral,
                 "decay_past_next": ca.vertcat(*queues),

@@ -79,7 +79,8 @@ class LinearLaw(Tracking):
         first_gains = [self.gains(order)[0] for order in orders] if self.integral else []
 
         def step(s: Signals) -> dict[str, Expression]:
-            errors, own = error_chains(plant, s._target - s.state), own_errors(plant, s._target - s.state)
+            error = s._target - s.state
+            errors, own = error_chains(plant, error), own_errors(plant, error)
             first_integral = ca.vertcat(*map(self._first_integral, own, errors))
             integral_before, remembered = bumpless(s, first_gains)
             integral = ca.if_else(s.warm_up > 0.5, integral_before, first_integral)
