@@ -122,7 +122,7 @@ from .symbolic.functions import signed_power
 from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.foreign import Foreign
-from .task.limits import Limits, PathConstraint
+from .task.limits import Ellipsoid, Limits, PathConstraint
 from .task.outside import Believed, Known, Samples, Unknown
 from .task.problem import Problem
 from .task.reality import Reality
@@ -160,6 +160,7 @@ __all__ = [
     "DeadTime",
     "DelayWatched",
     "DisturbanceKalman",
+    "Ellipsoid",
     "Estimating",
     "Euler",
     "ExactHessian",

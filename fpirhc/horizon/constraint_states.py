@@ -41,24 +41,11 @@ class ConstraintState:
     upper: float
 
 
-def rates(limits: Limits, plant: Plant, view: View, step: float) -> list[ConstraintState]:
-    """Change of inputs per unit of time, (u_i - u_{i-1}) / step, for inputs with a limited rate."""
+def limited(limits: Limits, plant: Plant, view: View, step: float) -> list[ConstraintState]:
+    """Limited expressions of state and input of stages 0 ... N-1: rates of inputs, and paths."""
     return [
-        ConstraintState(
-            f"{name} rate",
-            plant.derivative_unit(plant.inputs[name], 1),
-            (view.input[name] - view.input_before[name]) / step,
-            *bounds,
-        )
-        for name, bounds in limits.rates.items()
-    ]
-
-
-def paths(limits: Limits, view: View) -> list[ConstraintState]:
-    """Limited expressions of state and input of stages 0 ... N-1."""
-    return [
-        ConstraintState(name, path.unit, path.value(name, view), path.lower, path.upper)
-        for name, path in limits.paths.items()
+        ConstraintState(name, one.unit, one.named_value(name, view), one.lower, one.upper)
+        for name, one in limits.members(plant, step).items()
     ]
 
 

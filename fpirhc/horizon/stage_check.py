@@ -28,7 +28,7 @@ def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mista
             mistakes.add(str(error))
     for name, path in limits.paths.items():
         try:
-            path.value(name, view, symbols)
+            path.named_value(name, view, symbols)
         except FpirhcError as error:
             mistakes.add(str(error))
 

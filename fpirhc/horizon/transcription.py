@@ -16,10 +16,9 @@ from fpirhc.horizon.constraint_states import (
     ends,
     hard,
     hard_state_bounds,
+    limited,
     measured,
     narrowed,
-    paths,
-    rates,
     soft_names,
     softened,
     state_prices,
@@ -163,7 +162,11 @@ def _stage_expressions(
     plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits, others: Sequence[Expression]
 ) -> _Stage:
     layout = data_layout(plant, horizon)
-    keeps_input = cost.uses_rate or bool(limits.rates) or bool(horizon.blocks)
+    keeps_input = (
+        cost.uses_rate
+        or bool(horizon.blocks)
+        or any(one.uses_rate for one in limits.members(plant, horizon.step).values())
+    )
     x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size * keeps_input)
     u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
     data = layout.split(theta)
@@ -254,7 +257,7 @@ def _start(plant: Plant, free: int, written: int) -> ca.Function:
 def _written(
     plant: Plant, horizon: Horizon, limits: Limits, view: View, x_next: Expression, data: Mapping[str, Expression]
 ) -> list[ConstraintState]:
-    entries = [*rates(limits, plant, view, horizon.step), *paths(limits, view)]
+    entries = limited(limits, plant, view, horizon.step)
     for entry in entries:
         if ca.SX(entry.expression).numel() != 1:
             raise InvalidProblem(f"limits: path '{entry.name}' must be one scalar, got {entry.expression.shape}")

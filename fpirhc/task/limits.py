@@ -1,27 +1,76 @@
-"""Limits of inputs, states, rates and paths by name. A quantity that is not named is free."""
+"""Limits of inputs, states, rates and paths by name. A quantity that is not named is free.
+
+A limit on what is no state is a member of the contract `Limit`: one scalar of a stage, in an interval.
+"""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
-from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.errors import InvalidName, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.expression import Expression, Value
+from fpirhc.symbolic.expression import Expression, Value, total
 from fpirhc.symbolic.live import nominal
 
 Interval = tuple[float, float]
 
 
+class Limit(Checked, ABC):
+    """Contract: lower <= c(x_i, u_i) <= upper in stages i = 0 ... N-1 of a plan, with one scalar c.
+
+    Concrete limits are frozen dataclasses; they stand in `Limits(paths={name: ...})`.
+    """
+
+    uses_rate: ClassVar[bool] = False  # whether it reads `view.input_before`, the input of the stage before
+
+    if TYPE_CHECKING:
+
+        @property
+        def lower(self) -> float:
+            """Lower end of the interval; infinite where free."""
+
+        @property
+        def upper(self) -> float:
+            """Upper end of the interval; infinite where free."""
+
+        @property
+        def unit(self) -> str:
+            """Unit of the scalar."""
+
+    else:  # plain attributes, so that dataclasses may have fields of these names
+        lower, upper, unit = -math.inf, math.inf, ""
+
+    @abstractmethod
+    def value(self, view: Any) -> Value:
+        """Return the limited scalar of a stage, of a `View`: view.state.q1, view.input.Q1, view.output.y, view.parameters.m1."""
+
+    def named_value(self, name: str, view: object, symbols: Sequence[Expression] = ()) -> Expression:
+        """Return the limited scalar of a stage, checked.
+
+        Args:
+            name: of the limit.
+            view: of the stage.
+            symbols: those that the view is made of; without them any.
+
+        Raises:
+            InvalidProblem: it fails, or is no scalar of the view.
+        """
+        what = f"limits: paths['{name}']"
+        return scalar_expression(what, called(what, self.value, view), symbols=symbols, finite=False)
+
+
 @dataclass(frozen=True, eq=False)
-class PathConstraint(Checked):
+class PathConstraint(Limit):
     """A limit on any expression of a stage.
 
     Args:
@@ -40,19 +89,78 @@ class PathConstraint(Checked):
         if not takes(self.expression, 1):
             raise InvalidValue("PathConstraint.expression: expected a function of 1 argument, the view of a stage")
 
-    def value(self, name: str, view: object, symbols: Sequence[Expression] = ()) -> Expression:
-        """Return the limited expression of a stage.
+    def value(self, view: Any) -> Value:
+        """Return the expression."""
+        return self.expression(view)
 
-        Args:
-            name: of the constraint.
-            view: of the stage.
-            symbols: those that the view is made of; without them any.
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid(Limit):
+    """Quantities that stay inside an ellipsoid together: sum ((y - centre) / axis)^2 <= 1.
+
+    Args:
+        axes: half axes by name of a state, an output or an input, in their units.
+        centre: the middle by name, in the same units; 0 for names that are left out.
+
+    Raises:
+        InvalidValue: no axis, an axis that is not positive, or a centre of something without axis.
+    """
+
+    axes: Mapping[str, float]
+    centre: Mapping[str, float] = field(default_factory=dict)
+
+    upper: ClassVar[float] = 1.0
+    unit: ClassVar[str] = "1"
+
+    def __post_init__(self) -> None:
+        if not self.axes:
+            raise InvalidValue(
+                "Ellipsoid(axes={}): expected a half axis by name of at least one state, output or input"
+            )
+        for name, axis in self.axes.items():
+            if not 0 < nominal(axis) < math.inf:
+                raise InvalidValue(f"Ellipsoid(axes={{'{name}': {axis!r}}}): expected a positive number")
+        for name in self.centre.keys() - self.axes.keys():
+            raise InvalidValue(f"Ellipsoid(centre): '{name}' has no axis.{nearest(name, list(self.axes))}")
+
+    def value(self, view: Any) -> Value:
+        """Return the sum of squares.
 
         Raises:
-            InvalidProblem: the function fails, or does not give one scalar.
+            InvalidName: an axis of something that is no state, output or input.
         """
-        what = f"limits: paths['{name}']"
-        return scalar_expression(what, called(what, self.expression, view), symbols=symbols, finite=False)
+        quantities = {name: part[name] for part in (view.input, view.output, view.state) for name in part}
+        unknown = [name for name in self.axes if name not in quantities]
+        if unknown:
+            raise InvalidName(
+                f"Ellipsoid: '{unknown[0]}' is no state, output or input.{nearest(unknown[0], quantities)}"
+            )
+        return total(((quantities[n] - self.centre.get(n, 0.0)) / axis) ** 2 for n, axis in self.axes.items())
+
+
+@dataclass(frozen=True, eq=False)
+class _Rate(Limit):
+    """The change of an input per unit of time, from stage to stage.
+
+    Args:
+        input: name of the input.
+        step: length of a stage.
+        lower: lower end of the interval.
+        upper: upper end of the interval.
+        unit: of the rate.
+    """
+
+    uses_rate: ClassVar[bool] = True
+
+    input: str
+    step: float
+    lower: float
+    upper: float
+    unit: str
+
+    def value(self, view: Any) -> Value:
+        """Return (u_i - u_{i-1}) / step."""
+        return cast(Expression, (view.input[self.input] - view.input_before[self.input]) / self.step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +173,8 @@ class Limits(Checked):
         inputs: intervals (lower, upper) by name of the input.
         states: intervals (lower, upper) by name of the state (q1, q1', ...).
         rates: intervals of the change of inputs from stage to stage, per second, by name of the input.
-        paths: named limits on expressions of state and input in stages 0 ... N-1.
+        paths: named limits on expressions of state and input in stages 0 ... N-1: `PathConstraint`, `Ellipsoid`, or a
+            `Limit` of your own.
         soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or
             path, or by name of an input for its rate. The cost then has the term 'soft NAME'.
         prices: prices, in cost per second and unit, of limits that are kept wherever that is worth its price (exact penalties, L1);
@@ -76,7 +185,7 @@ class Limits(Checked):
     inputs: Mapping[str, Interval] = field(default_factory=dict)
     states: Mapping[str, Interval] = field(default_factory=dict)
     rates: Mapping[str, Interval] = field(default_factory=dict)
-    paths: Mapping[str, PathConstraint] = field(default_factory=dict)
+    paths: Mapping[str, Limit] = field(default_factory=dict)
     soft: Mapping[str, float] = field(default_factory=dict)
     prices: Mapping[str, float] = field(default_factory=dict)
 
@@ -110,6 +219,14 @@ class Limits(Checked):
             if not finite_number(weight) or not 0 < weight < math.inf:
                 mistakes.add(f"soft: the weight of '{name}' must be a positive number, got {weight!r}")
         mistakes.raise_if_any()
+
+    def members(self, plant: Plant, step: float) -> dict[str, Limit]:
+        """Return the limits on what is no state by name: rates of inputs, with stages of length `step`, and paths."""
+        rates: dict[str, Limit] = {
+            f"{name} rate": _Rate(name, step, *ends, unit=plant.derivative_unit(plant.inputs[name], 1))
+            for name, ends in self.rates.items()
+        }
+        return {**rates, **self.paths}
 
     def input_ends(self, plant: Plant) -> tuple[list[float], list[float]]:
         """Lower and upper end of every input, which may be live numbers; infinite where free."""

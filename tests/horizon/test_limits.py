@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.horizon.rollout import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.task.limits import Limit
 
 PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
 COST = fp.Quadratic(states={"angle": 10.0, "angle'": 0.1}, effort={"torque": 0.05})
@@ -31,6 +34,18 @@ def speed_and_angle(view):
     return view.state["angle'"] + 2 * view.state.angle
 
 
+@dataclass(frozen=True, eq=False)
+class Softly(Limit):
+    """How fast the square of an input grows, as somebody else might limit it: u_i^2 - u_{i-1}^2."""
+
+    upper: float
+    uses_rate = True
+
+    def value(self, view):
+        """Return the growth."""
+        return view.input.torque**2 - view.input_before.torque**2
+
+
 CASES = {
     "state": (fp.Limits(states={"angle'": (-0.2, 0.3)}), ()),
     "state and input": (fp.Limits(inputs={"torque": (-4.0, 4.0)}, states={"angle'": (-0.2, 0.5)}), ()),
@@ -40,6 +55,8 @@ CASES = {
         fp.Limits(paths={"power": fp.PathConstraint(lambda v: v.input.torque * v.state["angle'"], upper=0.5)}),
         (),
     ),
+    "ellipsoid": (fp.Limits(paths={"calm": fp.Ellipsoid({"angle": 0.7, "angle'": 0.9}, centre={"angle": 0.1})}), ()),
+    "of somebody else": (fp.Limits(paths={"softly": Softly(upper=5.0)}), ()),
     "terminal": (fp.Limits(), ("angle",)),
     "terminal and rate": (fp.Limits(rates={"torque": (-40.0, 40.0)}), ("angle", "angle'")),
 }
@@ -154,6 +171,7 @@ def test_limits_in_a_closed_loop(case):
         (fp.Limits(rates={"torque": (1.0, -1.0)}), (), "swap them"),
         (fp.Limits(paths={"angle": fp.PathConstraint(lambda v: v.state.angle)}), (), "already the name"),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.angel, upper=1.0)}), (), "angle"),
+        (fp.Limits(paths={"calm": fp.Ellipsoid({"angel": 1.0})}), (), "'angel' is no state, output or input.*'angle'"),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.vector, upper=1.0)}), (), "one scalar"),
         (fp.Limits(soft={"angle": 1.0}), (), "soft: limit of"),
         (fp.Limits(states={"angle": (0, 1)}, soft={"angle": -1.0}), (), "positive"),
@@ -258,3 +276,22 @@ def test_prices_are_refused_by_who_cannot_take_them():
         fp.solve(ocp, IPOPT, first, data)
     with pytest.raises(FpirhcError, match="both soft and priced"):
         horizon_of(fp.Limits(states={"angle": (0, 1)}, soft={"angle": 1.0}, prices={"angle": 1.0}))
+
+
+def test_an_ellipsoid_that_is_none_is_refused():
+    """By what is wrong, with the nearest name."""
+    for given, said in (
+        ({"axes": {}}, "expected a half axis by name of at least one"),
+        ({"axes": {"angle": 0.0}}, r"Ellipsoid\(axes={'angle': 0.0}\): expected a positive number"),
+        ({"axes": {"angle": 1.0}, "centre": {"angel": 1.0}}, "'angel' has no axis.*'angle'"),
+    ):
+        with pytest.raises(FpirhcError, match=said):
+            fp.Ellipsoid(**given)
+
+
+def test_a_plan_stays_in_its_ellipsoid():
+    """By the sum of squares itself, of every stage that is limited."""
+    ocp, data, first = horizon_of(CASES["ellipsoid"][0])
+    states = fp.solve(ocp, FIXED, first, data).states
+    inside = ((states[0, :-1] - 0.1) / 0.7) ** 2 + (states[1, :-1] / 0.9) ** 2
+    assert inside.max() == pytest.approx(1.0, abs=1e-6)
