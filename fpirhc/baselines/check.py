@@ -13,13 +13,14 @@ from fpirhc.baselines.bands import Expected, expected
 from fpirhc.baselines.baseline import Baseline, Settings, fingerprint, settings_of, to_text
 from fpirhc.baselines.judging import Judgement, judge
 from fpirhc.baselines.measuring import REFUSED, Job, Progress, measure_all, names_by_source, nominal, variants
-from fpirhc.baselines.places import baseline_path, check_inside, write_whole
+from fpirhc.baselines.places import baseline_path, check_inside
 from fpirhc.baselines.reading import read_baseline, read_text
-from fpirhc.errors import BaselineError, FpirhcError, InvalidValue
+from fpirhc.errors import BaselineError, FpirhcError, InvalidValue, OutputError
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.studies.comparison.compare import select, versions
+from fpirhc.whole_file import write_whole
 
 
 @checked_call
@@ -161,8 +162,16 @@ def write_baseline(task: Task, baseline: Baseline, baselines: Path | None, worki
     """
     path = baseline_path(task.path, baselines)
     check_inside(path, working)
-    write_whole(to_text(baseline), path, "baseline")
+    _write(baseline, path)
     return path
+
+
+def _write(baseline: Baseline, path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write the baseline to '{path}': {error.strerror}") from None
+    write_whole(to_text(baseline), path, "baseline")
 
 
 @checked_call
@@ -236,7 +245,7 @@ def write_merged(problem: Path, parts: Sequence[str], working: Path) -> Path:
         earlier = read_baseline(path)
         _check_mergeable(earlier, merged)
         merged = _joined(earlier, merged)
-    write_whole(to_text(merged), path, "baseline")
+    _write(merged, path)
     return path
 
 

@@ -7,8 +7,6 @@ They stand beside the problem, so that both change in the same review and move t
 from __future__ import annotations
 
 import ast
-import os
-import tempfile
 import tomllib
 from pathlib import Path
 
@@ -96,25 +94,3 @@ def check_inside(path: Path, working: Path) -> None:
             f"'{path}' lies outside of the project '{root}' and is not written; "
             "go to the problem's own project, or give --baselines FOLDER"
         )
-
-
-def write_whole(text: str, path: Path, what: str) -> None:
-    """Write a text file, atomically: the file is complete or not there.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=path.parent, prefix=".", suffix=".part", delete=False, newline="\n"
-        ) as file:
-            file.write(text)
-        try:
-            os.chmod(file.name, 0o644)
-            Path(file.name).replace(path)
-        except OSError:
-            Path(file.name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise OutputError(f"cannot write the {what} to '{path}': {error.strerror}") from None

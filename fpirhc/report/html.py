@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 from fpirhc.errors import InvalidName
 from fpirhc.report.figures import contraction_figure, lyapunov_figure, mismatch_figure, pair_figures
-from fpirhc.report.page import Image, asset, picture, render_page, write_page
+from fpirhc.report.page import Image, asset, picture, render_page
 from fpirhc.report.series import chart_data
 from fpirhc.simulation.drawing import BANDS, PALETTE
 from fpirhc.simulation.picture import Drawing
 from fpirhc.summary import Column, Table
+from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
     from fpirhc.simulation.pictures.base import Picture
@@ -50,7 +51,7 @@ def write_report(comparison: Comparison, path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    write_page(render(comparison), path)
+    write_whole(render(comparison), path, "report")
 
 
 def render(comparison: Comparison) -> str:
@@ -146,7 +147,7 @@ def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    write_page(render_scenarios(comparison), path)
+    write_whole(render_scenarios(comparison), path, "report")
 
 
 def render_scenarios(comparison: ScenarioComparison) -> str:

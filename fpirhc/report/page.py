@@ -5,15 +5,12 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fpirhc.errors import OutputError
 from fpirhc.simulation.picture import png
 from fpirhc.studies.comparison.outcome import Outcome
 
@@ -81,21 +78,6 @@ def _policy(scripts: Sequence[str]) -> str:
 def picture(figure: Figure, alt: str, caption: str = "") -> Image:
     """Return a figure as a picture inside the page."""
     return Image(f"data:image/png;base64,{base64.b64encode(png(figure)).decode('ascii')}", alt, caption)
-
-
-def write_page(content: str, path: Path) -> None:
-    """Write a page or another text, atomically: the file is complete or not there.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    try:
-        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, suffix=".part", delete=False) as file:
-            file.write(content)
-        Path(file.name).replace(path)
-        path.chmod(0o644)
-    except OSError as error:
-        raise OutputError(f"cannot write the report to '{path}': {error.strerror}") from None
 
 
 def asset(name: str) -> str:

@@ -47,9 +47,10 @@ _BETWEEN = 2  # between two columns: a space of each and the box between them
 _EDGES = 2  # columns left and right of a table
 
 
-def say(text: str, style: str = "", *, wrap: bool = True) -> None:
-    """Print text in which nothing is markup; without `wrap` it stays on one line."""
-    Console().print(Text(printable(text)), style=style, highlight=False, soft_wrap=not wrap)
+def say(text: str, style: str = "", more: str = "", *, wrap: bool = True) -> None:
+    """Print text in which nothing is markup, and more of it without the style; without `wrap` it stays on one line."""
+    line = Text.assemble((printable(text), style), printable(more))
+    Console().print(line, highlight=False, soft_wrap=not wrap)
 
 
 def show(view: View, report: Path) -> None:

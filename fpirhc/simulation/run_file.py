@@ -22,6 +22,7 @@ from fpirhc.fields.kinds import Positive
 from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.log import Log
 from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.whole_file import write_whole
 
 FORMAT = 1
 MOST = 2**34  # bytes of an unpacked file; a small file that unpacks to more is no run
@@ -62,14 +63,9 @@ def save(run: Log, path: Path) -> None:
     }
     content = io.BytesIO()
     np.savez_compressed(content, log=run.log, facts=np.array(json.dumps(facts)))
-    try:
-        if path.is_symlink() or (path.exists() and not path.is_file()):
-            raise OutputError(f"cannot write the run to '{path}': it is a link or no ordinary file; give another path")
-        _write_whole(path, content.getvalue())
-    except OSError as error:
-        if isinstance(error, OutputError):
-            raise
-        raise OutputError(f"cannot write the run to '{path}': {error.strerror}") from None
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        raise OutputError(f"cannot write the run to '{path}': it is a link or no ordinary file; give another path")
+    write_whole(content.getvalue(), path, "run")
 
 
 def read(path: Path) -> tuple[Facts, Layout, np.ndarray]:
@@ -134,17 +130,3 @@ def _layout(facts: Facts, log: np.ndarray) -> Layout:
     if any(len(s.units) not in (0, 1, s.size) for s in layout.signals):
         raise OutputError("the elements and the units of a signal differ in number")
     return layout
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise

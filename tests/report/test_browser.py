@@ -200,7 +200,7 @@ def test_axes_of_charts_name_time_and_its_unit(reports, visit):
 
 def test_a_table_that_is_cut_says_so(reports, visit):
     """The hint is there where the table is wider than the window, and only there; at its end the shade is gone."""
-    page = visit(reports["many"], 1280).page
+    page = visit(reports["many"], 800).page
     assert page.is_visible(".more")
     assert page.evaluate("document.querySelector('.scroll').classList.contains('cut')")
     page.evaluate("document.querySelector('.scroll').scrollLeft = 1e6")

@@ -30,8 +30,9 @@ def _add(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.baselines.judging import ignoring
     from fpirhc.baselines.outline import check_replaceable, outline
-    from fpirhc.baselines.places import problems_here, write_whole
+    from fpirhc.baselines.places import problems_here
     from fpirhc.baselines.printing import MARK, show_check, to_markdown
+    from fpirhc.whole_file import write_whole
 
     if options.markdown:
         check_replaceable(options.markdown, MARK)

@@ -70,12 +70,12 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.html import write_report
-    from fpirhc.report.page import write_page
     from fpirhc.report.terminal import announce_backend, progress_bars, show
     from fpirhc.studies.comparison.compare import compare, select
     from fpirhc.studies.comparison.optimiser_choices import with_optimisers
     from fpirhc.studies.tuning.tuned_file import noted, read_tuned, with_tuned
     from fpirhc.studies.view import to_json
+    from fpirhc.whole_file import write_whole
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     task = with_tuned(task, tuned.values) if tuned else task
@@ -97,7 +97,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     report = folder / "report.html"
     write_report(comparison, report)
     view = comparison.view
-    write_page(f"{to_json(view.facts)}\n", folder / RESULTS)
+    write_whole(f"{to_json(view.facts)}\n", folder / RESULTS, "report")
     announce_backend(entry.run for entry in comparison.entries)
     if options.json:
         print(to_json(view.facts))
@@ -160,9 +160,9 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import mismatch_figure, save_figure
     from fpirhc.report.html import write_scenarios
-    from fpirhc.report.page import write_page
     from fpirhc.report.terminal import show
     from fpirhc.studies.view import to_json
+    from fpirhc.whole_file import write_whole
 
     task = load_problem(options.problem)
     kind = "tuned_scenarios" if options.tuned else "scenarios"
@@ -172,7 +172,7 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
     report = folder / "report.html"
     write_scenarios(comparison, report)
     view = comparison.view
-    write_page(f"{to_json(view.facts)}\n", folder / RESULTS)
+    write_whole(f"{to_json(view.facts)}\n", folder / RESULTS, "report")
     if comparison.summaries:
         save_figure(mismatch_figure(comparison), folder / "mismatch.png")
     if options.json:

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from fpirhc.cli.options import add_controllers, add_json, add_mismatch, add_problem, add_seed
 from fpirhc.cli.verb import ExitCode, Verb
+
+if TYPE_CHECKING:
+    from fpirhc.review.answer import Answer, Review
+
+_COLOURS = {"yes": "green", "no": "red", "unknown": "yellow"}
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -20,17 +27,65 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
-    from fpirhc.report.answers import review_to_json, show_review
     from fpirhc.review.review import review
     from fpirhc.studies.comparison.compare import select
+    from fpirhc.studies.view import to_json
 
     controllers = select(task, options.controllers)
     answers = review(task.problem, controllers, mismatch=options.mismatch, seed=options.seed)
     if options.json:
-        print(review_to_json(task.name, answers))
+        print(to_json(_facts(task.name, answers)))
     else:
-        show_review(task.title, answers)
+        _show(task.title, answers)
     return ExitCode.FINISHED if answers.ready else ExitCode.ANSWERED_NO
+
+
+def _show(title: str, review: Review) -> None:
+    """Print what to do about every no, then every answer under its controller, and the number of answers of each kind."""
+    from fpirhc.report.terminal import say
+
+    say(title, "bold")
+    for about, answer in review.to_do:
+        say(f"  no      {about}: {answer.question}", _COLOURS["no"], f" -> {answer.advice}", wrap=False)
+    if review.to_do:
+        say("\nproblem", "bold")
+    _show_answers(review.problem)
+    for name, answers in review.controllers.items():
+        say(f"\n{name}", "bold")
+        _show_answers(answers)
+    counts = {v: sum(a.verdict == v for a in review.answers) for v in _COLOURS}
+    say("\n" + ", ".join(f"{count} {name}" for name, count in counts.items()))
+
+
+def _show_answers(answers: Iterable[Answer]) -> None:
+    from fpirhc.report.terminal import say
+
+    for one in answers:
+        say(f"  {one.verdict:7s} ", _COLOURS[one.verdict], one.question)
+        say(f"          {one.evidence}", wrap=False)
+        if one.change:
+            say(f"          -> {one.change}", wrap=False)
+
+
+def _facts(name: str, review: Review) -> dict[str, Any]:
+    return {
+        "problem": name,
+        "mismatch": review.mismatch,
+        "ready": review.ready,
+        "to_do": [{"about": about, "question": a.question, "what": a.advice} for about, a in review.to_do],
+        "answers": [_answer(a) for a in review.problem],
+        "controllers": {c: [_answer(a) for a in answers] for c, answers in review.controllers.items()},
+    }
+
+
+def _answer(answer: Answer) -> dict[str, Any]:
+    return {
+        "question": answer.question,
+        "verdict": str(answer.verdict),
+        "evidence": answer.evidence,
+        "change": answer.change,
+        "numbers": answer.numbers,
+    }
 
 
 VERB = Verb(

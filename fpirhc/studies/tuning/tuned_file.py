@@ -13,6 +13,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values, with_settings
 from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.tuning.objective import RELATIVE_ERROR
+from fpirhc.whole_file import write_whole
 
 FORMAT = 1
 
@@ -100,9 +101,5 @@ def write_tuned(facts: Mapping[str, Any], path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    part = path.with_suffix(".part")
-    try:
-        part.write_text(json.dumps({"format": FORMAT, **facts}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise OutputError(f"cannot write '{path}': {error.strerror}") from None
+    content = json.dumps({"format": FORMAT, **facts}, indent=2, allow_nan=False) + "\n"
+    write_whole(content, path, "tuned settings")
