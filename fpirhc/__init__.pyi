@@ -41,8 +41,7 @@ from .deformation.affine import Affine
 from .deformation.identity import Identity
 from .deformation.leaky import leaky_margin, leaky_pole
 from .deformation.model_referenced import ModelReferenced
-from .deformation.rfpt import RFPT
-from .deformation.rfpt_vector import RFPTVector
+from .deformation.rfpt import RFPT, RFPTVector
 from .deformation.rotation import Rotation
 from .deformation.sigmoid import Sigmoid
 from .deformation.wrappers.beyond_limit import BeyondLimit
@@ -128,9 +127,8 @@ from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
 from .task.set_point import Setpoint
-from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
-from .tracking.shift_polynomial import ShiftPolynomial
+from .tracking.linear_law import Exponential, ShiftPolynomial
 
 __all__ = [
     "PID",

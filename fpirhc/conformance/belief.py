@@ -29,7 +29,7 @@ from fpirhc.status import Status
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.exponential import Exponential
+from fpirhc.tracking.linear_law import Exponential
 
 Array = npt.NDArray[Any]
 

@@ -15,7 +15,7 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.exponential import Exponential
+from fpirhc.tracking.linear_law import Exponential
 
 
 @dataclass(frozen=True)

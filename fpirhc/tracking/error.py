@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
 
 import casadi as ca
 import numpy as np
@@ -17,6 +20,7 @@ from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.gap import GAP, is_long
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.tracking.base import Tracking
 
 ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor
 
@@ -47,6 +51,39 @@ class Useful:
         counted = ca.if_else(ca.fabs(self.integral * integral + self.error * error) <= most, error, 0)
         later = integral + period * counted
         return ca.if_else(ca.fabs(self.integral * later) <= 2 * most, later, 0)
+
+
+class IntegralLaw(Tracking):
+    """A law whose memory between cycles is the integral of the error, which does not grow while the command is clipped."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def largest(self) -> Sequence[float]:
+            """Responses beyond ten times of which an error is not integrated; empty: not decided yet."""
+
+    else:  # a plain attribute, so that dataclasses may have a field of this name
+        largest: Sequence[float]
+
+    def within(self, largest: Sequence[float]) -> Self:
+        """Return the law with these largest responses, unless the user has set them."""
+        if self.largest:
+            return self
+        other = copy(self)  # not `replace`, which would check numbers that are live
+        object.__setattr__(other, "largest", tuple(largest))
+        return other
+
+    def update(self, plant: Plant, period: float) -> Block:
+        """Block that integrates the error, except while the command is clipped, and within its bounds."""
+        return integral_update(plant, period, self._useful(plant))
+
+    def delays(self, plant: Plant) -> tuple[Delay, ...]:
+        """The delay of the integral of the error; a block of the law may hold more."""
+        return integral_delay(plant)
+
+    @abstractmethod
+    def _useful(self, plant: Plant) -> list[Useful]:
+        """What the integrals may ask for; nothing where they are not fed back."""
 
 
 def law_signals(plant: Plant) -> tuple[Layout, Layout]:

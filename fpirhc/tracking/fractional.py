@@ -26,38 +26,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, field
-from typing import Self
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.error import (
-    ROOM,
-    Useful,
-    check_modes,
-    error_chains,
-    integral_delay,
-    integral_update,
-    law_signals,
-    own_errors,
-)
+from fpirhc.tracking.error import ROOM, IntegralLaw, Useful, check_modes, error_chains, law_signals, own_errors
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default
 
 
 @dataclass(frozen=True)
-class Fractional(Tracking):
+class Fractional(IntegralLaw):
     """S decays as the Mittag-Leffler function E_beta(-(rate t)^beta).
 
     At the start of a run the integral of the error is zero, and S_0 is the value of S. Beyond the memory S stops decaying, at about
@@ -120,14 +108,6 @@ class Fractional(Tracking):
         """Lambda."""
         return self.rate
 
-    def within(self, largest: Sequence[float]) -> Self:
-        """Return the law with these largest responses, unless the user has set them."""
-        if self.largest:
-            return self
-        other = copy(self)  # not `replace`, which would check numbers that are live
-        object.__setattr__(other, "largest", tuple(largest))
-        return other
-
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use).
 
@@ -179,14 +159,6 @@ class Fractional(Tracking):
 
         waits = Block("tracking_waits", Layout(), Layout(), wait, memory, opaque=True)
         return Block("tracking", reads + Layout((GAP,)), writes, step, memory, opaque=True, waits=waits)
-
-    def update(self, plant: Plant, period: float) -> Block:
-        """Block that integrates the error, except while the command is clipped, and within its bounds."""
-        return integral_update(plant, period, self._useful(plant))
-
-    def delays(self, plant: Plant) -> tuple[Delay, ...]:
-        """The delay of the integral of the error; the block of the law holds the rest of the memory."""
-        return integral_delay(plant)
 
     def _useful(self, plant: Plant) -> list[Useful]:
         """What the integrals may ask for by way of rate S."""

@@ -1,33 +1,43 @@
-"""The common part of laws that feed errors back with constant gains, with or without the integral of the error."""
+"""Laws that feed errors back with constant gains, with or without the integral of the error.
+
+The error is nominal minus actual, hence the plus signs. On maps divided differences delta = (z - 1) / T of the cycle T stand in
+place of derivatives, and the integral is a sum.
+"""
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from copy import copy
-from typing import TYPE_CHECKING, Self
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import casadi as ca
+import numpy as np
 
+from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Duration
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
+from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression
-from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.base import Feedback
 from fpirhc.tracking.error import (
+    IntegralLaw,
     Useful,
     bumpless,
     check_modes,
     error_chains,
     gains_before,
-    integral_delay,
-    integral_update,
     law_signals,
     own_errors,
 )
 
+_REAL = 1e-9  # share of an imaginary part that is rounding
 
-class LinearLaw(Tracking):
+
+class LinearLaw(IntegralLaw):
     """q^(n),Des = q^(n),N + gains times (e_int, e, e', ...), the gains those of the members."""
 
     if TYPE_CHECKING:
@@ -40,14 +50,9 @@ class LinearLaw(Tracking):
         def bumpless(self) -> bool:
             """Whether the integral starts so that the first desired response is the nominal one."""
 
-        @property
-        def largest(self) -> Sequence[float]:
-            """Responses beyond ten times of which an error is not integrated; empty: not decided yet."""
-
     else:  # plain attributes, so that dataclasses may have fields of these names
         integral: bool
         bumpless: bool
-        largest: Sequence[float]
 
     @abstractmethod
     def gains(self, order: int) -> tuple[float, ...]:
@@ -62,14 +67,6 @@ class LinearLaw(Tracking):
         del period
         for order in plant.response_orders.values():
             check_modes(self, plant, self.gains(order))
-
-    def within(self, largest: Sequence[float]) -> Self:
-        """Return the law with these largest responses, unless the user has set them."""
-        if self.largest:
-            return self
-        other = copy(self)  # not `replace`, which would check numbers that are live
-        object.__setattr__(other, "largest", tuple(largest))
-        return other
 
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
@@ -94,14 +91,6 @@ class LinearLaw(Tracking):
 
         return Block("tracking", reads, writes, step, gains_before(plant, first_gains))
 
-    def update(self, plant: Plant, period: float) -> Block:
-        """Block that integrates the error, except while the command is clipped, and within its bounds."""
-        return integral_update(plant, period, self._useful(plant))
-
-    def delays(self, plant: Plant) -> tuple[Delay, ...]:
-        """The delay of the integral of the error."""
-        return integral_delay(plant)
-
     def _useful(self, plant: Plant) -> list[Useful]:
         """What the integrals may ask for; nothing where they are not fed back."""
         if not (self.integral and self.largest):
@@ -118,3 +107,141 @@ class LinearLaw(Tracking):
             return error * 0
         first, *others = self.gains(len(chain))
         return -total(g * e for g, e in zip(others, chain, strict=True)) / first
+
+
+@dataclass(frozen=True)
+class Exponential(LinearLaw):
+    """All error modes decay as exp(-rate t): (d/dt + rate)^(n+1) e_int = 0, and without the integral (d/dt + rate)^n e = 0.
+
+        q^(n),Des = q^(n),N + sum_{s=0}^{n} C(n+1, s) rate^(n+1-s) e_int^(s),   e_int^(s) = e^(s-1) for s >= 1
+
+    On a map with cycles of T all modes have the pole z = 1 - rate T, and rate = 1 / T is deadbeat. Source: J. K. Tar, J. F. Bito,
+    I. Rudas, Acta Polytechnica Hungarica 13(1), 2016.
+
+    Args:
+        rate: Lambda, 1/s. The digital loop needs rate x period well below 0.667 for n = 2 (0.412 for n = 4).
+        integral: whether the integral of the error is fed back (it removes constant offsets and adds an undershoot).
+        bumpless: whether the integral starts so that the first desired response is the nominal one.
+        largest: response of every controlled coordinate beyond ten times of which an error is not integrated, and an integral does
+            not grow or start a run; infinite for no bound. Empty: what the limits of the inputs allow.
+
+    Raises:
+        InvalidValue: a rate that is not positive.
+    """
+
+    rate: float
+    integral: bool = True
+    bumpless: bool = True
+    largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate) and self.rate > 0):
+            raise InvalidValue(f"tracking rate must be positive (1/s), got {self.rate}")
+
+    def gains(self, order: int) -> tuple[float, ...]:
+        """Gains of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first."""
+        degree = order + 1 if self.integral else order
+        return tuple([math.comb(degree, s) * power(self.rate, degree - s) for s in range(degree)])
+
+    @property
+    def speed(self) -> float:
+        """Lambda."""
+        return self.rate
+
+    def feedback(self, order: int) -> Feedback:
+        """The gains for that order."""
+        return Feedback(self.gains(order), self.integral, self.bumpless, self.rate)
+
+
+@dataclass(frozen=True)
+class ShiftPolynomial(LinearLaw):
+    """The error modes have the stated poles in z.
+
+        (z - z_1) ... (z - z_{n+1}) e_int = 0,      without the sum  (z - z_1) ... (z - z_n) e = 0
+
+    It is written in divided differences, (delta + (1 - z_1) / T) ... . A pole at zero is deadbeat: with an exact model the error is
+    zero after n cycles (one more with the sum). On differential equations the poles are those of a cycle to first order in 1 - z.
+    Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed., 1997, ch. 5.
+
+    Args:
+        poles: one real number for all modes, or one number per mode, complex ones with their conjugates; inside the unit circle.
+        step: the control cycle T, for which they are meant.
+        integral: whether the sum of the errors is fed back (it removes constant offsets, and has one more pole).
+        bumpless: whether the sum starts so that the first desired response is the nominal one.
+        largest: see `Exponential`.
+
+    Raises:
+        InvalidValue: a pole that is not inside the unit circle, or complex without its conjugate; when the loop is built, another
+            number of poles than modes, or another cycle.
+    """
+
+    poles: float | Sequence[float | complex]
+    step: Duration = field(metadata={"structure": True})
+    integral: bool = True
+    bumpless: bool = True
+    largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
+
+    def __post_init__(self) -> None:
+        every = [self.poles] if not isinstance(self.poles, Sequence) else list(self.poles)
+        outside = [z for z in every if not abs(z) < 1]
+        if outside or not every:
+            wrong = f"{outside[0]:g} is not inside the unit circle" if outside else "there is none"
+            raise InvalidValue(
+                f"ShiftPolynomial(poles={self.poles!r}): {wrong}; 0 is deadbeat, and a slow mode is below 1"
+            )
+        coefficients = np.poly(every)
+        if np.abs(np.imag(coefficients)).max() > _REAL:
+            raise InvalidValue(
+                f"ShiftPolynomial(poles={self.poles!r}): give a complex pole together with its conjugate"
+            )
+
+    def gains(self, order: int) -> tuple[float, ...]:
+        """Gains of (e_int, e, delta e, ...) with the sum, of (e, delta e, ...) without; lowest difference first.
+
+        Raises:
+            InvalidValue: another number of poles than modes.
+        """
+        degree = order + 1 if self.integral else order
+        if not isinstance(self.poles, Sequence):
+            rate = (1 - self.poles) / self.step
+            return tuple(math.comb(degree, s) * power(rate, degree - s) for s in range(degree))
+        if len(self.poles) != degree:
+            raise InvalidValue(
+                f"ShiftPolynomial: {len(self.poles)} poles are given, and a quantity of relative order {order} has {degree} modes"
+                f"{' with the sum of its errors' if self.integral else ''}; give {degree} poles, or one number for all"
+            )
+        coefficients = np.real(np.poly([(z - 1) / self.step for z in self.poles]))
+        return tuple(float(c) for c in coefficients[:0:-1])
+
+    def check_cycle(self, plant: Plant, period: float) -> None:
+        """Raise if the poles are meant for another cycle.
+
+        Raises:
+            InvalidValue: with the cycle.
+        """
+        if abs(self.step - period) > _REAL * period:
+            raise InvalidValue(
+                f"ShiftPolynomial(step={self.step:g}): the control cycle is {period:g} {plant.time_unit}, and poles in z belong to "
+                f"one cycle; write step={period:g}, with the poles of that cycle"
+            )
+        super().check_cycle(plant, period)
+
+    @property
+    def speed(self) -> float | None:
+        """(1 - z) / T of the fastest mode."""
+        every = [self.poles] if not isinstance(self.poles, Sequence) else list(self.poles)
+        return max(abs(1 - z) for z in every) / self.step
+
+    def feedback(self, order: int) -> Feedback:
+        """The gains for that order."""
+        rate = (1 - self.poles) / self.step if not isinstance(self.poles, Sequence) else None
+        return Feedback(self.gains(order), self.integral, self.bumpless, rate)
+
+
+EXAMPLES = (
+    Exponential(rate=6.0),
+    Exponential(rate=6.0, bumpless=False),
+    Exponential(rate=2.0, integral=False),
+    ShiftPolynomial(poles=0.98, step=5e-3),
+    ShiftPolynomial(poles=0.99, step=5e-3, integral=False),
+)

@@ -30,7 +30,7 @@ from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.live import live_numbers, settled
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains, integral_signal
-from fpirhc.tracking.exponential import Exponential
+from fpirhc.tracking.linear_law import Exponential
 
 
 @dataclass(frozen=True, eq=False)

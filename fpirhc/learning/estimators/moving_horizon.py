@@ -26,17 +26,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.kinds import Deviation
-from fpirhc.learning.estimators.base import Correct, Estimator, Seen
-from fpirhc.learning.estimators.uncertain import (
-    Uncertain,
-    between,
-    bounds_of,
-    check_learner,
-    deviations,
-    forgetting_factor,
-    residual_function,
-)
+from fpirhc.learning.estimators.base import Correct, Seen
+from fpirhc.learning.estimators.uncertain import Learner, Uncertain, between, bounds_of, deviations, forgetting_factor
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
@@ -44,7 +35,7 @@ MOST = 2000  # pairs in a window: the memory has a fixed size
 
 
 @dataclass(frozen=True, eq=False)
-class MovingHorizon(Estimator):
+class MovingHorizon(Learner):
     """Learn parameters from a window of pairs of command and response.
 
     Args:
@@ -58,32 +49,15 @@ class MovingHorizon(Estimator):
         InvalidValue: no parameter; a noise or time that is not positive; a window or iterations outside their range.
     """
 
-    parameters: Mapping[str, Uncertain]
-    noise: Mapping[str, Deviation]
     window: int
     time: float
     iterations: int = 1
 
     def __post_init__(self) -> None:
-        if not self.parameters:
-            raise InvalidValue("MovingHorizon(parameters={}): name at least one parameter to learn")
-        if not self.time > 0:
-            raise InvalidValue(f"MovingHorizon(time={self.time!r}): expected a positive number of seconds, or math.inf")
+        self._require(self.time)
         for name, value, most in (("window", self.window, MOST), ("iterations", self.iterations, 20)):
             if not isinstance(value, int) or not 1 <= value <= most:
                 raise InvalidValue(f"MovingHorizon({name}={value!r}): expected a whole number from 1 to {most}")
-
-    def learned(self) -> tuple[str, ...]:
-        """The named parameters."""
-        return tuple(self.parameters)
-
-    def check(self, problem: Problem) -> None:
-        """Raise if names or bounds do not fit the plant.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
-        check_learner("MovingHorizon", problem.plant, self.parameters, self.noise)
 
     def memory(self, problem: Problem) -> Layout:
         """The scaled estimate z, the prior's mean and information, and the window, newest pair first."""
@@ -103,7 +77,7 @@ class MovingHorizon(Estimator):
     def step(self, problem: Problem) -> Correct:
         """Exchange of one pair in the window, and the Gauss-Newton steps."""
         plant, size, row = problem.plant, len(self.parameters), _row_size(problem)
-        residual = residual_function(plant, self.parameters, [self.noise[c] for c in plant.controlled_names])
+        residual = self.residual(plant)
         pair = _pair_function(problem, residual)
         newton, absorb = _newton_function(size), _absorb_function(size, forgetting_factor(self.time, problem.period))
 

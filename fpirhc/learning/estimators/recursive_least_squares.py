@@ -22,24 +22,14 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue
-from fpirhc.fields.kinds import Deviation
-from fpirhc.learning.estimators.base import Correct, Estimator, Seen
-from fpirhc.learning.estimators.uncertain import (
-    Uncertain,
-    between,
-    bounds_of,
-    check_learner,
-    deviations,
-    forgetting_factor,
-    residual_function,
-)
+from fpirhc.learning.estimators.base import Correct, Seen
+from fpirhc.learning.estimators.uncertain import Learner, Uncertain, between, bounds_of, deviations, forgetting_factor
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
-class RecursiveLeastSquares(Estimator):
+class RecursiveLeastSquares(Learner):
     """Learn parameters from every pair of command and response.
 
     Args:
@@ -51,29 +41,10 @@ class RecursiveLeastSquares(Estimator):
         InvalidValue: no parameter, or a noise or time that is not positive.
     """
 
-    parameters: Mapping[str, Uncertain]
-    noise: Mapping[str, Deviation]
     time: float
 
     def __post_init__(self) -> None:
-        if not self.parameters:
-            raise InvalidValue("RecursiveLeastSquares(parameters={}): name at least one parameter to learn")
-        if not self.time > 0:
-            raise InvalidValue(
-                f"RecursiveLeastSquares(time={self.time!r}): expected a positive number of seconds, or math.inf"
-            )
-
-    def learned(self) -> tuple[str, ...]:
-        """The named parameters."""
-        return tuple(self.parameters)
-
-    def check(self, problem: Problem) -> None:
-        """Raise if names or bounds do not fit the plant.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
-        check_learner("RecursiveLeastSquares", problem.plant, self.parameters, self.noise)
+        self._require(self.time)
 
     def memory(self, problem: Problem) -> Layout:  # noqa: ARG002
         """The scaled estimate z and its covariance P, column by column."""
@@ -83,7 +54,7 @@ class RecursiveLeastSquares(Estimator):
     def step(self, problem: Problem) -> Correct:
         """One update of the estimate and its covariance."""
         plant, size = problem.plant, len(self.parameters)
-        residual = residual_function(plant, self.parameters, [self.noise[c] for c in plant.controlled_names])
+        residual = self.residual(plant)
         factor = forgetting_factor(self.time, problem.period)
 
         def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:

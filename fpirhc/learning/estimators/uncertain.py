@@ -18,6 +18,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Deviation
+from fpirhc.learning.estimators.base import Estimator
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.problem import Problem
@@ -45,12 +46,44 @@ class Uncertain(Checked):
             raise InvalidValue(f"Uncertain(lower={self.lower!r}, upper={self.upper!r}): expected finite lower < upper")
 
 
-def check_learner(owner: str, plant: Plant, parameters: Mapping[str, Uncertain], noise: Mapping[str, float]) -> None:
-    """Raise if names do not fit the plant, or an approximate value lies outside its bounds.
+@dataclass(frozen=True, eq=False)
+class Learner(Estimator):
+    """What learners of parameters share: the priors, and the noise of the responses.
 
-    Raises:
-        InvalidProblem: all mistakes together.
+    Args:
+        parameters: name -> Uncertain(lower, upper, deviation) of every learned parameter.
+        noise: controlled coordinate -> deviation of the part of its response that the model lacks, in the response's unit.
     """
+
+    parameters: Mapping[str, Uncertain]
+    noise: Mapping[str, Deviation]
+
+    def learned(self) -> tuple[str, ...]:
+        """The named parameters."""
+        return tuple(self.parameters)
+
+    def check(self, problem: Problem) -> None:
+        """Raise if names do not fit the plant, or an approximate value lies outside its bounds.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        _check_names(type(self).__name__, problem.plant, self.parameters, self.noise)
+
+    def residual(self, plant: Plant) -> ca.Function:
+        """Return the Function of `residual_function` in units of the noise."""
+        return residual_function(plant, self.parameters, [self.noise[c] for c in plant.controlled_names])
+
+    def _require(self, time: float) -> None:
+        """Raise unless there is a parameter to learn, and the time constant is positive."""
+        owner = type(self).__name__
+        if not self.parameters:
+            raise InvalidValue(f"{owner}(parameters={{}}): name at least one parameter to learn")
+        if not time > 0:
+            raise InvalidValue(f"{owner}(time={time!r}): expected a positive number of seconds, or math.inf")
+
+
+def _check_names(owner: str, plant: Plant, parameters: Mapping[str, Uncertain], noise: Mapping[str, float]) -> None:
     mistakes = Mistakes(owner)
     mistakes.unknown("parameters:", parameters, plant.parameters)
     for name, prior in parameters.items():
