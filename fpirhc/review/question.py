@@ -28,13 +28,13 @@ from fpirhc.review.loops_by_gain import LoopsByGain, loops_by_gain
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.prediction import NominalRun
 from fpirhc.simulation.error_pair import ErrorPair
-from fpirhc.simulation.trials import Trials
+from fpirhc.simulation.trials import Trials, harm_in
 from fpirhc.task.problem import Problem
 
 GROUP = "fpirhc.questions"  # of entry points
 
 Kind = TypeVar("Kind", "ProblemQuestion", "ControllerQuestion")
-_TRIED = 1000  # cycles of a run that tries a form or a gain
+TRIED = 1000  # cycles of a run that tries a form or a gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Case:
 
     @cached_property
     def _trials(self) -> Trials:
-        return Trials(self.grid.real or self.problem, without_deformation(self.controller), cycles=_TRIED)
+        return Trials(self.grid.real or self.problem, without_deformation(self.controller), cycles=TRIED)
 
     @cached_property
     def _tried(self) -> dict[str, tuple[ErrorPair | None, ErrorPair] | str]:
@@ -92,14 +92,12 @@ class Case:
         The exact parameters are those of the problem, so a form or a gain is proposed only after a run with the wrong model.
         """
         trial = self.trial(deformation)
-        if isinstance(trial, str):
-            return trial
-        real, null = trial
-        if real is not None and not real.passes:
-            return f"with the wrong model {real.sentence}"
-        if not null.passes and (real is None or null.adapted[null.worst] > real.without[null.worst]):
-            return f"with a right model {null.sentence}"
-        return ""
+        return trial if isinstance(trial, str) else harm_in(*trial)
+
+    def lowers(self, deformation: Deformation) -> bool:
+        """Whether runs on plant and model show no harm of a deformation, and that on the plant no larger error, however small."""
+        trial = self.trial(deformation)
+        return not self.harm(deformation) and (isinstance(trial, str) or trial[0] is None or trial[0].lowers)
 
     @cached_property
     def nominal(self) -> NominalRun | str:

@@ -195,7 +195,7 @@ def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
         _asked(one_sign, own, boxed),
         _asked(gain_admissible, deformation, own, boxed, limit, gain_advice(case, boxed, null)),
         *suited,
-        _asked(fast_enough, grid, controller, own),
+        _asked(fast_enough, case, own),
         _asked(bears_lag, grid, controller, own),
         two_cycles,
         _asked(chatter_small, grid, controller),

@@ -39,4 +39,4 @@ def _answer(problem: Problem, controller: Controller) -> Answer | None:
     grid = review_grid(problem, 0.0, 0)
     case = Case(grid, controller, loops_along(grid, controller), NominalRuns(grid.problem))
     own = spectrum_near(grid, case.believed, grid.draws[:1], near=False)
-    return fast_enough(grid, controller, own) or plan_keeps_up(case)
+    return fast_enough(case, own) or plan_keeps_up(case)

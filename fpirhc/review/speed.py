@@ -8,17 +8,21 @@ from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.forms import INCREMENT, REFERENCED, forms_of
 from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.question import Case
 
 FAST = "Does the iteration keep up with its tracking law?"
 LAG = "Does it bear a small lag that is not in the model?"
+_FORMS = {REFERENCED: "ModelReferenced", INCREMENT: "Increment"}
 _SPARE = 3.0
 _DAMPING = 0.3
 _CYCLES = 3.0  # of lag that it should bear
 
 
-def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
+def fast_enough(case: Case, own: Spectrum) -> Answer | None:
     """Return the smallest a lambda beside the one that the plain form needs; None for other forms, unknown poles, and maps."""
+    grid, controller = case.grid, case.controller
     law = law_of(grid, controller)
     if grid.problem.plant.step is not None:
         return None  # the linear loop of a map is exact
@@ -30,13 +34,9 @@ def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answ
     text = f"gain x eigenvalue is at least {product:.3g}, {ratio:.3g} times what {poles} poles"
     text += f" at {rate:g} {grid.problem.rate_unit} need"
     numbers = {"product": product, "ratio": ratio}
-    change = (
-        "Use a form that passes the desired response at once (ModelReferenced, Increment), multiply the gain by "
-        f"{_SPARE / ratio:.2g} or more, or lower rate x period."
-    )
     if ratio >= _SPARE:
         return Answer(FAST, Verdict.YES, text, "", numbers)
-    return Answer(FAST, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, change, numbers)
+    return Answer(FAST, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, _remedy(case, _SPARE / ratio), numbers)
 
 
 def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
@@ -66,6 +66,18 @@ def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None
     laws = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law else []
     known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]
     return max(known, key=lambda pair: pair[1]) if known else None
+
+
+def _remedy(case: Case, factor: float) -> str:
+    """What to do: a form or a gain that runs on plant and model speak for, or a slower law."""
+    deformation = case.controller.deformation
+    forms = forms_of(case.problem, deformation)
+    passing = [name for kind, name in _FORMS.items() if kind in forms and not case.harm(forms[kind])]
+    ways = [f"use a form that passes the desired response at once ({', '.join(passing)})"] if passing else []
+    if case.lowers(deformation.with_effective_gain(factor * deformation.effective_gain())):
+        ways.append(f"multiply the gain by {factor:.2g}")
+    text = ", or ".join([*ways, "lower rate x period"])
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _products(controller: Controller, own: Spectrum) -> tuple[float, float]:

@@ -10,22 +10,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fpirhc.by_name import FoundByName
 from fpirhc.contraction.noise import filter_pole
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
-from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotContractive, NotSupported, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
 from fpirhc.review.noise_along import Noisy, noisy_points
+from fpirhc.review.question import TRIED
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.simulation.trials import Trials, harm_in
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
@@ -44,6 +46,7 @@ class Suggestion(FoundByName):
         chatter: by input, predicted rms of the command's step per cycle that noise causes, in the input's unit.
         floor: by controlled coordinate, predicted rms tracking error that noise causes, in the coordinate's unit; NaN where no
             linear loop is known.
+        harm: what runs on the plant and on the controller's own model show against it, beside no adaptation; empty without harm.
     """
 
     deformation: Deformation
@@ -53,6 +56,7 @@ class Suggestion(FoundByName):
     gain: float
     chatter: Mapping[str, float]
     floor: Mapping[str, float]
+    harm: str = ""
 
     def __repr__(self) -> str:
         return line(self, *(f"{name} {value}" for name, value in self._facts()))
@@ -64,7 +68,8 @@ class Suggestion(FoundByName):
     def _facts(self) -> list[tuple[str, str]]:
         own = [(self.gain_name, number(self.gain)), ("pole", number(self.pole))]
         steps = [(f"step of {i} per cycle", number(v)) for i, v in self.chatter.items()]
-        return [*own, *steps, *((f"rms error of {c} from noise", number(v)) for c, v in self.floor.items())]
+        against = [("against it", self.harm)] if self.harm else []
+        return [*own, *steps, *((f"rms error of {c} from noise", number(v)) for c, v in self.floor.items()), *against]
 
 
 @checked_call
@@ -79,7 +84,8 @@ def suggest(
     """Return the largest gain, with the pole of a filter of its error, whose chatter is within a budget.
 
     The gain ends at the deadbeat one, the inverse of the largest eigenvalue of the response Jacobian along the reference. The
-    wrappers of the deformation stay, a `Filtered` among them is replaced.
+    wrappers of the deformation stay, a `Filtered` among them is replaced. It is run on the plant and on the controller's model, for
+    1000 cycles at most: where no adaptation does better, `harm` says so.
 
     Parameters: `chatter`: rms step of the command per cycle that noise may cause, in the input's unit, by input or one for all;
     `noise`: standard deviation of the measured response by controlled coordinate, by default that of the problem's sensors;
@@ -90,6 +96,19 @@ def suggest(
         or coordinate. NotSupported: a controller without adaptation; a response that is estimated, whose noise must
         be given. NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
     """
+    found = within_budget(problem, controller, chatter=chatter, noise=noise, ringing=ringing)
+    return replace(found, harm=_harm(problem, controller, found.deformation))
+
+
+def within_budget(
+    problem: Problem,
+    controller: Controller,
+    *,
+    chatter: float | Mapping[str, float],
+    noise: Mapping[str, float] | None = None,
+    ringing: float = RINGING,
+) -> Suggestion:
+    """Return what `suggest` does, before it is run."""
     ready = resolved(problem, controller)
     _check(ready, ringing)
     budget = _budget(problem, chatter)
@@ -108,6 +127,14 @@ def suggest(
     predicted = dict(zip(problem.plant.inputs, map(float, noisy.steps(sign * size, pole)), strict=True))
     floor = _floor(loops_along(grid, ready).ideal, noisy, problem)
     return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
+
+
+def _harm(problem: Problem, controller: Controller, deformation: Deformation) -> str:
+    try:
+        trials = Trials(problem, without_deformation(controller), cycles=TRIED)
+        return harm_in(*trials.errors(controller.with_deformation(deformation)))
+    except FpirhcError as error:
+        return f"it cannot be tried ({error})"
 
 
 def _check(controller: Controller, ringing: float) -> None:

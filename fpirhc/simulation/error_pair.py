@@ -15,6 +15,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
 WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
+_ROUNDING = 1e-9  # share of the coordinate's range
 SLIGHT, CLEAR = 1e-3, 1e-2  # added error as a share of the coordinate's range
 
 
@@ -65,6 +66,11 @@ class ErrorPair:
     def passes(self) -> bool:
         """Whether adaptation makes no coordinate worse by more than a fifth and by a thousandth of its range."""
         return not self._beyond(WORSE, SLIGHT)
+
+    @property
+    def lowers(self) -> bool:
+        """Whether adaptation makes no coordinate worse by more than a fifth, however small its errors are."""
+        return not self._beyond(WORSE, _ROUNDING)
 
     @property
     def fails(self) -> bool:

@@ -26,6 +26,15 @@ def weighed(problem: Problem, controller: Controller) -> frozenset[str] | None:
     return frozenset(n for n in problem.judged_names if n in names) or None
 
 
+def harm_in(real: ErrorPair | None, null: ErrorPair) -> str:
+    """Return what runs on the plant (None: it is outside) and on the model show against adaptation; empty without harm."""
+    if real is not None and not real.passes:
+        return f"with the wrong model {real.sentence}"
+    if not null.passes and (real is None or null.adapted[null.worst] > real.without[null.worst]):
+        return f"with a right model {null.sentence}"
+    return ""
+
+
 class Trials:
     """Runs beside one controller without adaptation, whose own runs are made once. A plant outside is not run."""
 

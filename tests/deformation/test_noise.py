@@ -106,6 +106,14 @@ def test_generous_budget_ends_at_the_deadbeat_gain():
     assert "Suggested" in suggestion._repr_html_()
 
 
+def test_a_suggestion_that_a_run_speaks_against_says_so():
+    """A hundredth of the budget leaves a gain with which the run of two masses is 40 times worse than without adaptation."""
+    assert not fp.suggest(noisy(), planning(), chatter=BUDGET).harm
+    small = fp.suggest(noisy(), planning(), chatter={name: value / 100 for name, value in BUDGET.items()}, ringing=0.0)
+    assert small.harm.startswith("with the wrong model the rms error of q1 is 0.0304 without adaptation, 1.")
+    assert small.harm in repr(small)
+
+
 def test_suggestion_keeps_the_other_wrappers():
     """A filter is replaced, a guard around it stays, and so does the sign of the gain."""
     guarded = fp.Guarded(fp.Filtered(fp.Affine(gain=-0.1), pole=0.99), largest_deformation=1e3)

@@ -46,6 +46,21 @@ def test_slow_iterations_are_told(ratio, verdict):
     assert answer(moving(), fp.Filtered(slow, pole=0.1), "keep up with its tracking law") is not None
 
 
+@pytest.mark.parametrize(("eigenvalue", "larger"), [(1.5, True), (1.02, False)])
+def test_a_larger_gain_is_proposed_where_a_run_with_the_wrong_model_speaks_for_it(eigenvalue, larger):
+    """3.3 times the gain of the plain form has a seventh of the error of no adaptation, or twice it beside a model nearly right."""
+    problem, ratio = moving(eigenvalue), 0.9
+    slow = fp.Affine(gain=-2 * ratio * least_product(3, RATE, PERIOD) / eigenvalue)
+    forms = "Use a form that passes the desired response at once (ModelReferenced, Increment), or "
+    said = answer(problem, slow, "keep up with its tracking law").change
+    assert said == forms + "multiply the gain by 3.3, or " * larger + "lower rate x period."
+    law = fp.ComputedTorque(fp.Exponential(rate=RATE))
+    faster = fp.Affine(gain=slow.gain * 3 / ratio)
+    runs = (fp.simulate(problem, one, seed=0, compiled=False) for one in (law, law.with_deformation(faster)))
+    without, adapted = (fp.measure(problem, run).rms_error["y"] for run in runs)
+    assert (adapted < 0.2 * without) if larger else (adapted > 2 * without)
+
+
 def test_lag_that_is_said_to_be_borne_is_borne():
     """At the longest lag the loop is stable, at twice the limit not; a large gain bears less than three cycles."""
     one_answer = answer(moving(1.0), fp.Affine(gain=-0.2), "small lag")

@@ -16,7 +16,7 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.chatter import SMALL
 from fpirhc.review.noise_along import chatter_of
 from fpirhc.review.question import Case, ControllerQuestion
-from fpirhc.review.suggest import suggest
+from fpirhc.review.suggest import within_budget
 
 TEXT = "Are gain and filter those that the sensors' noise asks for?"
 _ENOUGH = 0.5  # share of the suggested gain that is as good
@@ -31,7 +31,7 @@ def suits_noise(case: Case) -> Answer | None:
     try:
         steps = chatter_of(case.grid, case.controller, deformation.effective_gain(), deformation.iteration.error_pole)
         budget = _budget(case) or steps
-        pair = suggest(case.problem, case.controller, chatter=budget)
+        pair = within_budget(case.problem, case.controller, chatter=budget)
     except FpirhcError as error:
         return Answer(TEXT, Verdict.UNKNOWN, str(error))
     pole = deformation.iteration.error_pole
@@ -44,6 +44,10 @@ def suits_noise(case: Case) -> Answer | None:
     )
     if share >= _ENOUGH and all(steps[name] <= 1.01 * value for name, value in budget.items()):
         return Answer(TEXT, Verdict.YES, text, "", numbers)
+    against = case.harm(pair.deformation)
+    if against:
+        change = "Less noise at the response is needed: a better sensor, an estimator, or a longer period."
+        return Answer(TEXT, Verdict.UNKNOWN, f"{text}, but {against}", change, numbers)
     change = f"Use {pair.gain_name} = {pair.gain:.3g}" + (
         f" in Filtered(map, pole={pair.pole:.3g})." if pair.pole else " without a filter."
     )
