@@ -1,7 +1,7 @@
 """The Temperature Control Lab as the reality of a problem: its digital twin, or the board.
 
     problem = fp.Problem(plant=model, reality=tclab_body(model, period=2.0), ...)             the twin, in simulated time
-    problem = fp.Problem(plant=model, reality=tclab_body(model, period=2.0, board=True), ...)
+    problem = fp.Problem(plant=model, reality=tclab_body(model, period=2.0, board=RealTime()), ...)
 
 Measured are the temperatures T1 and T2, degC, with noise and the steps of the converter; inputs are the heaters Q1 and Q2, %.
 """
@@ -11,13 +11,12 @@ from __future__ import annotations
 import contextlib
 import io
 import random
-import time as wall
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from fpirhc.adapters.names import package
+from fpirhc.adapters.real_time import RealTime
 from fpirhc.errors import Mistakes
 from fpirhc.plant.plant import Plant
 from fpirhc.task.foreign import Foreign
@@ -25,22 +24,13 @@ from fpirhc.task.foreign import Foreign
 _SENSORS, _HEATERS = ("T1", "T2"), ("Q1", "Q2")
 
 
-def tclab_body(
-    model: Plant,
-    *,
-    period: float,
-    board: bool = False,
-    clock: Callable[[], float] = wall.monotonic,
-    sleep: Callable[[float], None] = wall.sleep,
-) -> Foreign:
+def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) -> Foreign:
     """Return the lab as a reality.
 
     Args:
         model: the controller's model; its states or outputs are named T1 and T2, its inputs Q1 and Q2, one or both.
         period: of the problem, s.
-        board: whether it is the board, in real time; False: its digital twin.
-        clock: function that returns the wall time, s; the board alone needs it.
-        sleep: function that waits for some seconds; the board alone needs it.
+        board: the clock of the board, `RealTime()`; None: it is its digital twin, in simulated time.
 
     Raises:
         NotSupported: tclab is not installed.
@@ -50,7 +40,7 @@ def tclab_body(
     mistakes.unknown("measured", model.output.elements, _SENSORS)
     mistakes.unknown("input", model.inputs, _HEATERS)
     mistakes.raise_if_any()
-    body = _Board(tclab, model, period, clock, sleep) if board else _Twin(tclab, model, period)
+    body = _Twin(tclab, model, period) if board is None else _Board(tclab, model, period, board)
     return Foreign(body, measures=dict.fromkeys(model.output.elements, "degC"))
 
 
@@ -96,18 +86,16 @@ class _Twin:
 class _Board(_Twin):
     """The board: the next cycle begins when it is time."""
 
-    def __init__(
-        self, tclab: Any, model: Plant, period: float, clock: Callable[[], float], sleep: Callable[[float], None]
-    ) -> None:
+    def __init__(self, tclab: Any, model: Plant, period: float, now: RealTime) -> None:
         super().__init__(tclab, model, period)
-        self._clock, self._sleep = clock, sleep
+        self._now = now
 
     def _begun(self) -> Any:
         if self._lab is not None:
             self._lab.close()
         lab = self._tclab.TCLab()
-        self._begin = self._clock()
+        self._now.begin()
         return lab
 
     def _wait(self, time: float) -> None:
-        self._sleep(max(self._begin + time - self._clock(), 0.0))
+        self._now.wait_until(time)

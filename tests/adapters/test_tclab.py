@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.adapters.real_time import RealTime
 from fpirhc.adapters.tclab import tclab_body
 from fpirhc.errors import InvalidProblem
 
@@ -87,7 +88,7 @@ def test_the_board_is_asked_when_its_cycle_is_over(monkeypatch):
         now[0] += seconds
 
     monkeypatch.setattr(tclab, "TCLab", Board)
-    body: Any = tclab_body(LAB, period=PERIOD, board=True, clock=lambda: now[0], sleep=sleep).body
+    body: Any = tclab_body(LAB, period=PERIOD, board=RealTime(lambda: now[0], sleep)).body
     body.reset(0)
     now[0] += 0.5  # the controller's own time
     body.step(0.0, np.array([50.0, 0.0]))
