@@ -18,9 +18,9 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.mirror_path import MEASURED, Path
+from fpirhc.controllers.mirror_path import MEASURED, MEASURED_OUTPUT, Path, measured_output
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import response_names
+from fpirhc.sensing.base import response_names, values_of
 from fpirhc.symbolic.block import Block, unseen
 from fpirhc.symbolic.expression import Signals, expression, is_finite, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -36,8 +36,8 @@ def twin_block(path: Path) -> Block:
     estimate = problem.sensing.estimator.block(plant, problem.period, start, Signal("_seen", names))
     own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
     twin = Signal("mirror_state", plant.state.elements, plant.state.units, tuple(map(float, start)))
-    seen, calm = _seen(problem, names), np.zeros(len(plant.names))
-    resting = np.asarray(seen(start, problem.inputs_before, plant.approximate, calm).full()).ravel()
+    seen, controlled = _seen(problem, names, response_names(plant)), list(plant.controlled_indices)
+    resting = np.asarray(seen(start, problem.inputs_before, plant.approximate, 0).full()).ravel()
     late = (Signal("mirror_sample", names, start=tuple(map(float, resting))),) if path.fraction else ()
     advance, moves, past = (
         problem.integrator.step(plant, problem.period),
@@ -51,7 +51,7 @@ def twin_block(path: Path) -> Block:
         acting, answered, next_deformations = past.seen(s)
         waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
         at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, -acting))
-        sample = seen(at, end, parameters, -acting)
+        sample = seen(at, end, parameters, -acting[controlled])
         arrived = (1 - path.fraction) * sample + path.fraction * s.mirror_sample if late else sample
         state, response, *memories = estimate.function(arrived, *(getattr(s, m.name) for m in own))
         away = getattr(s, MEASURED) - state
@@ -104,20 +104,19 @@ class _Deformations:
         return ca.vertcat(*forcing), ca.vertcat(*answered), remembered
 
 
-def _seen(problem: Problem, names: Sequence[str]) -> ca.Function:
-    """Function (state, command that acted, parameters, forcing) -> what the sensors show without noise, rounded as they round."""
-    plant = problem.plant
-    x, u, p = plant.symbols()
-    w = ca.SX.sym("w", len(plant.names))
-    values = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
-    answered = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
-    values |= dict(zip(response_names(plant), ca.vertsplit(answered), strict=True))
-    entries = []
-    for name in names:
-        sensor = problem.sensing.sensors.get(name)
-        quantum = sensor.quantum if sensor is not None else None
-        entries.append(values[name] if quantum is None else quantum * ca.floor(values[name] / quantum + 0.5))
-    return ca.Function("fpirhc_mirror_seen", [x, u, p, w], [ca.densify(ca.vertcat(*entries))])
+def _seen(problem: Problem, names: Sequence[str], shifted: Sequence[str]) -> ca.Function:
+    """Function (state, command that acted, parameters, shift) -> what the sensors show without noise, rounded as they round.
+
+    Args:
+        problem: with the model and the sensors.
+        names: of what they show.
+        shifted: names of the quantities to which the entries of the shift are added.
+    """
+    (x, u, p), shift = problem.plant.symbols(), ca.SX.sym("shift", len(shifted))
+    values = values_of(problem.plant, x, u, p)
+    values |= {name: values[name] + one for name, one in zip(shifted, ca.vertsplit(shift), strict=True)}
+    shown = [problem.sensing.rounded(name, values[name]) for name in names]
+    return ca.Function("fpirhc_mirror_seen", [x, u, p, shift], [ca.densify(ca.vertcat(*shown))])
 
 
 class _Moves:
@@ -163,3 +162,75 @@ def drift(plant: Plant, time: float) -> np.ndarray:
             if other.rstrip("'") == element.rstrip("'") and power >= 0:
                 drift[k, j] = time**power / math.factorial(power)
     return drift
+
+
+_STATE, _OFFSET = "mirror_state", "mirror_offset"
+
+
+def twin_of_outputs(path: Path) -> Block:
+    """Block (state, outputs, last command, parameters) -> the model's response behind the estimator.
+
+    The model moves over a cycle from the state that is given, x_{k-1}, to x^ = F(x_{k-1}, u), and shows its outputs there. Outputs
+    that the model computes are not the measured ones, so the twin has an offset o, a polynomial in y ... y^(r-1) as the plans have:
+
+        y~_k = y^(x^) + o_k.
+
+    After each cycle the offset is moved to where the estimate of the twin is the controller's, and it takes up the difference
+    between x^ and the state that is given next, so that the samples stay on one path.
+
+    Args:
+        path: of the commands to the model, without a fraction of a cycle in the measurement.
+    """
+    problem, plant = path.problem, path.problem.plant
+    names = problem.sensing.estimator.measures(plant.face)
+    estimate = problem.sensing.estimator.block(plant.face, problem.period, problem.start_output, Signal("_seen", names))
+    own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
+    moves, ahead = memory_moves(problem, names), ca.DM(drift(plant.face, problem.period))
+    advance, chain, shown = (
+        problem.integrator.step(plant, problem.period),
+        _chain(problem),
+        _seen(problem, names, plant.output.elements),
+    )
+    calm = np.zeros(len(plant.names))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        end, mean, remembered = path.acted(s)
+        parameters, signals = path.told.acted(s, path.late)
+        waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
+        at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, calm))
+        offset = ca.if_else(waits, s.mirror_offset, ahead @ s.mirror_offset)
+        sample = shown(at, end, parameters, offset)
+        motion, response, *memories = estimate.function(sample, *(getattr(s, m.name) for m in own))
+        away = getattr(s, MEASURED_OUTPUT) - motion
+        move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
+        measured = getattr(s, MEASURED)
+        measured = ca.if_else(is_finite(measured), measured, at)
+        turn = chain(at, end, parameters) - chain(measured, end, parameters)
+        remembered |= {f"{_STATE}_next": measured, f"{_OFFSET}_next": offset + move + turn, **signals}
+        for signal, value, matrix in zip(own, memories, moves, strict=True):
+            remembered[f"{signal.name}_next"] = value + matrix @ move
+        return {"_modelled": response, **remembered}
+
+    memory = Layout((*path.memory, *_starts(problem), *own))
+    reads, writes = Layout((*path.reads, measured_output(plant))), Layout((plant.response_signal("_modelled"),))
+    block = Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
+    return replace(block, waits=unseen(block, (MEASURED, MEASURED_OUTPUT)))
+
+
+def _starts(problem: Problem) -> tuple[Signal, Signal]:
+    """The state that was given last, and the offset of the model's outputs from the real ones."""
+    plant, start = problem.plant, problem.start_state
+    own = np.asarray(_chain(problem)(start, problem.inputs_before, plant.approximate).full()).ravel()
+    offset = tuple(map(float, problem.start_output - own))
+    return (
+        Signal(_STATE, plant.state.elements, plant.state.units, tuple(map(float, start))),
+        Signal(_OFFSET, plant.output.elements, plant.output.units, offset),
+    )
+
+
+def _chain(problem: Problem) -> ca.Function:
+    """Function (state, command, parameters) -> the model's outputs and their derivatives below the relative order."""
+    plant = problem.plant
+    x, u, p = plant.symbols()
+    entries = plant.output_function(x, u, p, np.zeros(len(plant.names)))
+    return ca.Function("fpirhc_mirror_chain", [x, u, p], [entries])

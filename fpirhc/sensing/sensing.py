@@ -230,6 +230,14 @@ class Sensing(Checked):
             [sensors, delay_block("see", measured, arriving, [late] * measured.size)] if late is not None else [sensors]
         )
 
+    def rounded(self, name: str, value: Expression) -> Expression:
+        """Return a measured quantity in whole quanta of its sensor; the value itself where it has none."""
+        sensor = self.sensors.get(name)
+        if sensor is None or sensor.quantum is None:
+            return value
+        quantum = float(sensor.quantum)  # not live: a division by a symbol rounds otherwise than one by a number
+        return quantum * ca.floor(value / quantum + 0.5)
+
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]
         lossy = [(n, "lost", s.dropout > 0) for n, s in self.sensors.items()]
@@ -250,11 +258,7 @@ class Sensing(Checked):
             for name, sensor in self.sensors.items():
                 if sensor.noise is not None:
                     seen[name] = seen[name] + s.sensing[columns.index(f"{name} noise")]
-                if sensor.quantum is not None:
-                    quantum = float(
-                        sensor.quantum
-                    )  # not live: a division by a symbol rounds otherwise than one by a number
-                    seen[name] = quantum * ca.floor(seen[name] / quantum + 0.5)
+                seen[name] = self.rounded(name, seen[name])
                 if sensor.dropout:
                     lost = s.sensing[columns.index(f"{name} lost")] > 0.5
                     seen[name] = ca.if_else(lost, s.sensor_last[lossy.index(name)], seen[name])
