@@ -562,6 +562,17 @@ def test_a_file_imports_its_neighbours_and_forgets_them(tmp_path):
     assert starts == [{"angle": 0.1}, {"angle": 0.2}]
 
 
+def test_a_file_is_read_as_it_is_now(tmp_path, monkeypatch):
+    """Also where it was changed within a second to one of the same length, and no bytecode is left beside it."""
+    monkeypatch.setattr("sys.dont_write_bytecode", False)
+    path, starts = tmp_path / "mine.py", []
+    for angle in ("0.1", "0.2"):
+        path.write_text(PENDULUM.replace('{"angle": 0.0}', f'{{"angle": {angle}}}'), encoding="utf-8")
+        starts.append(fp.load_problem(str(path)).problem.start["angle"])
+    assert starts == [0.1, 0.2]
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.py"]
+
+
 def test_names_of_other_tools_lead_to_names_that_exist():
     public = [getattr(fp, name) for name in fp.__all__]
     fields = {name for one in public if isinstance(one, type) and issubclass(one, Checked) for name in field_names(one)}

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from on_problem import on_problem
 
 import fpirhc as fp
 from fpirhc.conformance.live import check_live, number_paths
@@ -13,22 +13,12 @@ from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.members import Example, examples
-from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.simulation.simulate import simulator
 from fpirhc.task.problem import Problem
 
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=50.0)
 TRACKING = fp.Exponential(rate=8.0)
 WEIGHTS: dict[str, Any] = {"states": {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}, "deviation": {"Fa": 1e-3, "Fb": 1e-3}}
-
-
-def on_problem(member: Any) -> tuple[Controller, Problem]:
-    """A controller of the shipped examples with its problem."""
-    if not isinstance(member, Example):
-        return member, two_masses()
-    task = load_problem(member.problem) if member.problem else None
-    problem = replace(task.problem if task else two_masses(), **{"measure_from": 0.0, **member.changes})
-    return (task.controllers[member.controller] if task and member.value is None else member.value), problem
 
 
 def some_paths(problem: Problem, controller: Controller) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 from test_cascade import STATIC, affine, linear
 from test_outputs import OPTIMISER, hill, planned, sedated
@@ -19,16 +18,6 @@ LAW = fp.ComputedTorque(fp.Exponential(rate=1.0))
 def simulated(problem: fp.Problem, controller: Any) -> fp.Run:
     """A run in the virtual machine."""
     return fp.simulate(problem, controller, seed=1, compiled=False)
-
-
-def test_outputs_that_are_coordinates_change_no_signal() -> None:
-    """The linear plant with its coordinate as output, with computed torque inside."""
-    plain = linear(0.6, duration=400.0)
-    outputs = replace(plain, plant=replace(plain.plant, outputs={"y": fp.Output("K", lambda q, p: q.y)}))
-    controller = fp.Cascade(fp.ComputedTorque(fp.Exponential(rate=0.05)), affine(0.4))
-    one, other = (simulated(p, controller) for p in (plain, outputs))
-    assert [n for n in one.layout.names if not np.array_equal(one[n], other[n])] == []
-    assert np.abs(one["shift"]).max() > 0.1
 
 
 @pytest.mark.parametrize("inner", ["computed torque", "receding horizon"])

@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from test_outputs import ARM, OPTIMISER, arm, circle, hill, planned, simulated
+from test_outputs import ARM, arm, circle, simulated
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
@@ -191,15 +191,6 @@ def test_a_model_referenced_deformation_of_an_exact_model_is_zero(name: str, kin
     problem = replace(make(), duration=make().period * 60, measure_from=0.0)
     run = simulated(problem, controllers(rate)[kind].with_deformation(FORMS["model-referenced"]))
     assert np.abs(run["deformed"] - run["desired"]).max() < 1e-12 * (1 + np.abs(run["desired"]).max())
-
-
-def test_plans_with_the_form_that_compares_with_the_model_leave_an_exact_plan_alone() -> None:
-    exact = replace(planned(), plant=hill(4.0), duration=2.0, measure_from=0.0)
-    bare, other = (
-        simulated(exact, fp.RecedingHorizon(OPTIMISER, deformation=m))
-        for m in (fp.Identity(), FORMS["model-referenced"])
-    )
-    assert np.allclose(bare["command"], other["command"], atol=1e-9)
 
 
 FIGURES = {

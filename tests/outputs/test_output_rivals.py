@@ -82,18 +82,6 @@ def test_one_slot_for_the_whole_run_is_computed_torque(deformation: Deformation)
     assert np.allclose(one, other, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["AID+FPI", "Slotine-Li+FPI"])
-def test_learning_inverse_dynamics_controls_coordinates_that_are_outputs(name: str) -> None:
-    task = fp.load_problem("planar_arm")
-    short = replace(task.problem, duration=0.1, measure_from=0.0)
-    units = short.plant.coordinates
-    outputs = {c: fp.Output(unit, lambda q, v, p, c=c: q[c]) for c, unit in units.items()}
-    spelled = replace(short, plant=replace(short.plant, outputs=outputs))
-    plain, run = (simulated(p, task.controllers[name]) for p in (short, spelled))
-    for signal in ("state", "command", "estimate"):
-        assert np.array_equal(plain[signal], run[signal]), signal
-
-
 @pytest.mark.parametrize("name", ["AID", "Slotine-Li"])
 def test_learning_inverse_dynamics_of_other_outputs_says_why_not(name: str) -> None:
     with pytest.raises(NotSupported, match=r"mechanics in its own coordinates.* x, y are other functions of the state"):

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from test_outputs import OPTIMISER, SHORT, TWO_MASS, arm, circle, hill, on_outputs, planned, sedated, simulated
+from test_outputs import OPTIMISER, arm, circle, hill, planned, sedated, simulated
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
@@ -28,19 +28,6 @@ def late(problem: fp.Problem, time: float = LATE) -> fp.Problem:
 
 
 @pytest.mark.parametrize("by", [fp.ByModel(), fp.ByModel(residual_time=0.02), fp.ByDesired()], ids=repr)
-@pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC"])
-def test_outputs_that_are_coordinates_change_no_prediction(name: str, by: Any) -> None:
-    dead_time = fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}, measurement=2e-3)
-    short = replace(SHORT, duration=0.06, measure_from=0.0, dead_time=dead_time)
-    controller = fp.Predicted(TWO_MASS.controllers[name], inputs=3e-3, measurement=2e-3, by=by)
-    if controller.deformation.adapts:
-        controller = controller.with_deformation(fp.Paired(controller.deformation, cycles=5))
-    plain, run = (simulated(p, controller) for p in (short, on_outputs(short)))
-    for signal in ("state", "command", "state_ahead"):
-        assert np.array_equal(plain[signal], run[signal])
-    assert np.array_equal(run["output_ahead"], run["state_ahead"])
-
-
 def scaled(gain: float) -> Callable[..., Any]:
     return lambda q, v, p: gain * q.x
 

@@ -1,7 +1,7 @@
 """Learners on plants with outputs: offset-free control, disturbances of outputs and responses, learned parameters.
 
-Laws: outputs that are coordinates change no estimate; the filter is a recursion that is written here; a disturbance of a
-response is what a deformation corrects, and a plan does not see it; parameters are found from the response of an output.
+Laws: the filter is a recursion that is written here; a disturbance of a response is what a deformation corrects, and no plan has
+it; parameters are found from the response of an output.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from test_outputs import SHORT, TWO_MASS, arm, circle, hill, on_outputs, planned, sedated, simulated
+from test_outputs import arm, circle, hill, planned, sedated, simulated
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
@@ -27,20 +27,6 @@ SLOW = {"C": 1e-3, "E": 1e-3}
 ANSWER = fp.DisturbanceKalman({"depth''": 100.0}, {"depth''": 0.1, **STATES}, noise=SLOW)
 SHIFT = fp.DisturbanceKalman({"depth": 1.0}, {"depth": 0.01, **STATES}, noise=SLOW)
 PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2))
-
-
-@pytest.mark.parametrize("name", ["RHC"])
-def test_outputs_that_are_coordinates_change_no_estimate(name: str) -> None:
-    """The filter that measures the response too: positions and velocities are states and outputs at once."""
-    short = replace(SHORT, duration=0.1, measure_from=0.0)
-    weights = {"q1": 1e-3, "q2": 1e-3, "q1'": 1e-2, "q2'": 1e-2, "q1''": 0.1, "q2''": 0.1}
-    offset_free = fp.Estimating(
-        TWO_MASS.controllers[name], fp.DisturbanceKalman({"q1": 5.0, "q2": 5.0}, weights), at_once=True
-    )
-    plain, run = (simulated(p, offset_free) for p in (short, on_outputs(short)))
-    assert np.ptp(plain["estimate"]) > 0.1
-    for signal in ("state", "command", "estimate"):
-        assert np.array_equal(plain[signal], run[signal])
 
 
 def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:

@@ -16,10 +16,69 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from on_problem import on_problem
 from test_outputs import simulated
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
+from fpirhc.members import examples
+
+
+def with_arguments(function: Any, names: Sequence[str]) -> Any:
+    """The function, which says that it takes these arguments."""
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    vars(function)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
+    return function
+
+
+# Coordinates as outputs
+
+TWO_MASS = fp.load_problem("two_mass")
+TRACK, MAP = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=20.0)
+PUSHED = {"disturbances": {"q1": fp.Sine(0.5, 3.0), "Q2": fp.Step(at=0.01, size=5.0)}}
+LATE = {"dead_time": fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}, measurement=2e-3)}
+NOISES = {"q1": 1e-3, "q2": 1e-3, "q1'": 1e-2, "q2'": 1e-2, "q1''": 0.1, "q2''": 0.1}
+FILTER = fp.DisturbanceKalman({"q1": 5.0, "q2": 5.0}, NOISES)
+LOOPS: dict[str, tuple[Controller, fp.Problem]] = {
+    **{f"{type(e).__name__}-{k}": on_problem(e) for k, e in enumerate(examples("controllers", fp.ComputedTorque(TRACK, MAP)))},
+    **{
+        name: (controller, replace(TWO_MASS.problem, **changes))
+        for name, controller, changes in (
+            ("disturbed", TWO_MASS.controllers["RHC+FPI"], PUSHED),
+            ("late", TWO_MASS.controllers["RHC+FPI"], LATE),
+            ("paired", fp.Predicted(fp.ComputedTorque(TRACK, fp.Paired(MAP, cycles=5)), inputs=3e-3, measurement=2e-3), LATE),
+            ("at once", fp.Estimating(fp.ComputedTorque(TRACK), FILTER, at_once=True), {}),
+            ("reality", fp.ComputedTorque(TRACK, fp.ModelReferenced(MAP)), {"reality": fp.Reality(TWO_MASS.problem.plant)}),
+        )
+    },
+}  # fmt: skip
+
+
+def named_again(problem: fp.Problem) -> fp.Problem:
+    """The problem with its coordinates as outputs."""
+    names = [f"d{k}" for k in range(max(problem.plant.orders))] + ["p"]
+
+    def of(coordinate: str) -> Any:
+        return with_arguments(lambda q, *rest: q[coordinate], names)
+
+    plant = replace(problem.plant, outputs={n: fp.Output(unit, of(n)) for n, unit in problem.plant.coordinates.items()})
+    cost = problem.cost
+    cost = replace(cost, states={}, outputs=cost.states) if isinstance(cost, fp.Quadratic) else cost
+    return replace(problem, plant=plant, cost=cost, reality=problem.reality and fp.Reality(plant))
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_coordinates_as_outputs_change_no_signal(name: str) -> None:
+    """Of any controller, bit by bit. A schedule of slots gives every output a reference, and every coordinate at its time."""
+    controller, problem = LOOPS[name]
+    short = replace(problem, duration=40 * problem.period, measure_from=0.0)
+    plain, run = (simulated(p, controller, seed=1) for p in (short, named_again(short)))
+    slots = isinstance(controller, fp.Slotted)
+    different = {n for n in plain.layout.names if not np.array_equal(plain[n], run[n], equal_nan=True)}
+    assert different <= ({"reference", "desired"} if slots else set())
+    assert slots or np.array_equal(run["output"], run["state"])
+    assert np.ptp(run["command"], axis=0).max() > 0
+
 
 TANKS = fp.load_problem("leaking_tanks")
 
@@ -101,9 +160,7 @@ def in_outputs(plant: fp.Plant) -> fp.Plant:
         return dict(zip(plant.outputs, ca.vertsplit(values), strict=True))
 
     face = plant.face
-    names = [f"d{k}" for k in range(max(face.orders))] + ["u", "p"]
-    kind = inspect.Parameter.POSITIONAL_ONLY
-    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
+    with_arguments(response, [f"d{k}" for k in range(max(face.orders))] + ["u", "p"])
     order = dict(zip(face.names, face.orders, strict=True))
     return fp.Plant(face.coordinates, plant.inputs, plant.parameters, response, order=order)
 

@@ -1,0 +1,21 @@
+"""The shipped examples of controllers, each with the problem that it is tried on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from fpirhc.conformance.loops import two_masses
+from fpirhc.controllers.base import Controller
+from fpirhc.members import Example
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.task.problem import Problem
+
+
+def on_problem(member: Any) -> tuple[Controller, Problem]:
+    """A controller of the shipped examples with its problem."""
+    if not isinstance(member, Example):
+        return member, two_masses()
+    task = load_problem(member.problem) if member.problem else None
+    problem = replace(task.problem if task else two_masses(), **{"measure_from": 0.0, **member.changes})
+    return (task.controllers[member.controller] if task and member.value is None else member.value), problem
