@@ -23,6 +23,7 @@ import math
 from fpirhc.deformation.queue import Cycles, every
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
+from fpirhc.symbolic.functions import between, smaller, sqrt
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
@@ -45,10 +46,7 @@ def leaky_pole(product: float, uncertainty: float) -> float:
     _check_product("leaky_pole", product)
     if not (math.isfinite(uncertainty) and uncertainty >= 0):
         raise InvalidValue(f"leaky_pole(uncertainty={uncertainty!r}): expected a number of cycles of at least 0")
-    bound = product * (2 + product) * uncertainty**2 / 4
-    # The formula of the docstring, without cancellation at small bounds.
-    root = math.sqrt(4 * bound + 1)
-    return 2 * bound / (2 * bound + 1 + root)
+    return _least_pole(product, uncertainty)
 
 
 def leaky_margin(product: float, pole: float) -> float:
@@ -71,11 +69,11 @@ def leaky_margin(product: float, pole: float) -> float:
 def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
     """Return the pole of a leaky pairing: `pole` itself, or for None the one that follows from the gain and the uncertainty."""
     if pole is not None:
-        return float(pole)
+        return pole
     error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
     if not error:
         return 0.0
-    return default_pole(min(max(1.0, abs(gain)), _LARGEST_PRODUCT), error)
+    return default_pole(between(abs(gain), 1.0, _LARGEST_PRODUCT), error)
 
 
 def default_uncertainty(cycles: float) -> int:
@@ -85,15 +83,21 @@ def default_uncertainty(cycles: float) -> int:
 
 def default_pole(product: float, uncertainty: float) -> float:
     """The pole of the theorem and a little more, below one; 0 where the dead time is certain."""
-    least = leaky_pole(product, uncertainty)
+    least = _least_pole(product, uncertainty)
     factor, amount = _BEYOND
-    return min(factor * least + amount, 0.5 * (1 + least)) if uncertainty else 0.0
+    return smaller(factor * least + amount, 0.5 * (1 + least)) if uncertainty else 0.0
 
 
 def check_pole(owner: str, pole: float) -> None:
     """Raise InvalidValue where the pole is outside [0, 1)."""
     if not (finite_number(pole) and 0 <= pole < 1):
         raise InvalidValue(f"{owner}(pole={pole!r}): expected a number from 0 (no leak) to below 1")
+
+
+def _least_pole(product: float, uncertainty: float) -> float:
+    """The formula of `leaky_pole` without cancellation at small bounds; the product may be live."""
+    bound = product * (2 + product) * uncertainty**2 / 4
+    return 2 * bound / (2 * bound + 1 + sqrt(4 * bound + 1))
 
 
 def _check_product(owner: str, product: float) -> None:

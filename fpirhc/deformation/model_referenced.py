@@ -34,6 +34,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.live import nominal
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class ModelReferenced(Wrapper):
         undeformed = request - queue.delayed(past, size)
         next_request, next_memory = self.map.step(request, response, undeformed, of_map(self, memory, size))
         deformation = next_request - undeformed
-        if pole:
+        if nominal(pole):
             deformation = pole * before + (1 - pole) * deformation
         # A deformation that is not a number must not be remembered.
         remembered = ca.if_else(is_finite(deformation), deformation, before)

@@ -75,6 +75,22 @@ def quotient(over: Expression, number: float | LiveNumber) -> Expression:
     return ca.if_else(under == 0, 0 * over, over / ca.if_else(under == 0, 1, under))
 
 
+def between(x: float, low: float, high: float) -> float:
+    """Return a number, live or not, moved to the nearer end of an interval where it is outside."""
+    if isinstance(x, LiveNumber):
+        return x.called(lambda v: min(max(low, v), high), lambda v: ca.fmin(ca.fmax(low, v), high))
+    return min(max(low, x), high)
+
+
+def smaller(x: float, y: float) -> float:
+    """Return the smaller of two numbers, live or not."""
+    if not isinstance(x, LiveNumber) and not isinstance(y, LiveNumber):
+        return min(x, y)
+    paths = tuple(dict.fromkeys(path for one in (x, y) if isinstance(one, LiveNumber) for path in one.paths))
+    both = lambda kind: tuple(one.of(kind) if isinstance(one, LiveNumber) else one for one in (x, y))  # noqa: E731
+    return LiveNumber(paths, lambda kind: min(both(kind)) if kind is float else ca.fmin(*both(kind)))
+
+
 def sqrt(x: float) -> float:
     """Return the square root of a number, live or not."""
     return x.called(math.sqrt, ca.sqrt) if isinstance(x, LiveNumber) else math.sqrt(x)

@@ -103,6 +103,24 @@ def test_numbers_that_follow_from_settings_follow():
     assert ready.live.changed({"limits.inputs.Fa.1": 60.0})[2]["deformation.scale"] > 1.2 * scale
 
 
+@pytest.mark.parametrize(
+    ("deformation", "paths"),
+    [
+        (fp.Increment(SIGMOID, cycles=2.5), ["map.gain", "map.shift"]),
+        (fp.Increment(SIGMOID, cycles=2.5, pole=0.5), ["pole", "map.gain"]),
+        (fp.ModelReferenced(SIGMOID, cycles=2.5), ["map.gain"]),
+        (fp.ModelReferenced(fp.Affine(gain=-2.6), cycles=3, uncertainty=2), ["map.gain"]),
+        (fp.ModelReferenced(SIGMOID, cycles=2.5, pole=0.4), ["pole"]),
+    ],
+    ids=["Increment", "Increment of a pole", "ModelReferenced", "gain above one", "ModelReferenced of a pole"],
+)
+def test_the_leak_follows_the_gain(deformation, paths):
+    """The pole of a leaky pairing is chosen from the gain, or given: both may change in a run, and the pole with them."""
+    controller = fp.ComputedTorque(TRACKING, deformation)
+    tried = check_live(two_masses(), controller, paths=[f"deformation.{path}" for path in paths], cycles=40)
+    assert all(t.factor for t in tried), tried
+
+
 def test_the_law_catches_a_lost_number():
     """A map that computes with the number where nobody sees it is found out."""
 

@@ -36,6 +36,7 @@ from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_lo
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import nominal
 
 __all__ = ["MOST", "Increment", "Paired"]
 
@@ -214,7 +215,7 @@ class Increment(_Queued):
         undeformed, request = self._queue.delayed(past.desired, size), self._queue.delayed(past.requests, size)
         next_request, next_memory = self.map.step(request, response, undeformed, memory)
         deformation = next_request - undeformed
-        if pole:
+        if nominal(pole):
             deformation = pole * (past.requests[:size] - past.desired[:size]) + (1 - pole) * deformation
         return desired + deformation, next_memory
 
