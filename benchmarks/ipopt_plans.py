@@ -12,7 +12,7 @@ import fpirhc as fp
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.bounds import scales
-from fpirhc.optimisers.multiple_shooting import interleave, program, separate, shift_dynamics, shift_variables, sizes
+from fpirhc.optimisers.nlp import interleave, program, separate, shift_dynamics, shift_variables, sizes
 
 ACCURACY = 1e-9
 GONE = 1e-6  # of half the range: a smaller least violation is rounding, and the horizon has a plan

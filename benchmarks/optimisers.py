@@ -28,7 +28,7 @@ from fpirhc.horizon.rollout import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, judge
-from fpirhc.optimisers.multiple_shooting import (
+from fpirhc.optimisers.nlp import (
     MultipleShooting,
     interleave,
     program,

@@ -10,9 +10,9 @@ from mutated_problems import mutated
 import fpirhc as fp
 from fpirhc.controllers.contract import checked
 from fpirhc.errors import FpirhcError, ProblemFileError
-from fpirhc.problem_files import importing
+from fpirhc.problem_files import problem_file
 
-_CAUSE = importing._cause_of
+_CAUSE = problem_file._cause_of
 
 
 def raw_error(path: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> str:
@@ -24,7 +24,7 @@ def raw_error(path: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> str:
         inside.append(error)
         return cause(error)
 
-    monkeypatch.setattr(importing, "_cause_of", seen)
+    monkeypatch.setattr(problem_file, "_cause_of", seen)
     path.write_text(mutated(seed), encoding="utf-8")
     try:
         task = fp.load_problem(str(path))

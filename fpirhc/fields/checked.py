@@ -6,18 +6,25 @@ A dataclass needs no line of its own, and a class of another distribution is che
 
 from __future__ import annotations
 
+import ast
 import inspect
 import sys
 from abc import ABCMeta
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from difflib import get_close_matches
 from functools import cache, wraps
-from typing import ParamSpec, TypeVar
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import ClassVar, ParamSpec, TypeVar, get_origin
+
+import casadi as ca
 
 from fpirhc.by_name import find_by_name
-from fpirhc.errors import InvalidField
-from fpirhc.fields.arguments import Arguments, arguments_of, read_annotation
-from fpirhc.fields.expected import Expected, Number
+from fpirhc.errors import InvalidField, nearest
+from fpirhc.fields.expected import Anything, Expected, Number, accepts, expected_by
+from fpirhc.fields.given import call_of, described, shortened, signature_of
 from fpirhc.fields.user_code import users_place
 
 
@@ -93,10 +100,10 @@ def _abstract(cls: type) -> tuple[str, ...]:
 
 
 @cache
-def _arguments_of(owner: type) -> Arguments:
+def _arguments_of(owner: type) -> _Arguments:
     makes: Callable[..., object] = getattr(owner, "__init__")  # noqa: B009 -- the class's own, whatever its call does
     parameters = tuple(inspect.signature(makes).parameters.values())[1:]
-    return arguments_of(owner, "field", parameters, lambda one: _expected(owner, one))
+    return _read_arguments(owner, "field", parameters, lambda one: _expected(owner, one))
 
 
 def _expected(owner: type, parameter: inspect.Parameter) -> Expected:
@@ -109,7 +116,7 @@ def _expected(owner: type, parameter: inspect.Parameter) -> Expected:
 
 
 def _read(annotation: object, owner: type) -> Expected:
-    return read_annotation(annotation, vars(sys.modules.get(owner.__module__, sys)), vars(owner))
+    return _read_annotation(annotation, vars(sys.modules.get(owner.__module__, sys)), vars(owner))
 
 
 P = ParamSpec("P")
@@ -136,8 +143,191 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 
 
 @cache
-def checks_of(function: Callable[..., object]) -> Arguments:
+def checks_of(function: Callable[..., object]) -> _Arguments:
     """Return what is checked of a function's arguments; they are read at its first call, when every module is loaded."""
     names = getattr(inspect.unwrap(function), "__globals__", {})
     parameters = tuple(inspect.signature(function).parameters.values())
-    return arguments_of(function, "argument", parameters, lambda one: read_annotation(one.annotation, names, {}))
+    return _read_arguments(function, "argument", parameters, lambda one: _read_annotation(one.annotation, names, {}))
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    """The arguments of a class or a function.
+
+    Args:
+        owner: what is called.
+        noun: what an argument of it is called, "field" or "argument".
+        positional: names of those that may be given by their place.
+        required: names of those without a default.
+        expected: what is expected of each, by name.
+        open: whether more arguments are taken than are named.
+    """
+
+    owner: type | Callable[..., object]
+    noun: str
+    positional: tuple[str, ...]
+    required: tuple[str, ...]
+    expected: Mapping[str, Expected]
+    open: bool
+
+    def mistakes(self, arguments: Sequence[object], named: Mapping[str, object]) -> Iterator[str]:
+        """Yield every mistake of a call."""
+        values = dict(zip(self.positional, arguments, strict=False))
+        yield from self._wrong_names(arguments, values, named)
+        every = {**values, **named}
+        wrong = [n for n, value in every.items() if n in self.expected and not accepts(self.expected[n], value)]
+        if self._swapped(wrong, every):
+            name, (one, other) = self.owner.__name__, wrong
+            yield f"{name}: the values of '{one}' and '{other}' are swapped; write {name}({one}=..., {other}=...)"
+            return
+        for name in wrong:
+            yield from _mistakes_in(self.expected[name], f"{self.owner.__name__}.{name}", every[name])
+
+    def _swapped(self, wrong: Sequence[str], values: Mapping[str, object]) -> bool:
+        """Whether two values are wrong, and each is what is expected of the other."""
+        if len(wrong) != 2:
+            return False
+        one, other = wrong
+        return accepts(self.expected[one], values[other]) and accepts(self.expected[other], values[one])
+
+    def _wrong_names(
+        self, arguments: Sequence[object], values: Mapping[str, object], named: Mapping[str, object]
+    ) -> Iterator[str]:
+        name = self.owner.__name__
+        for key in named:
+            if key in values:
+                yield f"{name}: '{key}' is given twice, by its place and by its name"
+            elif key not in self.expected and not self.open:
+                yield f"{name} has no {self.noun} '{key}'.{nearest(key, self.expected)}"
+        if len(arguments) > len(self.positional) and not self.open:
+            extra = described(arguments[len(self.positional)])
+            yield f"{name} takes {len(self.positional)} values without a name, got {len(arguments)}; {extra} is too many"
+        missing = [key for key in self.required if key not in values and key not in named]
+        if missing:
+            yield f"{name} needs {', '.join(missing)}; write {call_of(self.owner)}"
+
+
+def _read_arguments(
+    owner: type | Callable[..., object],
+    noun: str,
+    parameters: Sequence[inspect.Parameter],
+    expected: Callable[[inspect.Parameter], Expected],
+) -> _Arguments:
+    """Return the arguments of a call with these parameters; `expected` reads the annotation of one."""
+    ours = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return _Arguments(
+        owner,
+        noun,
+        tuple(p.name for p in ours if p.kind is not p.KEYWORD_ONLY),
+        tuple(p.name for p in ours if p.default is p.empty),
+        {p.name: expected(p) for p in ours},
+        open=len(ours) < len(parameters),
+    )
+
+
+def _read_annotation(annotation: object, names: Mapping[str, object], own: Mapping[str, object]) -> Expected:
+    """Return what an annotation expects, read with the names of its module and of its class."""
+    if isinstance(annotation, str):
+        try:
+            annotation = eval(annotation, dict(names), dict(own))
+        except Exception:  # noqa: BLE001 -- a name for type checkers only: such an argument is not checked
+            return Anything()
+    if annotation is inspect.Parameter.empty or get_origin(annotation) is ClassVar:
+        return Anything()
+    return expected_by(annotation)
+
+
+def _mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
+    """Yield every mistake of the value and its parts."""
+    if not expected.fits(value):
+        comma = isinstance(value, tuple) and len(value) == 1 and accepts(expected, value[0])
+        mend = "a comma behind the value makes a tuple of it; remove the comma" if comma else ""
+        mend = mend or expected.completed(value) or _mended(expected, value)
+        yield f"{where}: expected {expected.words}, got {described(value)}{'; ' + mend if mend else ''}"
+        return
+    for place, inner, part in expected.parts(value):
+        yield from _mistakes_in(inner, f"{where}{place}", part)
+
+
+def _mended(expected: Expected, value: object) -> str:
+    """Return what to write instead; empty where nothing is near."""
+    contract = expected.contract()
+    if isinstance(value, type):
+        return f"write {call_of(value)}" if contract is not None and issubclass(value, contract) else ""
+    if isinstance(value, str):
+        return _mended_text(expected, value, contract)
+    if isinstance(value, ca.SX | ca.MX):
+        return "a setting is a number" if expected.fits(1) or expected.fits(0.5) else ""
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 and expected.fits(int(value)):
+        return f"write {int(value)}"
+    return _made_of(expected, value, contract)
+
+
+def _made_of(expected: Expected, value: object, contract: type | None) -> str:
+    """How what is expected is made of a value that holds it, or that it should hold."""
+    if isinstance(value, int | float | Mapping) and expected.fits(lambda t: t):
+        return f"write lambda t: {shortened(value)}"
+    if contract is None:
+        return ""
+    if inspect.isroutine(value) and signature_of(value) == "()":
+        return "call it and give its result"
+    return _part_that_fits(expected, value) or _member(contract)
+
+
+def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
+    for number in (int, float):
+        try:
+            if expected.fits(number(text)):
+                return f"write {text} without quotes"
+        except ValueError:
+            continue
+    if contract is None:
+        return ""
+    loaded = getattr(contract, "_LOADED", "").format(repr(text))
+    members = {_plain(name): member for name, member in _public(contract) if member is not contract or not loaded}
+    close = get_close_matches(_plain(text), members, n=1, cutoff=0.5)
+    if close:
+        return f"write fp.{call_of(members[close[0]])}"
+    return f"write {loaded}" if loaded else _member(contract)
+
+
+def _member(contract: type) -> str:
+    """How a value of a public class is written, or which members a contract has; empty for classes of Python."""
+    if inspect.isabstract(contract):
+        return f"one of {', '.join(sorted(name for name, _ in _public(contract)))}"
+    if contract.__name__ not in getattr(import_module(contract.__module__.partition(".")[0]), "__all__", ()):
+        return ""
+    _, *first = inspect.signature(getattr(contract, "__init__")).parameters  # noqa: B009
+    return f"write fp.{call_of(contract)}".replace("()", f"({first[0]}=...)" if first else "()")
+
+
+def _part_that_fits(expected: Expected, value: object) -> str:
+    """Which part of the value is what is expected, such as the problem of a loaded file."""
+    if isinstance(value, Mapping):
+        return next((f"give one of its entries, such as [{k!r}]" for k, v in value.items() if expected.fits(v)), "")
+    names = [f.name for f in fields(value)] if is_dataclass(value) and not isinstance(value, type) else []
+    return next((f"give its .{name}" for name in names if expected.fits(getattr(value, name))), "")
+
+
+def _public(contract: type) -> Iterator[tuple[str, type]]:
+    """Public members of a contract, those of its part of the package; only a mistake pays for importing them."""
+    top, *part = contract.__module__.split(".")[:2]
+    package = import_module(top)
+    for name in _declared_in(package, ".".join(part)):
+        member = getattr(package, name, None)
+        if isinstance(member, type) and issubclass(member, contract) and not inspect.isabstract(member):
+            yield name, member
+
+
+def _declared_in(package: ModuleType, part: str) -> list[str]:
+    """Public names that the stub of a package imports from one part of it; all public names without a stub."""
+    stub = Path(package.__file__ or "").with_suffix(".pyi")
+    if not stub.is_file():
+        return list(getattr(package, "__all__", ()))
+    lines = (one for one in ast.parse(stub.read_text(encoding="utf-8")).body if isinstance(one, ast.ImportFrom))
+    of_part = (one for one in lines if (one.module or "").partition(".")[0] == part)
+    return [alias.asname or alias.name for one in of_part for alias in one.names]
+
+
+def _plain(name: str) -> str:
+    return "".join(c for c in name.lower() if c.isalnum())

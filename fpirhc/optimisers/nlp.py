@@ -11,14 +11,239 @@ References: J. A. E. Andersson et al., CasADi, Math. Program. Comput. 11, 2019.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Count, Positive
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.multiple_shooting import MultipleShooting, Options, gauss_newton_hessian
+from fpirhc.horizon.rollout import rollout
+from fpirhc.optimisers.base import UNKNOWN_ITERATIONS, Optimiser, clip, judge, remembered_plan, sane, shift, status_of
+from fpirhc.status import Status
+from fpirhc.symbolic.expression import is_finite
+from fpirhc.symbolic.layout import Layout, Signal
 
+Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | Mapping[str, Setting]"
+Options: TypeAlias = Mapping[str, Setting]
+_LARGEST_MULTIPLIER = 1e12
 _OSQP_BOUNDED = 2000  # iterations that are a bound of time on a machine
+
+
+@dataclass(frozen=True)
+class MultipleShooting(Optimiser):
+    """What all solvers share: the program, the warm start, and the judgement.
+
+    Args:
+        tolerance: of the stationarity, in the unit of the inputs, below which a plan is converged.
+
+    Raises:
+        InvalidValue: a tolerance that is not positive.
+    """
+
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not self.tolerance > 0:
+            raise InvalidValue(f"{type(self).__name__} needs a positive tolerance, got {self.tolerance}")
+
+    @property
+    @abstractmethod
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+
+    @abstractmethod
+    def options(self, ocp: OptimalControl) -> Options:
+        """CasADi's options of the solver."""
+
+    @property
+    def exportable(self) -> bool:
+        """Solver libraries are called, not written out."""
+        return False
+
+    def check(self, ocp: OptimalControl) -> None:
+        """Raise if limits have a price.
+
+        Raises:
+            NotSupported: they would be kept as hard ones.
+        """
+        if not ocp.hard.all():
+            names = ", ".join(e for e, hard in zip(ocp.state.elements, ocp.hard, strict=True) if not hard)
+            raise NotSupported(
+                f"{type(self).__name__} keeps limits or weighs them (soft), but takes no prices ({names}); use FixedPoint()"
+            )
+
+    def memory(self, ocp: OptimalControl) -> Layout:
+        """The plan, and the multipliers of variables and constraints."""
+        variables, constraints = sizes(ocp)
+        plan = tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements)
+        return Layout(
+            (
+                Signal("plan_inputs", plan),
+                Signal("plan_variable_multipliers", tuple(map(str, range(variables)))),
+                Signal("plan_dynamics_multipliers", tuple(map(str, range(constraints)))),
+            )
+        )
+
+    def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
+        """The plan and the multipliers one stage later."""
+        parts = self.memory(ocp).split(memory)
+        shifted_parts = {
+            "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], ocp.input.size, ocp.stages))),
+            "plan_variable_multipliers": shift_variables(ocp, parts["plan_variable_multipliers"]),
+            "plan_dynamics_multipliers": shift_dynamics(ocp, parts["plan_dynamics_multipliers"]),
+        }
+        return self.memory(ocp).join(shifted_parts)
+
+    def step(self, ocp: OptimalControl) -> ca.Function:
+        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
+
+        Solvers misbehave on numbers that are not finite, so they are not called when the arguments, or the program at its
+        first guess, are not.
+        """
+        s0, data, lower, upper, _ = arguments = self._arguments(ocp)
+        start, states = self._guess(ocp)(*arguments)
+        begin = _program_values(ocp)(interleave(states, start), ca.vec(data))
+        usable = ca.logic_and(sane(s0, data, lower, upper), is_finite(begin))
+        run, skip = self._solve(ocp, "fpirhc_shooting"), self._skip(ocp)
+        results = ca.Function.if_else("fpirhc_guarded_shooting", run, skip)(usable, *arguments)
+        return ca.Function("fpirhc_shooting_step", arguments, list(results))
+
+    def _arguments(self, ocp: OptimalControl) -> list[ca.MX]:
+        ns, nu = ocp.state.size, ocp.input.size
+        shapes = {"s0": (ns, 1), "data": (ocp.data.size, ocp.stages + 1), "lower": (nu, 1), "upper": (nu, 1)}
+        symbols = [ca.MX.sym(name, *shape) for name, shape in shapes.items()]
+        return [*symbols, ca.MX.sym("memory", self.memory(ocp).size)]
+
+    def _skip(self, ocp: OptimalControl) -> ca.Function:
+        """The remembered plan, with status NON_FINITE (INFEASIBLE for an empty box) and forgotten multipliers."""
+        layout = self.memory(ocp)
+        _, _, lower, upper, memory = arguments = self._arguments(ocp)
+        start = remembered_plan(layout.split(memory)["plan_inputs"], ocp.input.size, lower, upper)
+        status = ca.if_else(ca.mmax(lower - upper) > 0, int(Status.INFEASIBLE), int(Status.NON_FINITE))
+        diagnostics = ca.vertcat(ca.MX.zeros(3), UNKNOWN_ITERATIONS, status)
+        forgotten = {name: ca.MX.zeros(layout[name].size) for name in layout.names}
+        next_memory = layout.join({**forgotten, "plan_inputs": ca.vec(start)})
+        return ca.Function("fpirhc_shooting_skip", arguments, [start, diagnostics, next_memory])
+
+    def _guess(self, ocp: OptimalControl) -> ca.Function:
+        """Function of the step's arguments -> (U, S): the remembered plan, or one that the model survives."""
+        s0, data, lower, upper, memory = arguments = self._arguments(ocp)
+        plan = remembered_plan(self.memory(ocp).split(memory)["plan_inputs"], ocp.input.size, lower, upper)
+        still = clip(ca.MX.zeros(ocp.input.size, ocp.stages), lower, upper)
+        survives = is_finite(rollout(ocp)(s0, plan, data)[0])
+        start = ca.if_else(survives, plan, still)
+        states, _, _ = rollout(ocp)(s0, start, data)
+        # An unstable model may overflow under any open-loop plan; standing still is then the better first guess.
+        guess = ca.if_else(is_finite(states), states, ca.repmat(s0, 1, ocp.stages + 1))
+        return ca.Function("fpirhc_shooting_guess", arguments, [start, guess])
+
+    def _solve(self, ocp: OptimalControl, name: str) -> ca.Function:
+        n, layout = ocp.stages, self.memory(ocp)
+        s0, data, lower, upper, memory = arguments = self._arguments(ocp)
+        remembered = layout.split(memory)
+        start, states = self._guess(ocp)(*arguments)
+        solution = ca.nlpsol("fpirhc_shooting_solver", self.plugin, program(ocp), self.options(ocp))(
+            x0=interleave(states, start),
+            p=ca.vec(data),
+            lbx=interleave(_stage_bounds(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
+            ubx=interleave(_stage_bounds(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
+            lbg=0,
+            ubg=0,
+            lam_x0=_usable(remembered["plan_variable_multipliers"]),
+            lam_g0=_usable(remembered["plan_dynamics_multipliers"]),
+        )
+        inputs = clip(separate(ocp, solution["x"])[1], lower, upper)
+        multipliers = separate(ocp, solution["lam_x"])[0][:, 1:] * int(ocp.bounds_states)
+        cost, residual, violation = judge(ocp.measured_at_rest)(inputs, s0, data, lower, upper, multipliers)
+        finite = is_finite(ca.vertcat(ca.vec(inputs), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
+        plan = ca.if_else(finite, inputs, start)
+        numbers = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
+        status = status_of(finite, residual, violation, self.tolerance)
+        next_parts = {
+            "plan_inputs": ca.vec(plan),
+            # A solve that was not finite must not poison the next warm start.
+            "plan_variable_multipliers": ca.if_else(finite, solution["lam_x"], 0),
+            "plan_dynamics_multipliers": ca.if_else(finite, solution["lam_g"], 0),
+        }
+        diagnostics = ca.vertcat(numbers, UNKNOWN_ITERATIONS, status)
+        return ca.Function(name, arguments, [plan, diagnostics, layout.join(next_parts)])
+
+
+def _usable(multipliers: ca.MX) -> ca.MX:
+    """Forget multipliers that are not finite or absurdly large: they would poison a warm start."""
+    return ca.if_else(ca.fabs(multipliers) <= _LARGEST_MULTIPLIER, multipliers, 0)
+
+
+def _program_values(ocp: OptimalControl) -> ca.Function:
+    """Function (w, p) -> cost, constraints and their first derivatives in one column."""
+    nlp = program(ocp)
+    slopes = ca.gradient(nlp["f"], nlp["x"]), ca.jacobian(nlp["g"], nlp["x"])
+    column = ca.vertcat(nlp["f"], nlp["g"], ca.densify(slopes[0]), ca.vec(slopes[1].nz[:]))
+    return ca.Function("fpirhc_program_values", [nlp["x"], nlp["p"]], [column])
+
+
+def sizes(ocp: OptimalControl) -> tuple[int, int]:
+    """Return the numbers of variables and of constraints."""
+    return ocp.stages * (ocp.state.size + ocp.input.size) + ocp.state.size, ocp.stages * ocp.state.size
+
+
+def interleave(states: ca.MX, inputs: ca.MX) -> ca.MX:
+    """Return states (ns, N + 1) and inputs (nu, N) as a column (s_0, u_0, s_1, ..., s_N)."""
+    n = inputs.shape[1]
+    return ca.vertcat(ca.vec(ca.vertcat(states[:, :n], inputs)), states[:, n])
+
+
+def separate(ocp: OptimalControl, column: ca.MX) -> tuple[ca.MX, ca.MX]:
+    """Return states (ns, N + 1) and inputs (nu, N) of a column: the inverse of `interleave`."""
+    ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
+    stages = ca.reshape(column[: n * (ns + nu)], ns + nu, n)
+    return ca.horzcat(stages[:ns, :], column[n * (ns + nu) :]), stages[ns:, :]
+
+
+def _stage_bounds(ocp: OptimalControl, s0: ca.MX, bound: np.ndarray) -> ca.MX:
+    """Return the bounds of s_0 ... s_N; the first state is fixed."""
+    return ca.horzcat(s0, ca.repmat(ca.DM(bound), 1, ocp.stages))
+
+
+def shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
+    """Return variables, or their multipliers, one stage later."""
+    states, inputs = separate(ocp, column)
+    return interleave(shift(states), shift(inputs))
+
+
+def shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
+    """Return multipliers of the dynamics one stage later."""
+    stages: ca.MX = ca.reshape(column, ocp.state.size, ocp.stages)
+    return ca.vec(shift(stages))
+
+
+def program(ocp: OptimalControl) -> dict[str, ca.MX]:
+    """Return the program as CasADi's `nlpsol` takes it, with the data of all stages as its parameter."""
+    n = ocp.stages
+    w, flat = ca.MX.sym("w", sizes(ocp)[0]), ca.MX.sym("p", ocp.data.size * (n + 1))
+    states, inputs = separate(ocp, w)
+    data = ca.reshape(flat, ocp.data.size, n + 1)
+    costs, _ = ocp.stage_cost.map(n)(states[:, :n], inputs, data[:, :n])
+    value = ca.sum2(costs) + ocp.terminal_cost(states[:, n], data[:, n])
+    next_states = ocp.dynamics.map(n)(states[:, :n], inputs, data[:, :n])
+    return {"x": w, "p": flat, "f": value, "g": ca.vec(states[:, 1:] - next_states)}
+
+
+def _gauss_newton_hessian(ocp: OptimalControl) -> ca.Function:
+    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block, with both triangles."""
+    nlp = program(ocp)
+    hessian, _ = ca.hessian(nlp["f"], nlp["x"])
+    weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", sizes(ocp)[1])
+    inputs = [nlp["x"], nlp["p"], weight, multipliers]
+    names = ["x", "p", "lam_f", "lam_g"]
+    return ca.Function("nlp_hess_l", inputs, [weight * hessian], names, ["hess_gamma_x_x"])
+
+
 _QUIET: Options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 
 
@@ -209,7 +434,7 @@ class SequentialQuadratic(MultipleShooting):
             "tol_pr": 1e-8,
             "tol_du": 1e-8,
             "min_step_size": 1e-12,
-            "hess_lag": gauss_newton_hessian(ocp),
+            "hess_lag": _gauss_newton_hessian(ocp),
         }
 
 

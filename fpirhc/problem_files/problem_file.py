@@ -10,20 +10,26 @@ It may also define
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import ast
+import contextlib
+import importlib.util
+import io
+import linecache
+import sys
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from fpirhc.by_name import FoundByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import named_in_task
-from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError
-from fpirhc.fields.checked import checked_call
+from fpirhc.errors import FpirhcError, InvalidField, Mistakes, ProblemFileError
+from fpirhc.fields.checked import Checked, checked_call, mistakes_of
 from fpirhc.fields.given import call_of, described
-from fpirhc.problem_files.importing import imported
-from fpirhc.problem_files.importing import line_of as _at
+from fpirhc.fields.user_code import explained
 from fpirhc.problem_files.settings import TuningSpans, check_tuning
 from fpirhc.problem_files.shipped import find_problem
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
@@ -92,23 +98,23 @@ def load_problem(name_or_path: str) -> Task:
         ProblemFileError: the file raises an error on import (the message shows the line), or a definition is missing or wrong.
     """
     path = find_problem(name_or_path)
-    module = imported(path)
+    module = _imported(path)
     mistakes = Mistakes(f"problem file '{path.name}'")
     problem, controllers = _problem(module, mistakes), _controllers(module, mistakes)
     headline = _headline(module, controllers, mistakes)
     tuning, own = getattr(module, "tuning", {}), getattr(module, "metrics", ())
     if not isinstance(own, Sequence) or not all(isinstance(metric, Metric) for metric in own):
         mistakes.add(
-            f"{_at(module, 'metrics')}metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)"
+            f"{_line_of(module, 'metrics')}metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)"
         )
     pictures = getattr(module, "pictures", ())
     if not isinstance(pictures, Sequence):
-        mistakes.add(f"{_at(module, 'pictures')}expected a sequence of pictures, got {described(pictures)}")
+        mistakes.add(f"{_line_of(module, 'pictures')}expected a sequence of pictures, got {described(pictures)}")
         pictures = ()
     _check_pictures(tuple(pictures), controllers, mistakes)
     if not isinstance(tuning, Mapping):
         expected = "{'controller': {'deformation.gain': Span(low, high)}}"
-        mistakes.add(f"{_at(module, 'tuning')}expected {expected}, got {described(tuning)}")
+        mistakes.add(f"{_line_of(module, 'tuning')}expected {expected}, got {described(tuning)}")
     try:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
@@ -130,13 +136,13 @@ def _problem(module: ModuleType, mistakes: Mistakes) -> Problem | None:
     named = f"; '{others[0]}' is one, so call it 'problem'" if others else ""
     outside = ", outside every function"
     got = f", got {described(problem)}" if hasattr(module, "problem") else "" if others else outside
-    mistakes.add(f"{_at(module, 'problem')}it must define problem = fpirhc.Problem(...){got}{named}")
+    mistakes.add(f"{_line_of(module, 'problem')}it must define problem = fpirhc.Problem(...){got}{named}")
     return None
 
 
 def _controllers(module: ModuleType, mistakes: Mistakes) -> Mapping[str, Controller]:
     controllers = getattr(module, "controllers", None)
-    where = _at(module, "controllers")
+    where = _line_of(module, "controllers")
     if not isinstance(controllers, Mapping) or not controllers:
         got = f", got {described(controllers)}" if hasattr(module, "controllers") else _called_otherwise(module)
         mistakes.add(f"{where}it must define controllers = {{'name': fpirhc.ComputedTorque(...), ...}}{got}")
@@ -164,10 +170,10 @@ def _headline(module: ModuleType, controllers: Mapping[str, Controller], mistake
         return None
     if not isinstance(headline, Sequence) or isinstance(headline, str) or len(headline) != 2:
         mistakes.add(
-            f"{_at(module, 'headline')}headline must be a pair of names (without adaptation, with), got {described(headline)}"
+            f"{_line_of(module, 'headline')}headline must be a pair of names (without adaptation, with), got {described(headline)}"
         )
         return None
-    mistakes.unknown(f"{_at(module, 'headline')}headline: controller", headline, controllers)
+    mistakes.unknown(f"{_line_of(module, 'headline')}headline: controller", headline, controllers)
     return headline[0], headline[1]
 
 
@@ -177,3 +183,200 @@ def _check_pictures(pictures: tuple[object, ...], controllers: Mapping[str, obje
             mistakes.add(f"pictures must hold pictures such as Portrait(...), got {picture!r}")
         else:
             mistakes.unknown(f"picture '{picture.title}': controller", picture.controllers, controllers)
+
+
+def _imported(path: Path) -> ModuleType:
+    """Return the module of a problem file.
+
+    Raises:
+        ProblemFileError: the file raises an error, or is not Python; every mistake has its line.
+    """
+    module = _empty(path)
+    try:
+        with _neighbours(path):
+            assert module.__spec__ is not None
+            assert module.__spec__.loader is not None
+            module.__spec__.loader.exec_module(module)
+    except SyntaxError as error:
+        source, name = (error.text or "").strip(), Path(error.filename or path).name
+        raise ProblemFileError(f"{name}, line {error.lineno}: {error.msg}\n    {source}") from None
+    except SystemExit as error:
+        raise ProblemFileError(_message(path, error, "the file ends the program; leave the exit out")) from None
+    except Exception as error:  # noqa: BLE001 -- every error of a user's file is shown with its line
+        with _neighbours(path):
+            every = _MistakesOfFile(path, _empty(path)).text()
+        raise ProblemFileError(every or _message(path, error, _cause_of(error))) from None
+    return module
+
+
+def _line_of(module: ModuleType, name: str) -> str:
+    """Return "line 12: " of the last assignment of a name in a module's file; empty where there is none."""
+    try:
+        tree = ast.parse(Path(module.__file__ or "").read_text(encoding="utf-8"))
+    except (OSError, SyntaxError, ValueError):
+        return ""
+    lines = [
+        target.lineno
+        for node in tree.body
+        for target in (node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)])
+        if isinstance(target, ast.Name) and target.id == name
+    ]
+    return f"line {lines[-1]}: " if lines else ""
+
+
+def _empty(path: Path) -> ModuleType:
+    """The module of a file before its first line."""
+    spec = importlib.util.spec_from_file_location(f"fpirhc_problem_{path.stem}", path)
+    if spec is None:
+        raise ProblemFileError(f"'{path}' is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    return module
+
+
+@contextlib.contextmanager
+def _neighbours(path: Path) -> Iterator[None]:
+    """Let a file import the modules beside it, as a program can; libraries come first.
+
+    The modules are forgotten afterwards: another folder may have others of the same name.
+    """
+    folder, before = str(path.resolve().parent), set(sys.modules)
+    sys.path.append(folder)
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
+        for name in set(sys.modules) - before:
+            file = getattr(sys.modules[name], "__file__", None)
+            if file and Path(file).parent == Path(folder) and not name.startswith("fpirhc_problem_"):
+                del sys.modules[name]
+
+
+@dataclass
+class _MistakesOfFile:
+    """All mistakes of a file that has raised an error; Python shows the first.
+
+    The file's statements run once more, one by one. Of a statement that fails or needs what is missing, those calls of fpirhc still
+    run that need nothing missing; of the others, the arguments that are there are checked.
+
+    Args:
+        path: of the file.
+        module: its module, without names of the file's own.
+        missing: names that are not defined, because what should define them failed.
+        said: line -> messages.
+    """
+
+    path: Path
+    module: ModuleType
+    missing: set[str] = field(default_factory=set)
+    said: dict[int, list[str]] = field(default_factory=dict)
+
+    def text(self) -> str:
+        """Return every mistake once, by line: "file.py, line 12: source", and the cause below it."""
+        with contextlib.redirect_stdout(io.StringIO()):  # what the file prints is on the screen already
+            for statement in ast.parse(self.path.read_bytes()).body:
+                if self._lacks(statement) or not self._runs(statement):
+                    self.missing |= set(_defined(statement))
+                    for call in _calls(statement):
+                        self._check(call)
+        return "\n".join(
+            f"{_place(self.path, line)}\n    {one}" for line in sorted(self.said) for one in self.said[line]
+        )
+
+    def _lacks(self, source: ast.AST) -> bool:
+        """Whether a piece of source needs a name that is missing."""
+        return any(isinstance(n, ast.Name) and n.id in self.missing for n in ast.walk(source))
+
+    def _runs(self, statement: ast.stmt) -> bool:
+        """Run a statement; its error is kept."""
+        try:
+            exec(compile(ast.Module([statement], []), self.path, "exec"), vars(self.module))
+        except Exception as error:  # noqa: BLE001 -- every error of a user's file is shown
+            self._keep(statement, error)
+            return False
+        return True
+
+    def _check(self, call: ast.Call) -> None:
+        """Run a call of fpirhc that needs nothing missing; of another one, check the named arguments that do not."""
+        try:
+            one = None if self._lacks(call.func) else self._value(call.func)
+            if not getattr(one, "__module__", "").startswith("fpirhc"):
+                return
+            if not self._lacks(call):
+                self._value(call)
+            elif isinstance(one, type) and issubclass(one, Checked):
+                wrong = tuple(mistakes_of(one, dict(self._named(call))))
+                if wrong:
+                    self._keep(call, InvalidField(wrong))
+        except FpirhcError as error:
+            self._keep(call, error)
+        except Exception:  # noqa: BLE001 -- the statement around it has told it
+            return
+
+    def _named(self, call: ast.Call) -> Iterator[tuple[str, object]]:
+        """Name and value of the named arguments that have one."""
+        for one in call.keywords:
+            if one.arg and not self._lacks(one.value):
+                with contextlib.suppress(Exception):  # an argument that fails is told where it stands
+                    yield one.arg, self._value(one.value)
+
+    def _value(self, source: ast.expr) -> Any:
+        return eval(compile(ast.Expression(source), self.path, "eval"), vars(self.module))
+
+    def _keep(self, source: ast.stmt | ast.expr, error: Exception) -> None:
+        messages = self.said.setdefault(_line(self.path, error) or source.lineno, [])
+        if _cause_of(error) not in messages:
+            messages.append(_cause_of(error))
+
+
+def _message(path: Path, error: BaseException, cause: str) -> str:
+    """Return "file.py, line 12: source" of the innermost line of the file in the traceback, and the cause below it."""
+    line = _line(path, error)
+    return f"{_place(path, line) if line else path.name}\n    {cause}"
+
+
+def _cause_of(error: Exception) -> str:
+    """What an error says, without the place, and with what to write instead."""
+    if isinstance(error, InvalidField):
+        return error.text.lstrip()
+    if isinstance(error, FpirhcError):
+        return str(error)
+    cause = explained(error)
+    if not cause.startswith(type(error).__name__):
+        return cause
+    # Python's own last line also has the nearest name that it knows.
+    return "".join(traceback.TracebackException.from_exception(error).format_exception_only()).strip()
+
+
+def _line(path: Path, error: BaseException) -> int | None:
+    """The innermost line of the file in the traceback."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).resolve() == path.resolve()]
+    return frames[-1].lineno if frames else None
+
+
+def _place(path: Path, line: int) -> str:
+    return f"{path.name}, line {line}: {linecache.getline(str(path), line).strip()}"
+
+
+def _calls(source: ast.AST) -> Iterator[ast.Call]:
+    """Calls that happen where the source stands, the inner ones first; not those of functions and loops in it."""
+    if isinstance(source, _LATER):
+        return
+    for child in ast.iter_child_nodes(source):
+        yield from _calls(child)
+    if isinstance(source, ast.Call):
+        yield source
+
+
+def _defined(statement: ast.stmt) -> Iterator[str]:
+    """Names that a statement defines."""
+    for node in ast.walk(statement):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.alias):
+            yield node.asname or node.name.partition(".")[0]
+
+
+_LATER = (ast.Lambda, ast.FunctionDef, ast.ClassDef, ast.ListComp, ast.DictComp, ast.SetComp, ast.GeneratorExp)

@@ -17,7 +17,6 @@ from fpirhc.fields.kinds import Duration, finite_number
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
-from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.map_steps import motion_of
@@ -26,12 +25,11 @@ from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.live import nominal
+from fpirhc.task.checks import check_maps, check_stage, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
-from fpirhc.task.map_task import check_maps, settled_maps
-from fpirhc.task.needed import needed_measurements, needed_names
 from fpirhc.task.outside import External, check_signals, not_held, real_values, rows_of, signals_of
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference

@@ -1,21 +1,29 @@
-"""A task whose plant, or reality, is a map: what follows from its steps, and what is refused beside them.
+"""Whether the parts of a problem fit together: the steps of maps, what the plant that moves must have, what a cost and limits read.
 
-A map has its own steps in place of an integrator, in the run and along a horizon. The plant of the problem is the map over one
-control cycle (`fpirhc.plant.maps`). A response of a map is a difference of outputs, which no sensor shows, so it is taken from the
-outputs of the last cycles (`StepDifference`); that of an output of order 0 is the output itself, and measured.
+A map has its own steps in place of an integrator, in the run and along a horizon. A response of a map is a difference of outputs,
+which no sensor shows, so it is taken from the outputs of the last cycles (`StepDifference`); that of an output of order 0 is the
+output itself, and measured. What is believed, nobody measures; a reality need not have it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
-from fpirhc.errors import InvalidValue, Mistakes
+import casadi as ca
+
+from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.fields.user_code import named_results, scalar_expression
+from fpirhc.horizon.cost import Cost, View
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.map_steps import MapSteps
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing import Sensing
 from fpirhc.sensing.positions import StepDifference
+from fpirhc.sensing.sensing import Sensing
+from fpirhc.symbolic.layout import Named
+from fpirhc.symbolic.live import nominal
+from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
 
 
@@ -106,3 +114,63 @@ def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
     if integrator is not USUAL:
         mistakes.add(f"{what}: {integrator!r} integrates differential equations; the plant is a map, leave it out")
     return MapSteps()
+
+
+def needed_measurements(plant: Plant, sensing: Sensing) -> tuple[str, ...]:
+    """Return the names of what is measured: by sensors, and the state that is given beside outputs where nothing is believed."""
+    states = plant.state.elements if plant.outputs and sensing.belief is None else ()
+    return tuple(dict.fromkeys((*states, *sensing.measures(plant))))
+
+
+def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -> frozenset[str]:
+    """Return the names of the model's coordinates and outputs that the plant that moves must have.
+
+    Args:
+        plant: the model.
+        sensing: of the problem.
+        judged: names whose errors are judged beside the controlled ones; None: no other need be there.
+    """
+    if sensing.belief is None:
+        return frozenset((*plant.coordinates, *plant.face.coordinates))
+    measured = (name.rstrip("'") for name in needed_measurements(plant, sensing))
+    return frozenset((*measured, *(judged or ()), *(plant.outputs or plant.controlled_names)))
+
+
+def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
+    """Add every mistake in the cost's names and weights, and in the user's functions of a stage."""
+    cost, limits = nominal(cost), nominal(limits)
+    view = _view_of_symbols(plant)
+    parts = (view.state, view.output, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
+    symbols = (*(part.vector for part in parts), view.time)
+    if cost is not None:
+        try:
+            cost.check(plant)
+            for name, term in named_results("cost", cost.stage(view)).items():
+                scalar_expression(f"cost: term '{name}'", term, symbols=symbols, finite=False)
+        except FpirhcError as error:
+            mistakes.add(str(error))
+    for name, path in limits.paths.items():
+        try:
+            path.named_value(name, view, symbols)
+        except FpirhcError as error:
+            mistakes.add(str(error))
+
+
+def _view_of_symbols(plant: Plant) -> View:
+    state, command, parameter = plant.state, plant.input, plant.parameter
+    x = Named(state.elements, ca.SX.sym("x", state.size), "state")
+    elements, what = plant.output.elements, plant.output.name
+
+    def inputs(name: str) -> Named:
+        return Named(command.elements, ca.SX.sym(name, command.size), "input")
+
+    return View(
+        x,
+        Named(elements, ca.SX.sym("reference", len(elements)), what),
+        inputs("u"),
+        inputs("before"),
+        inputs("feedforward"),
+        Named(parameter.elements, ca.SX.sym("p", parameter.size), "parameter"),
+        ca.SX.sym("t"),
+        Named(elements, ca.SX.sym("y", len(elements)), what),
+    )
