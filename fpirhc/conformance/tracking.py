@@ -15,6 +15,7 @@ import numpy.typing as npt
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.errors import InvalidValue
+from fpirhc.plant.motion import places
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.simulate import simulate
 from fpirhc.symbolic.block import Block, Composite, compose
@@ -187,7 +188,7 @@ def error_is_target_minus_state(trial: _Trial, generator: np.random.Generator) -
     """The error that the law passes on is target minus state of every controlled coordinate."""
     for _ in range(_TRIALS):
         state, target, nominal = trial.motion(generator)
-        expected = (target - state)[list(trial.plant.indices(0))]
+        expected = (target - state)[places(trial.plant, 0)]
         _, _, error = trial(trial.start(), state, target, nominal, warm_up=0)
         hold(within(error - expected, _EXACT), f"'_target_error' is {error}, target minus state is {expected}")
 
@@ -303,7 +304,7 @@ def clipping_freezes(trial: _Trial, generator: np.random.Generator) -> None:
 
 def nan_shows(trial: _Trial, generator: np.random.Generator) -> None:
     """A measured coordinate that is not a number gives a desired response that is not one, so that it never acts."""
-    for k, place in enumerate(trial.plant.indices(0)):
+    for k, place in enumerate(places(trial.plant, 0)):
         state, target, nominal = trial.motion(generator)
         state[place] = np.nan
         _, desired, _ = trial(trial.start(), state, target, nominal)

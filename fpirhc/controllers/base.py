@@ -31,7 +31,7 @@ from fpirhc.controllers.own_reference import given_signals, motion_of, own_signa
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.given import described
-from fpirhc.plant.instant import nominal_responses
+from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose

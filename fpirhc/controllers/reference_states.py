@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.nominal import known_on_reference, nominal_run
-from fpirhc.plant.instant import nominal_responses
+from fpirhc.plant.chain import nominal_responses
 from fpirhc.task.problem import Problem, nominal_start
 
 

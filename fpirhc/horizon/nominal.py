@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
-from fpirhc.plant.instant import nominal_responses
+from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Matrix

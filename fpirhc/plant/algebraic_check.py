@@ -10,7 +10,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.user_code import called, named_results
 from fpirhc.plant.algebraic import Algebraic
-from fpirhc.plant.motion import Motion
+from fpirhc.plant.motion import Motion, arguments_of
 from fpirhc.symbolic.layout import Named
 
 SINGULAR = 1e-12  # ratio of the least to the largest singular value of dg/dz
@@ -67,8 +67,8 @@ def unsolved(plant: Motion, state: np.ndarray, command: np.ndarray, parameters: 
     solution = np.asarray(plant.algebraic_function(state, command, parameters).full()).ravel()
     x, u, p = plant.symbols()
     z = ca.SX.sym("z", len(algebraic.names))
-    slope = ca.jacobian(algebraic.residual(plant.views(x, u, p), z), z)
-    first = algebraic.first(plant.views(x, u, p))
+    slope = ca.jacobian(algebraic.residual(arguments_of(plant, x, u, p), z), z)
+    first = algebraic.first(arguments_of(plant, x, u, p))
     at_guess = np.asarray(ca.Function("fpirhc_guess", [x, u, p], [first])(state, command, parameters).full()).ravel()
     at = np.where(np.isfinite(solution), solution, at_guess)
     values = np.asarray(

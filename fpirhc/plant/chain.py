@@ -1,19 +1,20 @@
 """Derivatives of a plant's coordinates and outputs as functions of its state: the Lie derivatives y, y', y'', ... along its motion.
 
-    y_0 = the quantity,        y_{k+1} = dy_k/dx x'(x, u, p, w),
-
-with the input u and the forcing w held, as they are over a control cycle. A derivative that is a state or a response of the
-plant is that entry itself.
+With u and the forcing w held over a cycle, y_0 = the quantity and y_{k+1} = dy_k/dx x'(x, u, p, w); one that is a state or a
+response is that entry itself. The response of an output of order 0 is the output, and its nominal response the reference at the end
+of the cycle: there it is measured.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import casadi as ca
 
 from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression
+from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import Matrix
 from fpirhc.symbolic.layout import Expression
 
 
@@ -64,3 +65,34 @@ def _chain(plant: Plant, name: str, count: int, symbols: Symbols, responses: Exp
         for _ in range(count - order):
             chain.append(ca.jtimes(chain[-1], x, rate))
     return chain
+
+
+def nominal_responses(
+    plant: Plant, outputs: Matrix, responses: Matrix, later: Callable[[], Matrix] | None = None
+) -> Matrix:
+    """Return the nominal responses of the controlled quantities: highest derivatives, or the outputs of order 0 themselves.
+
+    Args:
+        plant: the plant.
+        outputs: nominal outputs and their derivatives, in the order of `Plant.output`; without outputs the state.
+        responses: nominal highest derivatives of the face.
+        later: gives the outputs at the end of the cycle, where one is of order 0; None: `outputs`.
+    """
+    face, instant = plant.face, [name for name, order in plant.response_orders.items() if not order]
+    if not instant:
+        return responses[list(face.controlled_indices)]
+    ahead = outputs if later is None else later()
+    places = [plant.output.elements.index(name) if name in instant else -1 for name in plant.controlled_names]
+    entries = (responses[k] if at < 0 else ahead[at] for k, at in zip(face.controlled_indices, places, strict=True))
+    return ca.vertcat(*entries)
+
+
+def differentiated_signals(plant: Plant) -> tuple[str, ...]:
+    """Return the signals on which an output of the plant, or a derivative below its relative order, depends."""
+    if not plant.outputs:
+        return ()
+    x, u, p = plant.symbols()
+    motion = plant.output_function(x, u, p, ca.SX.zeros(len(plant.names)))
+    differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if plant.output_orders.get(e, 1)]
+    places = {name: plant.parameter.elements.index(name) for name in outside_names(plant)}
+    return tuple(name for name, place in places.items() if ca.depends_on(ca.vertcat(*differentiated), p[place]))

@@ -21,13 +21,14 @@ from dataclasses import replace
 from typing import TypeVar
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.expected import takes
 from fpirhc.fields.given import described
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.maps import shifted
-from fpirhc.plant.motion import Motion, by_name
+from fpirhc.plant.motion import Motion, arguments_of, by_name, words
 from fpirhc.symbolic.layout import Expression, Named
 
 _Motion = TypeVar("_Motion", bound=Motion)
@@ -42,7 +43,7 @@ def output_expression(plant: Motion, name: str, x: Expression, u: Expression, p:
     """
     what, expression = f"outputs: '{name}'", plant.outputs[name].expression
     arguments = by_name(plant, x, p)
-    arguments = arguments if takes(expression, len(arguments)) else plant.views(x, u, p)
+    arguments = arguments if takes(expression, len(arguments)) else arguments_of(plant, x, u, p)
     return scalar_expression(what, called(what, expression, *arguments), of=expression, symbols=(x, u, p))
 
 
@@ -143,7 +144,7 @@ def check_outputs(plant: Motion, mistakes: Mistakes) -> None:
     for name, one in plant.outputs.items():
         lower = max(plant.orders, default=0)
         if not (takes(one.expression, lower + 1) or takes(one.expression, lower + 2)):
-            first = ["x"] if plant.words[0] == "state" else ["q", "v", "a", *(f"d{k}" for k in range(3, 12))]
+            first = ["x"] if words(plant)[0] == "state" else ["q", "v", "a", *(f"d{k}" for k in range(3, 12))]
             names = ", ".join(first[:lower])
             mistakes.add(
                 f"outputs: the expression of '{name}' is called as function({names}, p), or as function({names}, u, p) where the "
@@ -170,3 +171,22 @@ def _check_one(plant: Motion, name: str, mistakes: Mistakes) -> None:
     controlled = plant.controlled is None or name in plant.controlled
     if controlled and output_order(plant, name) is None:
         mistakes.add(f"outputs: no input reaches '{name}', however often it is differentiated; control another output")
+
+
+def structural_order(plant: Motion, coordinate: str) -> int | None:
+    """Return the number of the first derivative of `coordinate` that depends on an input; None if there is none.
+
+    Only the pattern of dependence counts, so an accidental cancellation has no effect. The search is a breadth-first walk from the
+    coordinate through the states on which its derivatives depend.
+    """
+    x, u, p = plant.symbols()
+    rate = plant.derivative_function(x, u, p)
+    on_state = np.array(ca.DM(ca.jacobian_sparsity(rate, x), 1).full(), dtype=bool)
+    on_input = np.array(ca.DM(ca.jacobian_sparsity(rate, u), 1).full(), dtype=bool).any(axis=1)
+    reached: np.ndarray = np.zeros(plant.state.size, dtype=bool)
+    reached[plant.state.elements.index(coordinate)] = True
+    for order in range(1, plant.state.size + 1):
+        if bool((reached & on_input).any()):
+            return order
+        reached = np.asarray(on_state[reached].any(axis=0))
+    return None

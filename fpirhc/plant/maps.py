@@ -87,16 +87,17 @@ def check_map(plant: Motion, mistakes: Mistakes) -> None:
 
 
 def over(plant: _Motion, cycle: float) -> _Motion:
-    """Return the map over one control cycle: as many steps with the command held as the cycle has.
+    """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself.
 
     Args:
-        plant: a map.
+        plant: a map, or any other plant.
         cycle: length of the control cycle.
 
     Raises:
         InvalidValue: the cycle is no whole number of steps; the next ones are named.
     """
-    assert plant.step is not None
+    if plant.step is None:
+        return plant
     ratio = cycle / plant.step
     count = round(ratio)
     if count < 1 or abs(ratio - count) > _WHOLE:

@@ -64,13 +64,6 @@ class Motion(Checked):
         order = self.order
         return tuple(order if isinstance(order, int) else order[c] for c in self.coordinates)
 
-    @property
-    def words(self) -> tuple[str, str]:
-        """What a coordinate and the response are called: "state" and "rates", or "next", where the plant is given by its states."""
-        if self.next is not None:
-            return "state", "next"
-        return ("state", "rates") if self.outputs and set(self.orders) == {1} else ("coordinate", "response")
-
     @cached_property
     def state(self) -> Signal:
         """The state vector's signal: q, q', ... below the highest derivative."""
@@ -79,7 +72,7 @@ class Motion(Checked):
             for c, r in zip(self.names, self.orders, strict=True):
                 if r > k:
                     names.append(c + "'" * k)
-                    units.append(self.derivative_unit(self.coordinates[c], k))
+                    units.append(derivative_unit(self.coordinates[c], k, self.time_unit))
         return vector("state", names, units)
 
     @cached_property
@@ -91,11 +84,6 @@ class Motion(Checked):
     def parameter(self) -> Signal:
         """The parameters' signal."""
         return vector("parameters", tuple(self.parameters), tuple(p.unit for p in self.parameters.values()))
-
-    @cached_property
-    def signal_names(self) -> tuple[str, ...]:
-        """Names of the parameters that are signals from outside."""
-        return tuple(name for name, one in self.parameters.items() if one.outside)
 
     @cached_property
     def controlled_names(self) -> tuple[str, ...]:
@@ -138,14 +126,11 @@ class Motion(Checked):
         """The time's signal."""
         return scalar("time", self.time_unit)
 
-    def derivative_unit(self, unit: str, derivative: int) -> str:
-        """Return the unit of a time derivative of a quantity in `unit`."""
-        return derivative_unit(unit, derivative, self.time_unit)
-
     @cached_property
     def response_units(self) -> tuple[str, ...]:
         """Units of the highest derivative of every coordinate."""
-        return tuple(self.derivative_unit(u, r) for u, r in zip(self.coordinates.values(), self.orders, strict=True))
+        units = zip(self.coordinates.values(), self.orders, strict=True)
+        return tuple(derivative_unit(unit, order, self.time_unit) for unit, order in units)
 
     @cached_property
     def approximate(self) -> np.ndarray:
@@ -179,16 +164,6 @@ class Motion(Checked):
         """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""
         return (ca.SX.sym("x", self.state.size), ca.SX.sym("u", len(self.inputs)), ca.SX.sym("p", len(self.parameters)))
 
-    def indices(self, derivative: int) -> tuple[int, ...]:
-        """Places in the state vector of one derivative, for every coordinate whose order is higher."""
-        elements = [c + "'" * derivative for c, r in zip(self.names, self.orders, strict=True) if r > derivative]
-        return tuple(self.state.elements.index(e) for e in elements)
-
-    def views(self, x: Expression, u: Expression, p: Expression) -> tuple[Named, ...]:
-        """Return the arguments of the response by name, without algebraic states: q, q', ..., u, p."""
-        *derivatives, parameters = by_name(self, x, p)
-        return (*derivatives, Named(self.input.elements, u, "input"), parameters)
-
     @cached_property
     def response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
@@ -196,10 +171,10 @@ class Motion(Checked):
         if self.next is not None:
             differences = (self.next_function(x, u, p, ca.SX.zeros(len(self.names))) - x) / self.sampling
             return ca.Function("fpirhc_response", [x, u, p], [differences], ["x", "u", "p"], ["r"])
-        views = self.views(x, u, p)
+        views = arguments_of(self, x, u, p)
         if self.algebraic is not None:
             views = (*views, self.algebraic.view(self.algebraic_function(x, u, p)))
-        responses = called(self.words[1], self.response, *views)
+        responses = called(words(self)[1], self.response, *views)
         column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
         return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
 
@@ -209,7 +184,7 @@ class Motion(Checked):
         x, u, p = self.symbols()
         solution = ca.SX(0, 1)
         if self.algebraic is not None:
-            solution = self.algebraic.solved(self.views(x, u, p), ca.vertcat(x, u, p))
+            solution = self.algebraic.solved(arguments_of(self, x, u, p), ca.vertcat(x, u, p))
         return ca.Function("fpirhc_algebraic", [x, u, p], [ca.densify(solution)], ["x", "u", "p"], ["z"])
 
     @cached_property
@@ -256,13 +231,37 @@ class Motion(Checked):
         return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
 
 
+def words(motion: Motion) -> tuple[str, str]:
+    """What a coordinate and the response are called: "state" and "rates", or "next", where the plant is given by its states."""
+    if motion.next is not None:
+        return "state", "next"
+    return ("state", "rates") if motion.outputs and set(motion.orders) == {1} else ("coordinate", "response")
+
+
+def outside_names(motion: Motion) -> tuple[str, ...]:
+    """Return the names of the parameters that are signals from outside."""
+    return tuple(name for name, one in motion.parameters.items() if one.outside)
+
+
+def places(motion: Motion, derivative: int) -> list[int]:
+    """Return the places in the state vector of one derivative, for every coordinate whose order is higher."""
+    elements = [c + "'" * derivative for c, r in zip(motion.names, motion.orders, strict=True) if r > derivative]
+    return [motion.state.elements.index(e) for e in elements]
+
+
+def arguments_of(motion: Motion, x: Expression, u: Expression, p: Expression) -> tuple[Named, ...]:
+    """Return the arguments of the response by name, without algebraic states: q, q', ..., u, p."""
+    *derivatives, parameters = by_name(motion, x, p)
+    return (*derivatives, Named(motion.input.elements, u, "input"), parameters)
+
+
 def by_name(motion: Motion, x: Expression, p: Expression) -> tuple[Named, ...]:
     """Return the arguments of a user's function without the inputs, each with its entries by name: q, q', ..., p."""
     derivatives = [
         Named(
             [c for c, r in zip(motion.names, motion.orders, strict=True) if r > k],
-            x[list(motion.indices(k))],
-            motion.words[0],
+            x[places(motion, k)],
+            words(motion)[0],
         )
         for k in range(max(motion.orders, default=0))
     ]
@@ -270,7 +269,7 @@ def by_name(motion: Motion, x: Expression, p: Expression) -> tuple[Named, ...]:
 
 
 def _one_step(motion: Motion, step: Callable[..., Mapping[str, Expression]], x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
-    views = motion.views(x, u, p)
+    views = arguments_of(motion, x, u, p)
     if motion.algebraic is not None:
         views = (*views, motion.algebraic.view(motion.algebraic_function(x, u, p)))
     values = called("next", step, *views)

@@ -31,14 +31,13 @@ from fpirhc.plant.lie_derivatives import (
     light_plant,
     output_expression,
     output_order,
+    structural_order,
 )
 from fpirhc.plant.maps import Differences, check_map
-from fpirhc.plant.maps import over as map_over
 from fpirhc.plant.motion import Motion
 from fpirhc.plant.output import Output
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
-from fpirhc.plant.structural_order import structural_order
 from fpirhc.plant.units import derivative_unit
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.layout import Expression, Signal, vector
@@ -253,16 +252,8 @@ class Plant(Motion):
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
         face = self.face.coordinates
-        units = [self.derivative_unit(face[n], order) for n, order in self.response_orders.items()]
+        units = [derivative_unit(face[n], order, self.time_unit) for n, order in self.response_orders.items()]
         return vector(name, self.controlled_names, units)
-
-    def over(self, cycle: float) -> Plant:
-        """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself.
-
-        Raises:
-            InvalidValue: the cycle is no whole number of the map's steps; the next ones are named.
-        """
-        return self if self.step is None else map_over(self, cycle)
 
     @cached_property
     def controlled_response_function(self) -> ca.Function:

@@ -12,8 +12,8 @@ from fpirhc.fields.expected import takes
 from fpirhc.fields.user_code import called, named_results, place_of, scalar_expression
 from fpirhc.plant.algebraic_check import check_algebraic
 from fpirhc.plant.inverse import inverse_by_user
-from fpirhc.plant.motion import Motion
-from fpirhc.plant.structural_order import structural_order
+from fpirhc.plant.lie_derivatives import structural_order
+from fpirhc.plant.motion import Motion, arguments_of, words
 from fpirhc.symbolic.layout import Expression
 
 HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mistyped 10**9 would fill the memory
@@ -71,8 +71,8 @@ def check_ranges(plant: Motion, mistakes: Mistakes) -> None:
 def check_response(plant: Motion, mistakes: Mistakes) -> None:
     """Add every mistake of the response and of the orders to `mistakes`."""
     x, u, p = plant.symbols()
-    arguments_of_step, symbols = plant.views(x, u, p), [x, u, p]
-    algebraic, (quantity, function) = plant.algebraic, plant.words
+    arguments_of_step, symbols = arguments_of(plant, x, u, p), [x, u, p]
+    algebraic, (quantity, function) = plant.algebraic, words(plant)
     if algebraic is not None:
         check_algebraic(plant, algebraic, arguments_of_step, mistakes)
         symbols.append(ca.SX.sym("z", max(1, len(algebraic.names))))
@@ -106,7 +106,7 @@ def check_response(plant: Motion, mistakes: Mistakes) -> None:
 
 def _wrong_arguments(plant: Motion, expected: int) -> str:
     """What a response of another number of arguments is, and what it should be."""
-    quantity, function = plant.words
+    quantity, function = words(plant)
     kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
     arguments, order = len(kinds), max(plant.orders, default=0)
     lower = ["x"] if quantity == "state" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
@@ -162,7 +162,7 @@ def _check_orders(plant: Motion, mistakes: Mistakes) -> None:
         if order is None:
             mistakes.add(
                 f"no input reaches coordinate '{name}', however often it is differentiated; use {' or '.join(plant.inputs)} in the "
-                f"{plant.words[1]}, or control another {plant.words[0]}"
+                f"{words(plant)[1]}, or control another {words(plant)[0]}"
             )
         elif order != stated and plant.next is not None:
             mistakes.add(

@@ -26,6 +26,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.motion import places
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.symbolic.layout import Expression, Named, Signal, vector
 
@@ -134,7 +135,7 @@ class Regressor:
         x, _, p = self.symbols()
         theta = ca.SX.sym("theta", len(self.names))
         mass = self.mass_function(x, theta, p)
-        q, v = x[list(self.plant.indices(0))], x[list(self.plant.indices(1))]
+        q, v = x[places(self.plant, 0)], x[places(self.plant, 1)]
         change = ca.jtimes(ca.reshape(mass, -1, 1), q, v).reshape(mass.shape)
         # M does not depend on q', so v is a constant in this derivative.
         slope = ca.jacobian(ca.mtimes(mass, v), q)
@@ -147,7 +148,7 @@ class Regressor:
         slope, theta = ca.SX.sym("slope", v.numel()), ca.SX.sym("theta", len(self.names))
         # M v' + C v + Q(q, q', 0) - C q' is affine in theta as Q is.
         force = self.force_function(x, slope, theta, p)
-        force += ca.mtimes(self.coriolis_function(x, theta, p), v - x[list(self.plant.indices(1))])
+        force += ca.mtimes(self.coriolis_function(x, theta, p), v - x[places(self.plant, 1)])
         y = ca.jacobian(force, theta)
         rest = ca.substitute(force, theta, ca.SX.zeros(theta.numel()))
         return ca.Function("fpirhc_split", [x, v, slope, p], ca.cse([ca.densify(y), ca.densify(rest)]))

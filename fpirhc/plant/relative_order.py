@@ -16,9 +16,9 @@ from functools import cached_property
 import casadi as ca
 
 from fpirhc.errors import InvalidName, NotInvertible, NotSupported, nearest
-from fpirhc.plant.lie_derivatives import output_expression
+from fpirhc.plant.lie_derivatives import output_expression, structural_order
 from fpirhc.plant.plant import Plant
-from fpirhc.plant.structural_order import structural_order
+from fpirhc.plant.units import derivative_unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ def _chain(
         name,
         unit,
         len(derivatives),
-        plant.derivative_unit(unit, len(derivatives)),
+        derivative_unit(unit, len(derivatives), plant.time_unit),
         ca.Function("fpirhc_chain", [x, p], [undisturbed[0]]),
         ca.Function("fpirhc_chain_response", [x, u, p, w], [ca.densify(response)]),
         ca.Function("fpirhc_chain_gain", [x, u, p], [gain]),

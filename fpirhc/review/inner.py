@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.nominal import output_feedback
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.plant.instant import nominal_responses
+from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.limits import Limits

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fpirhc.plant.structural_order import structural_order
+from fpirhc.plant.lie_derivatives import structural_order
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 

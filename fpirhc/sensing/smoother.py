@@ -26,6 +26,7 @@ from functools import cached_property
 
 import casadi as ca
 
+from fpirhc.plant.motion import outside_names
 from fpirhc.sensing.base import values_of
 from fpirhc.sensing.belief import Model
 from fpirhc.symbolic.layout import Expression
@@ -99,7 +100,7 @@ class Smoother:
     def row_size(self) -> int:
         """Entries of a row."""
         plant = self.model.plant
-        return 2 + len(self.measured) + plant.input.size + len(plant.signal_names)
+        return 2 + len(self.measured) + plant.input.size + len(outside_names(plant))
 
     def row(self, counts: Expression, moves: Expression, shown: Expression, u: Expression, p: Expression) -> Expression:
         """Return the row of a sample."""
@@ -206,7 +207,7 @@ class Smoother:
     @property
     def _signals(self) -> list[int]:
         plant = self.model.plant
-        return [plant.parameter.elements.index(n) for n in plant.signal_names]
+        return [plant.parameter.elements.index(n) for n in outside_names(plant)]
 
     def _symbols(self) -> tuple[ca.SX, ...]:
         size, few = self._size, len(self.noise)

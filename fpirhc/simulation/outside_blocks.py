@@ -6,6 +6,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import like
 from fpirhc.controllers.contract import Controller
+from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -30,7 +31,7 @@ def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
         values = real_values(real, problem.signals)
         assert values is not None
         blocks.append(_block("outside", problem, real, values, "signals", (_HELD, _NOW)))
-    if model.signal_names:
+    if outside_names(model):
         believed = model_values(model, known.signals) or _unchanged(model)
         blocks.append(_block("told", problem, model, believed, "signals_told", ("parameters", "")))
     return blocks
@@ -38,10 +39,10 @@ def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
 
 def _block(name: str, problem: Problem, plant: Plant, values: ca.Function, shown: str, ends: tuple[str, str]) -> Block:
     """Block (time, parameters `ends[0]`) -> their signals `shown`, and the parameters `ends[1]` where these have a name."""
-    places, half = [plant.parameter.elements.index(n) for n in plant.signal_names], problem.period / 2
+    places, half = [plant.parameter.elements.index(n) for n in outside_names(plant)], problem.period / 2
     source, target = ends
     units = tuple(plant.parameter.units[k] for k in places)
-    writes = (Signal(shown, plant.signal_names, units), *([like(plant.parameter, target)] if target else []))
+    writes = (Signal(shown, outside_names(plant), units), *([like(plant.parameter, target)] if target else []))
 
     def step(s: Signals) -> dict[str, Expression]:
         now = values(s.time + half, getattr(s, source))

@@ -16,8 +16,8 @@ from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.user_code import named_results, scalar_expression
 from fpirhc.horizon.cost import Cost, View
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.plant.integrators import USUAL, Integrator
-from fpirhc.plant.map_steps import MapSteps
+from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
+from fpirhc.plant.maps import over
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.positions import StepDifference
 from fpirhc.sensing.sensing import Sensing
@@ -49,9 +49,9 @@ def settled_maps(
     """
     settled: dict[str, object] = {}
     try:
-        settled["plant"] = plant.over(period)
+        settled["plant"] = over(plant, period)
         if reality is not None:
-            real = reality.plant.over(period)
+            real = over(reality.plant, period)
             settled["reality"] = reality if real is reality.plant else replace(reality, plant=real)
     except InvalidValue as error:
         mistakes.add(str(error))

@@ -19,6 +19,7 @@ from fpirhc.fields.expected import takes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.expression import Expression, Value, total
 from fpirhc.symbolic.live import nominal
 
@@ -223,7 +224,7 @@ class Limits(Checked):
     def members(self, plant: Plant, step: float) -> dict[str, Limit]:
         """Return the limits on what is no state by name: rates of inputs, with stages of length `step`, and paths."""
         rates: dict[str, Limit] = {
-            f"{name} rate": _Rate(name, step, *ends, unit=plant.derivative_unit(plant.inputs[name], 1))
+            f"{name} rate": _Rate(name, step, *ends, unit=derivative_unit(plant.inputs[name], 1, plant.time_unit))
             for name, ends in self.rates.items()
         }
         return {**rates, **self.paths}

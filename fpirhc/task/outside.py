@@ -24,6 +24,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError, InvalidShape, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import expression, graph, kind
 from fpirhc.symbolic.latest import Latest
@@ -106,12 +107,12 @@ class Believed(External):
 
 def real_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with the real values of the signals; None where the plant has none."""
-    return _filled(plant, {n: signals[n].values for n in plant.signal_names if n in signals})
+    return _filled(plant, {n: signals[n].values for n in outside_names(plant) if n in signals})
 
 
 def model_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with what the model is told at this time; None where it is told nothing."""
-    courses = {n: signals[n].told for n in plant.signal_names if n in signals}
+    courses = {n: signals[n].told for n in outside_names(plant) if n in signals}
     return _filled(plant, {n: course for n, course in courses.items() if course is not None})
 
 
@@ -123,13 +124,13 @@ def previewed_values(plant: Plant, signals: Mapping[str, External]) -> ca.Functi
 
 def told_places(plant: Plant, signals: Mapping[str, External]) -> tuple[int, ...]:
     """Places of the signals among the parameters of which the model is told something."""
-    names = [n for n in plant.signal_names if n in signals and signals[n].told is not None]
+    names = [n for n in outside_names(plant) if n in signals and signals[n].told is not None]
     return tuple(plant.parameter.elements.index(n) for n in names)
 
 
 def signals_of(plant: Plant, signals: Mapping[str, External]) -> dict[str, External]:
     """Return the signals that a plant has."""
-    return {name: one for name, one in signals.items() if name in plant.signal_names}
+    return {name: one for name, one in signals.items() if name in outside_names(plant)}
 
 
 def really_known(signals: Mapping[str, External]) -> Mapping[str, External]:
@@ -139,7 +140,7 @@ def really_known(signals: Mapping[str, External]) -> Mapping[str, External]:
 
 def as_told(plant: Plant, signals: Mapping[str, External]) -> dict[str, External]:
     """Return signals that are what the model believes: the world of a null test."""
-    nominal = {name: plant.parameters[name].approximate for name in plant.signal_names}
+    nominal = {name: plant.parameters[name].approximate for name in outside_names(plant)}
     made: dict[str, External] = {}
     for name, one in signals_of(plant, signals).items():
         course = one.told
@@ -174,7 +175,7 @@ def check_signals(
     """
     units: dict[str, str] = {}
     for plant in plants:
-        for name in plant.signal_names:
+        for name in outside_names(plant):
             unit = plant.parameters[name].unit
             if units.setdefault(name, unit) != unit:
                 mistakes.add(

@@ -18,10 +18,11 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.algebraic_check import unsolved
-from fpirhc.plant.integrators import USUAL, Integrator
-from fpirhc.plant.map_steps import motion_of
+from fpirhc.plant.chain import differentiated_signals
+from fpirhc.plant.integrators import USUAL, Integrator, motion_of
+from fpirhc.plant.motion import words
 from fpirhc.plant.plant import Plant, plant_facts
-from fpirhc.plant.signals_in_outputs import differentiated_signals
+from fpirhc.plant.units import derivative_unit
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.live import nominal
@@ -350,7 +351,7 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
     mistakes.unknown("start: state", problem.start, plant.state.elements)
     for c in plant.names:
         if c not in problem.start:
-            mistakes.add(f"start: {plant.words[0]} '{c}' has no first value; add '{c}': ...")
+            mistakes.add(f"start: {words(plant)[0]} '{c}' has no first value; add '{c}': ...")
     for name, value in problem.start.items():
         if not finite_number(value):
             mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
@@ -470,7 +471,7 @@ def _time_rows(problem: Problem) -> list[tuple[str, str]]:
 def _limit_rows(problem: Problem) -> list[tuple[str, str]]:
     limits, plant = problem.limits, problem.plant
     states = dict(zip(plant.state.elements, plant.state.entry_units, strict=True))
-    rates = {name: plant.derivative_unit(unit, 1) for name, unit in plant.inputs.items()}
+    rates = {name: derivative_unit(unit, 1, plant.time_unit) for name, unit in plant.inputs.items()}
     rows = [(f"limits of {name}", _interval(ends, plant.inputs[name])) for name, ends in limits.inputs.items()]
     rows += [(f"limits of {name}", _interval(ends, states[name])) for name, ends in limits.states.items()]
     rows += [(f"limits of the rate of {name}", _interval(ends, rates[name])) for name, ends in limits.rates.items()]

@@ -23,11 +23,10 @@ from fpirhc.fields.checked import Checked
 from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
 from fpirhc.plant.integrators import Integrator
-from fpirhc.plant.lie_derivatives import output_order
+from fpirhc.plant.lie_derivatives import output_order, structural_order
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
-from fpirhc.plant.structural_order import structural_order
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.plant.maps import over
 from fpirhc.problem_files.problem_file import Task
 
 DATA = Path(__file__).parents[1] / "data" / "freeway" / "reference.csv"
@@ -40,7 +41,7 @@ def error(name: str, controller: str) -> float:
 def open_loop() -> np.ndarray:
     """900 steps of 10 s with an open ramp and the demands of the source, shape (900, 14)."""
     problem = task("freeway_metering").problem
-    plant = problem.plant.over(T)  # one step, and not the six of a minute
+    plant = over(problem.plant, T)  # one step, and not the six of a minute
     hours = T * np.arange(900)
     demands = {
         "demand": np.interp(hours, [2, 2.25], [3500, 1000]),

@@ -17,6 +17,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
+from fpirhc.plant.maps import over
 from fpirhc.report.series import chart_data
 
 T = 10.0  # s, one step
@@ -153,8 +154,8 @@ def test_the_order_is_counted_in_cycles(order: int) -> None:
     """In single steps it is the length of the chain; a cycle as long as the chain sees the input in one."""
     plant = chain(order)
     assert plant.face.orders == (order,)
-    assert plant.over(order * T).face.orders == (1,)
-    assert plant.over(T) is plant
+    assert over(plant, order * T).face.orders == (1,)
+    assert over(plant, T) is plant
 
 
 BAD: dict[str, tuple[Callable[[], object], str]] = {

@@ -13,6 +13,7 @@ from plants import chain, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported
+from fpirhc.plant.motion import places
 
 INERTIAS = {
     "a1": fp.Combination(lambda p: p.I1 + p.m1 * p.lc1**2 + p.Ie + p.me * (p.lce**2 + p.l1**2), "kg m^2"),
@@ -65,7 +66,7 @@ def test_regressor_is_the_inverse_dynamics(name, values):
 def test_split_with_the_actual_velocity_is_the_inverse_dynamics(name, values):
     """Y_s(q, q', q', q'') = Y(q, q', q''), and it is linear in v with slope C."""
     model, x, r, v, p, theta = drawn(values, name)
-    own = x[list(model.plant.indices(1))]
+    own = x[places(model.plant, 1)]
 
     def force(velocity):
         y, rest = model.split_function(x, velocity, r, p)

@@ -15,7 +15,9 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
+from fpirhc.plant.motion import places
 from fpirhc.plant.regressor import Combination, Regressor
+from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers
@@ -105,7 +107,7 @@ class SlotineLi(Controller):
     def _sliding_block(self, problem: Problem) -> Block:
         """Block (state, reference) -> (sliding rho, v, v'); v' is also 'desired' where nothing is deformed."""
         plant = problem.plant
-        at, moving = list(plant.indices(0)), list(plant.indices(1))
+        at, moving = places(plant, 0), places(plant, 1)
         seen = plant.output
         reads = (seen, like(seen, "reference"), plant.response_signal("_reference_response"))
         slope = plant.response_signal("_velocity_slope" if self._deforms else "desired")
@@ -174,7 +176,7 @@ class SlotineLi(Controller):
 def _rates(problem: Problem, name: str) -> Signal:
     """A signal with a velocity of every coordinate."""
     plant = problem.plant
-    return vector(name, plant.names, [plant.derivative_unit(plant.coordinates[c], 1) for c in plant.names])
+    return vector(name, plant.names, [derivative_unit(plant.coordinates[c], 1, plant.time_unit) for c in plant.names])
 
 
 EXAMPLES = (

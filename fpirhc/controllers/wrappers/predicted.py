@@ -38,7 +38,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
 from fpirhc.plant.chain import derivatives_function
-from fpirhc.plant.map_steps import one_step
+from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay

@@ -32,7 +32,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, Estimator, Seen, Wait
-from fpirhc.plant.map_steps import one_step
+from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import Differences, response_age
 from fpirhc.plant.output import Output
 from fpirhc.plant.plant import Parameter, Plant

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fpirhc.plant.motion import outside_names
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.question import ProblemQuestion
@@ -17,12 +18,12 @@ def stay_nominal(grid: ReviewGrid) -> Answer | None:
     """Return whether every signal from outside has its nominal value all the time; None without signals."""
     problem = grid.real if grid.real is not None else grid.problem
     plant = problem.real_plant
-    if not plant.signal_names:
+    if not outside_names(plant):
         return None
     times = np.linspace(0.0, problem.duration, len(grid.times))
     rows = rows_of(real_values(plant, problem.signals), times, plant.exact)
     facts, moves = [], False
-    for name in plant.signal_names:
+    for name in outside_names(plant):
         place = plant.parameter.elements.index(name)
         low, high, nominal = rows[:, place].min(), rows[:, place].max(), plant.parameters[name].exact
         moves |= max(abs(low - nominal), abs(high - nominal)) > _SAME * (1 + abs(nominal))
