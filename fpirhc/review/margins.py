@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
@@ -33,9 +34,10 @@ _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 _DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
 _STEPS = 60
+SLOWER = "Let it learn more slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
 
 
-def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: bool) -> Answer:
+def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: bool, learner: bool = False) -> Answer:
     """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is.
 
     Where plans are not made in every cycle they are those of all points.
@@ -45,6 +47,7 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         loops: linear loops of the controller.
         adapts: whether the controller has a deformation.
         planned: whether the controller is a plan, which has weights in place of a rate.
+        learner: whether its model changes in a run.
     """
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
@@ -54,7 +57,8 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         text += f"; no margins of a loop of {len(first.dynamics)} states"
         return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
     if radius >= 1:  # there is no margin to lose
-        return _outside(loops.radii, text, {"radius": radius}, learns=loops.learns)
+        change = SLOWER if learner else "See the rates, the zero dynamics, and the convergence of a deformation."
+        return replace(_outside(loops.radii, text, {"radius": radius}, learns=loops.learns), change=change)
     # Loops of plans are few, and differ more.
     places = range(len(loops.loops)) if len(first.cycles) > 1 else sorted({0, int(np.argmax(loops.radii))})
     sizes = [margins(loops.loops[k], i) for k in places for i in range(len(problem.plant.inputs))]
@@ -80,9 +84,7 @@ def _outside(radii: np.ndarray, text: str, numbers: dict[str, float], *, learns:
     on_circle = float(radii.max()) < 1 + NEUTRAL
     text += f"; a pole is {'on' if on_circle else 'outside'} the unit circle {where} the reference"
     verdict = Verdict.NO if smallest >= 1 + NEUTRAL and not learns else Verdict.UNKNOWN
-    return Answer(
-        QUESTION, verdict, text, "See the rates, the zero dynamics, and the convergence of a deformation.", numbers
-    )
+    return Answer(QUESTION, verdict, text, "", numbers)
 
 
 def _sizes(gain: float, phase: float, delay: float, problem: Problem) -> str:

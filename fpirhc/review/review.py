@@ -142,7 +142,7 @@ def _zero_dynamics(case: Case) -> Answer | None:
 
 def _margins(case: Case) -> Answer | None:
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
-    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned)
+    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
 
 
 def _more(case: Case) -> list[Answer]:

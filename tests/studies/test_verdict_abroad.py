@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import abroad
 import pytest
@@ -11,6 +12,7 @@ import fpirhc as fp
 from fpirhc.report.html import render
 from fpirhc.report.page import css_class
 from fpirhc.report.terminal import STYLES
+from fpirhc.review.margins import SLOWER
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.comparison.outcome import Outcome
@@ -110,6 +112,28 @@ def test_own_map_in_the_wrong_form_is_worse_and_the_right_form_is_named():
     assert any(text.startswith("RHC+FPI, increment is far better than this pair") for text in cart.verdict)
     assert cart.null is not None
     assert cart.null.harmful
+
+
+def test_a_filter_that_is_too_fast_for_a_wrong_model_is_named_by_review_and_verdict():
+    """Tanks of 2.3 times their area: three times the error of RHC, and a loop with a pole of 1.35; with a third of the drift a
+    seventeenth, and every pole inside.
+    """
+    task: Any = fp.load_problem("leaking_tanks")
+    area = replace(task.problem.plant.parameters["A"], approximate=2.3 * 1.54e-3)
+    plant = replace(task.problem.plant, parameters={**task.problem.plant.parameters, "A": area})
+    problem, fast = replace(task.problem, plant=plant), task.controllers["RHC offset-free"]
+    slow = replace(fast, estimator=replace(fast.estimator, drift={"h1": 3e-5, "h2": 3e-5}))
+    rows = {"RHC": task.controllers["RHC"], "fast": fast, "slow": slow}
+    comparison = compare(replace(task, problem=problem, controllers=rows, headline=None), seed=0, compiled=False)
+    [worse] = [text for text in comparison.verdict if "does worse" in text]
+    assert worse.startswith(
+        "fast does worse than RHC, whose model does not change (0.275): its relative error is 0.907 (3.3 times"
+    )
+    answers = fp.review(problem, {"fast": fast, "slow": slow}, mismatch=0.0, seed=0).controllers
+    margin = {name: next(a for a in group if "margin" in a.question) for name, group in answers.items()}
+    assert margin["fast"].numbers["radius"] == pytest.approx(1.35, abs=0.02)
+    assert margin["fast"].change == SLOWER
+    assert margin["slow"].numbers["radius"] < 1
 
 
 def test_an_exact_model_that_is_beaten_is_no_bound():

@@ -296,6 +296,21 @@ def test_an_exact_model_that_is_worse_is_no_bound():
     assert len(said(*pair, entry("exact", errors={"y": 0.0105}, facts=exact))) == 1
 
 
+def test_a_learner_that_does_worse_than_its_fixed_model_is_named():
+    """With a fifth less error, or the same, nothing is said."""
+    fixed: dict[str, Any] = {"facts": {"learns": True, "fixed": "RHC"}}
+    both = [entry("RHC"), entry("FPI", "RHC")]
+    assert said(*both, entry("RLS", errors={"y": 3.3}, **fixed))[1] == (
+        "RLS does worse than RHC, whose model does not change (1): its relative error is 3.3 (3.3 times more). Let it learn more "
+        "slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
+    )
+    assert (
+        " RHC, whose model does not change (1): it does not finish." in said(*both, entry("RLS", stop=STOP, **fixed))[1]
+    )
+    for errors in (1.0, 0.8):
+        assert len(said(*both, entry("RLS", errors={"y": errors}, **fixed))) == 1
+
+
 def test_unequal_rates_are_stated():
     """Where adaptation acts in every cycle and a learner at every plan; with a plan in every cycle there is nothing to say."""
     for every, count in ((10, 2), (1, 1)):

@@ -252,6 +252,7 @@ def _entry(
         weighed=weighed(problem, ready),
         exact=has_exact_model(problem, ready),
         learns=ready.learns,
+        fixed=_fixed(controllers, controller) if ready.learns else None,
         plan_every=every,
         information=informed,
         automatic=automatic(controller.deformation),
@@ -280,6 +281,12 @@ def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:
         return None
     plain = ((n, c) for n, c in controllers.items() if not c.deformation.adapts)
     return next((other for other, controller in plain if describe(controller) == wanted), None)
+
+
+def _fixed(controllers: Mapping[str, Controller], learner: Controller) -> str | None:
+    """The controller around which a learner is, with its fixed model."""
+    wanted = None if learner.inner is None else describe(learner.inner)
+    return next((name for name, one in controllers.items() if describe(one) == wanted), None)
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:

@@ -53,6 +53,7 @@ class Entry:
         weighed: judged coordinates that its cost weighs; None: all.
         exact: whether its model is exact where the others' is not, so that it should be a bound.
         learns: whether its model or its gains change during a run.
+        fixed: name of the same controller with a model that does not change, for one that learns, if there is one.
         plan_every: cycles from plan to plan; 1 for a controller that does not plan.
         price: its time per cycle beside that of its pair.
         no_bound: why it is no bound, for an exact model that an adapted controller beats.
@@ -75,6 +76,7 @@ class Entry:
     weighed: frozenset[str] | None = None
     exact: bool = False
     learns: bool = False
+    fixed: str | None = None
     plan_every: int = 1
     price: Price | None = None
     no_bound: tuple[str, ...] = ()

@@ -10,7 +10,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from fpirhc.studies.comparison.changes import HELPS, ROUNDING, times
+from fpirhc.review.margins import SLOWER
+from fpirhc.studies.comparison.changes import HELPS, HURTS, ROUNDING, times
 from fpirhc.studies.comparison.outcome import Finding
 
 if TYPE_CHECKING:
@@ -21,7 +22,12 @@ FAR = 2.0  # times a smaller error, from which another row is far better
 
 def remarks(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scales: Mapping[str, float]) -> list[Finding]:
     """Return the remarks about the first pair; none without a pair that finished."""
-    texts = [*_far_better(entries, pair, scales), *_no_bound(entries, scales), *_rates(entries)]
+    texts = [
+        *_worse_learners(entries, scales),
+        *_far_better(entries, pair, scales),
+        *_no_bound(entries, scales),
+        *_rates(entries),
+    ]
     return [Finding(text) for text in texts]
 
 
@@ -55,6 +61,24 @@ def _far_better(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scal
         f"{best.name} is far better than this pair: its relative error is {error[best.name]:.3g} ({both}), {times(ratio)} "
         f"smaller than that of {ahead.name}."
     ]
+
+
+def _worse_learners(entries: Sequence[Entry], scales: Mapping[str, float]) -> list[str]:
+    """A sentence for every learner that does worse than the same controller with its fixed model."""
+    by_name, sentences = {e.name: e for e in entries}, []
+    for one in entries:
+        fixed = by_name.get(one.fixed or "")
+        if fixed is None:
+            continue
+        error, before = (relative_error(e, scales, one.weighed) for e in (one, fixed))
+        if error <= HURTS * before or error < ROUNDING:
+            continue
+        much = f"{error:.3g} ({times(error / before)} more)" if before > 0 and math.isfinite(error) else "no number"
+        end = "it does not finish" if one.run.stop is not None else f"its relative error is {much}"
+        sentences.append(
+            f"{one.name} does worse than {fixed.name}, whose model does not change ({before:.3g}): {end}. {SLOWER}"
+        )
+    return sentences
 
 
 def beaten_by(exact: Entry, entries: Sequence[Entry], scales: Mapping[str, float]) -> str | None:
