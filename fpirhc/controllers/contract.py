@@ -29,6 +29,7 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.outside import External
@@ -289,6 +290,9 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     return controller.with_defaults(problem)
 
 
+_CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same controllers again and again
+
+
 def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
     """Return the resolved controller, checked against the problem.
 
@@ -305,8 +309,8 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
         NotSupported: a form of the deformation that cannot be used here; a
             response of the controller's own behind sensors or dead time.
     """
-    build = nominal(controller)
-    ready = _checked(nominal(problem), build, numbers_only)
+    task, build = nominal(problem), nominal(controller)
+    ready = _CHECKED.of((task, build), (numbers_only,), lambda: _checked(task, build, numbers_only))
     return ready if build is controller else controller
 
 
