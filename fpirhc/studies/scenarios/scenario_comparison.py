@@ -101,9 +101,9 @@ def _view(comparison: ScenarioComparison) -> View:
         title=comparison.title,
         about=comparison.description,
         sentences=tuple(zip_longest(comparison.verdict, outcomes)),
-        conditions=f"{conditions} {_MEANING}",
-        tables=(_controllers(comparison, f"{comparison.problem}: {conditions}"),),
-        lists={"Tuning": [f"{name}: {note}" for name, note in comparison.tuning.items()] or [_UNTUNED]},
+        conditions=f"{conditions} {_MEANING} {'' if comparison.tuning else _UNTUNED}",
+        tables=(_controllers(comparison, conditions),),
+        lists={"Tuning": [f"{name}: {note}" for name, note in comparison.tuning.items()]},
         skipped=comparison.skipped,
         settings=comparison.settings,
         versions=comparison.versions,
@@ -113,7 +113,7 @@ def _view(comparison: ScenarioComparison) -> View:
     )
 
 
-def _controllers(comparison: ScenarioComparison, title: str) -> Table:
+def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
     heads = (
         Column("controller"),
         Column("median error", "median"),
@@ -123,10 +123,10 @@ def _controllers(comparison: ScenarioComparison, title: str) -> Table:
         *(Column(f"median {c.short}", None) for c in comparison.columns),
         Column("worst"),
         Column("in scenario", None),
-        Column("failures"),
+        Column("failures", "failed"),
         Column("status", None, left=True),
     )
-    table = Table(title, heads)
+    table = Table(f"{comparison.problem}: {comparison.count} scenarios", heads, conditions)
     for one in comparison.summaries:
         beside = ["baseline", "", ""]
         if one.difference is not None:
