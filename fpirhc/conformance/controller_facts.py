@@ -133,6 +133,24 @@ def model_is_of_the_plant(trial: Trial, generator: np.random.Generator) -> None:
         )
 
 
+def notes_are_sentences(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """Its `notes` are sentences for a reader: a tuple of texts, none of them empty."""
+    notes = checked(trial.problem, trial.controller).notes(trial.problem)
+    texts = isinstance(notes, tuple) and all(isinstance(one, str) and one.strip() for one in notes)
+    hold(texts, f"its notes are {notes!r}")
+
+
+def own_response_fits(trial: Trial, generator: np.random.Generator) -> None:
+    """A `response` of its own is the signal 'realised', and its Function gives finite numbers for every entry."""
+    own, plant = checked(trial.problem, trial.controller).response(trial.problem), trial.problem.plant
+    if own is None:
+        return
+    state, command = trial.problem.start_state, generator.normal(size=plant.input.size)
+    numbers = np.asarray(own.function(state, command, plant.exact, np.zeros(len(plant.names))).full()).ravel()
+    fits = own.signal.name == "realised" and numbers.size == own.signal.size and bool(np.isfinite(numbers).all())
+    hold(fits, f"its response is '{own.signal.name}' with {own.signal.size} entries, at the start {numbers}")
+
+
 def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """Near the reference it feeds the error back with the gains of its `tracking` law, from which reviews read its speed."""
     ready, plant = checked(trial.problem, trial.controller), trial.problem.plant
@@ -222,6 +240,8 @@ FACTS = (
     learning_remembers,
     model_is_of_the_plant,
     law_is_what_it_does,
+    notes_are_sentences,
+    own_response_fits,
     outputs_are_controlled,
     maps_are_controlled,
 )

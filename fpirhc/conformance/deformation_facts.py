@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.conformance.laws import hold, keep
-from fpirhc.deformation.base import Deformation, Demand, automatic, with_inner
+from fpirhc.deformation.base import Deformation, Demand, automatic, innermost, with_inner
 from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
 
@@ -105,6 +105,36 @@ def inner_can_be_exchanged(trial: _Cycles, generator: np.random.Generator) -> No
     if deformation.inner is not None:
         same = with_inner(deformation, deformation.inner)
         hold(describe(same) == describe(deformation), f"around its own inner map it is {same}")
+
+
+def gain_is_proportional_to_its_field(trial: _Cycles, generator: np.random.Generator) -> None:
+    """The field that `gain_name` names is proportional to the effective gain: advice in units of one is advice in the other."""
+    gain, factor = trial.deformation.effective_gain(), float(generator.uniform(1.2, 1.9))
+    if gain == 0:
+        return
+    before = innermost(trial.deformation)
+    after = innermost(trial.deformation.with_effective_gain(factor * gain))
+    one, other = (getattr(own, own.gain_name, None) for own in (before, after))
+    told = (
+        isinstance(one, int | float)
+        and isinstance(other, int | float)
+        and abs(other - factor * one) <= _SAME * abs(one)
+    )
+    hold(told, f"with {factor:.3g} times its effective gain its '{before.gain_name}' is {other}, and was {one}")
+
+
+def exact_model_is_left_alone(trial: _Cycles, generator: np.random.Generator) -> None:
+    """With a `mirror` it is given the model's response, and where this is the plant's the request is the desired response."""
+    if trial.deformation.mirror is None:
+        return
+    memory = trial.layout.start()
+    for response, desired in generator.normal(size=(_WARM, 2)) * trial.amplitude:
+        request, memory = trial.function(response, response, desired, memory)
+        missed = abs(float(request) - desired)
+        hold(
+            missed <= 1e-9 * trial.amplitude,
+            f"given the model's response as the plant's, the request misses the desired one by {missed:.3g}",
+        )
 
 
 def shown_is_remembered(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -250,6 +280,8 @@ LAWS = (
     filter_and_pairing_are_told,
     reach_is_told,
     leak_is_told,
+    gain_is_proportional_to_its_field,
+    exact_model_is_left_alone,
     shown_is_remembered,
     held_keeps_the_memory,
 )

@@ -36,10 +36,6 @@ from fpirhc.task.outside import External
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
-if TYPE_CHECKING:
-    from fpirhc.controllers.slots.floquet import Floquet
-
-
 FORMER = {  # members of earlier versions
     "around": "hold the inner controller in a field",
     "check_numbers": "write `check`",
@@ -263,10 +259,6 @@ class Controller(Checked, ABC):
     def response(self, problem: Problem) -> Response | None:
         """Return the response that the controller reads as 'realised'; None: that of the plant's controlled coordinates."""
         return None if self.inner is None else self.inner.response(self.inner_problem(problem))
-
-    def floquet(self, problem: Problem) -> Floquet | None:
-        """Return the stability of one period of a controller that switches; None for a controller that does not switch."""
-        return None if self.inner is None else self.inner.floquet(self.inner_problem(problem))
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """Return sentences about the controller on this problem, for a reader of results."""

@@ -15,12 +15,14 @@ def schedule_stable(problem: Problem, controller: Controller) -> Answer | None:
 
     Gains of the wrong sign do not reach this question: the controller refuses them.
     """
+    while controller.inner is not None:
+        problem, controller = controller.inner_problem(problem), controller.inner
+    if not hasattr(controller, "floquet"):
+        return None
     try:
         floquet = controller.floquet(problem)
     except FpirhcError as error:
         return Answer(QUESTION, Verdict.UNKNOWN, str(error))
-    if floquet is None:
-        return None
     if floquet.radius is None:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {floquet.reason}", "Use a periodic schedule.")
     text = (

@@ -237,10 +237,6 @@ class Telling(Controller):
             Response(plant.response_signal("realised"), plant.controlled_response_function) if self.of_its_own else None
         )
 
-    def floquet(self, problem) -> Any:
-        """Anything."""
-        return problem.plant.approximate[0]
-
     def notes(self, problem):
         """Name the mass."""
         return (f"mass {problem.plant.approximate[0]}",)
@@ -279,8 +275,6 @@ def test_a_wrapper_tells_the_facts_of_what_it_wraps():
     assert outer.learns
     assert (outer.planner, dict(outer.feeds)) == (inner.planner, {"state": "predicted"})
     assert resolved(problem, outer) == fp.ExactModel(Telling(fp.Affine(2.0)))
-    stability: Any = outer.floquet(problem)
-    assert stability == 2.0
     assert outer.notes(problem) == ("mass 2.0",)
     assert outer.response(problem) is None
     assert fp.ExactModel(replace(inner, of_its_own=True)).response(problem) is not None
@@ -304,7 +298,7 @@ def test_a_controller_that_stands_alone_has_no_facts_of_others():
     assert (model.plant, model.exact, model.parameters(problem.plant).tolist()) == (problem.plant, False, [1.0, 8.0])
     assert Telling().plant_model(problem).parameters(problem.plant).tolist() == [2.0, 8.0]
     assert fp.ExactModel(Telling()).plant_model(problem).parameters(problem.plant).tolist() == [2.0, 4.0]
-    assert (alone.response(problem), alone.floquet(problem)) == (None, None)
+    assert alone.response(problem) is None
     assert alone.notes(problem) == ()
     assert alone.inner_problem(problem) is problem
     alone.check(problem)

@@ -20,7 +20,7 @@ from fpirhc.conformance import check_deformation
 from fpirhc.conformance.deformation_facts import check_deformation_facts
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, rename
 from fpirhc.controllers.contract import resolved, with_optimiser, without_deformation
-from fpirhc.deformation.base import Deformation, Iteration, Pairing, Reach, automatic
+from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Reach, automatic
 from fpirhc.deformation.wrappers.base import Wrapper
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.simulation.lyapunov_view import lyapunov_view
@@ -172,6 +172,14 @@ def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
         def held(self, request, memory):
             return {**super().held(request, memory), "filter_error": ca.vertcat(request, request)}
 
+    @dataclass(frozen=True)
+    class Inverse(fp.Sigmoid):
+        gain_name = "shift"
+
+    @dataclass(frozen=True)
+    class Blind(fp.Affine):
+        mirror = Mirror()
+
     inner = fp.Affine(gain=-1.0)
     liars = {
         Steady(inner): "constant map",
@@ -181,6 +189,8 @@ def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
         Narrow(offset=10.0, sign=-1, gain=0.05): "reach",
         Finished(gain=-0.5): "automatic settings",
         Stubborn(inner, pole=0.5): "inner can be exchanged",
+        Inverse(gain=-0.5, scale=5.0): "gain is proportional",
+        Blind(gain=-0.5): "exact model is left alone",
         Boasting(inner, pole=0.5): "shown is remembered",
         Confused(inner, pole=0.5): "held keeps the memory",
     }

@@ -11,10 +11,15 @@ from typing import Any
 
 import pytest
 from wrong import controllers, maps, observers, optimisers
-from wrong.tables import CONTROLLERS, MAPS, OBSERVERS, OPTIMISERS
+from wrong.tables import CONTROLLER_MEMBERS, CONTROLLERS, MAP_MEMBERS, MAPS, OBSERVERS, OPTIMISERS
 
 import fpirhc as fp
+from fpirhc.conformance import controller as controller_laws
+from fpirhc.conformance import deformation as deformation_laws
+from fpirhc.conformance import deformation_facts
 from fpirhc.conformance.loops import two_masses
+from fpirhc.controllers.contract import Controller
+from fpirhc.deformation.base import Deformation
 
 DEFORMATION = fp.Sigmoid(gain=-0.5)
 
@@ -67,6 +72,21 @@ def test_a_diverging_observer_is_caught():
         "wrong start is corrected",
         "does not converge",
     )
+
+
+@pytest.mark.parametrize(
+    ("contract", "table", "laws"),
+    [
+        (Controller, CONTROLLER_MEMBERS, controller_laws.LAWS),
+        (Deformation, MAP_MEMBERS, (*deformation_laws.LAWS, *deformation_facts.LAWS)),
+    ],
+    ids=["Controller", "Deformation"],
+)
+def test_every_member_of_a_contract_has_a_law(contract, table, laws):
+    """A fact that no law tests may be anything."""
+    own = {n for n in (*vars(contract), *contract.__annotations__) if not n.startswith("_")}
+    assert own == {*table}
+    assert {*table.values()} <= {law.__name__.replace("_", " ") for law in laws}
 
 
 def test_the_right_members_are_not_refused():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -118,6 +119,14 @@ def test_the_leak_follows_the_gain(deformation, paths):
     """The pole of a leaky pairing is chosen from the gain, or given: both may change in a run, and the pole with them."""
     controller = fp.ComputedTorque(TRACKING, deformation)
     tried = check_live(two_masses(), controller, paths=[f"deformation.{path}" for path in paths], cycles=40)
+    assert all(t.factor for t in tried), tried
+
+
+def test_the_switch_of_slots_may_be_live():
+    """How fast the offset of a switch decays, and which gain is too small to command with."""
+    task = fp.load_problem("mass_spring_slots")
+    problem = replace(task.problem, measure_from=0.0)
+    tried = check_live(problem, task.controllers["slots"], paths=["blend", "smallest_gain"], cycles=60)
     assert all(t.factor for t in tried), tried
 
 

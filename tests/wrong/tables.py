@@ -49,4 +49,36 @@ OBSERVERS = {
     observers.KnowsThePlant: ("exact parameters are unknown", "use evidence.parameters"),
     observers.ForgetsItsCorrection: ("wrong start is corrected", r"wrong by 0\.07 in the later|by 0\.07"),
 }
+CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
+    "blocks": "writes a command and a status",
+    "check": "outputs are controlled",
+    "deformation": "deformation acts",
+    "deforms": "desired response is deformed",
+    "feeds": "facts hold",
+    "inner": "facts hold",
+    "inner_problem": "same command everywhere",
+    "learns": "learning remembers",
+    "notes": "notes are sentences",
+    "plant_model": "model is of the plant",
+    "planner": "facts hold",
+    "response": "own response fits",
+    "with_defaults": "facts hold",
+    "with_deformation": "deformation acts",
+}
+MAP_MEMBERS = {
+    "adapts": "adaptation is told",
+    "effective_gain": "first step is effective gain",
+    "gain_name": "gain is proportional to its field",
+    "held": "held keeps the memory",
+    "inner": "inner can be exchanged",
+    "iteration": "filter and pairing are told",
+    "largest_step": "step is bounded",
+    "memory": "graphs agree",
+    "mirror": "exact model is left alone",
+    "secant_gain": "secant is bounded",
+    "shown": "shown is remembered",
+    "step": "fixed point stays",
+    "suited": "automatic settings are chosen",
+    "with_effective_gain": "gain can be set",
+}
 LOUD = "wrong start is corrected", "does not converge"  # a gain with which every correction is worse than the error

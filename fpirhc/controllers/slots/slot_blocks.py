@@ -13,7 +13,6 @@ Each slot has signals of its own (`Channel.signal`). All are computed in every c
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import casadi as ca
@@ -24,8 +23,10 @@ from fpirhc.controllers.own_reference import motion_of, own_signals, own_values,
 from fpirhc.controllers.slots.slot import Channel, First
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.status import Status
+from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
+from fpirhc.symbolic.functions import exp, signed
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
@@ -66,7 +67,7 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
         gain = chain.gain(s.state, others, s.parameters)
         measured = dict(zip(seen.elements, ca.vertsplit(getattr(s, seen.name)), strict=True))
         modelled = ca.vertsplit(chain.states(s.state, s.parameters))
-        good = ca.fabs(gain) >= smallest
+        good = ca.fabs(gain) >= live.expressed(smallest, gain)
         values = {
             "state": ca.vertcat(*(measured.get(e, own) for e, own in zip(elements, modelled, strict=True))),
             "target": nominal[: chain.order] if chain.order > 1 else nominal[0],
@@ -75,7 +76,7 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
             "gain": gain,
             "good": good,
             # Not zero, so that no slot that is not chosen divides by it.
-            "divisor": ca.if_else(good, gain, math.copysign(smallest, one.start_gain)),
+            "divisor": ca.if_else(good, gain, signed(smallest, one.start_gain)),
         }
         return {one.wire(name): value for name, value in values.items()}
 
@@ -118,7 +119,7 @@ def switch_block(channels: Sequence[Channel]) -> Block:
 
 def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blend: float, blank: int) -> Block:
     """Block that joins the slot's law to the plant's last motion: the desired response and the pair of the last cycle."""
-    decay = math.exp(-problem.period / blend) if blend > 0 else 0.0
+    decay = exp(-problem.period / blend) if live.nominal(blend) > 0 else 0.0
     place = problem.plant.input.elements.index(one.chain.input)
     names = ("law", "free", "gain", "active", "warm_up")
     request_before = _request_before(one)
