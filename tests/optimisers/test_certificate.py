@@ -38,12 +38,14 @@ def iterates(ocp, data, first, count):
     "name", [pytest.param(n, marks=pytest.mark.slow) if n == "chain_of_masses" else n for n in PROBLEMS]
 )
 def test_no_bound_is_below_the_true_error(name):
-    """On every iterate of every shipped problem: distance to the optimum, error of any input, and suboptimality."""
+    """On early and late iterates of every shipped problem: distance to the optimum, error of any input, and suboptimality."""
     from fpirhc.horizon.rollout import rollout
 
     ocp, data, first = first_horizon(name)
     counted = 0
-    for plan, best in iterates(ocp, data, first, 14):
+    for k, (plan, best) in enumerate(iterates(ocp, data, first, 14)):
+        if k not in {0, 1, 2, 3, 5, 8, 13}:
+            continue
         plan = replace(plan, states=rollout(ocp)(first, plan.inputs, data)[0].full())
         certificate = fp.certify(plan)
         if not np.isfinite(certificate.input_error):

@@ -294,6 +294,7 @@ def test_the_size_of_the_weights_changes_neither_plan_nor_status(factor, iterati
     assert other.cost == pytest.approx(factor * one.cost, rel=1e-8)
 
 
+BEST: dict[Any, fp.Plan] = {}  # of the problems with these costs
 COUPLED = {
     "rate": fp.Quadratic(states={"q1": 1e3, "q2": 1e3}, effort={"Q1": 1e-3}, rate={"Q1": 1e-3, "Q2": 1e-2}),
     "lqr": fp.Quadratic(states={"q1": 1e3, "q2": 1e3}, deviation={"Q1": 1e-3, "Q2": 1e-3}, terminal=fp.LQRTerminal()),
@@ -315,9 +316,10 @@ def test_costs_that_couple_states_and_inputs(optimiser, cost):
     data = stage_data(p.plant, p.reference, p.horizon, cost)(0.0, p.plant.approximate)
     first = np.concatenate([p.start_state, np.zeros(ocp.state.size - p.plant.state.size)])
     plan = fp.solve(ocp, optimiser, first, data)
-    best = fp.solve(ocp, fp.ReducedGradient(iterations=1000, tolerance=1e-6), first, data)
-    assert plan.status == best.status == fp.Status.OK
-    assert plan.cost == pytest.approx(best.cost, rel=1e-6)
+    if cost not in BEST:  # the same for all backends
+        BEST[cost] = fp.solve(ocp, fp.ReducedGradient(iterations=1000, tolerance=1e-6), first, data)
+    assert plan.status == BEST[cost].status == fp.Status.OK
+    assert plan.cost == pytest.approx(BEST[cost].cost, rel=1e-6)
 
 
 def broken(ocp, data, first):
