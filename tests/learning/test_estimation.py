@@ -371,7 +371,7 @@ TWO_TASK = fp.Problem(
             task(spring()),
             fp.DisturbanceKalman({"y": 1.0}, {"y'''": 1.0}),
             InvalidProblem,
-            "state or response.*Valid: y, y', y''",
+            "state, output or response.*Valid: y, y', y''",
         ),
     ],
 )

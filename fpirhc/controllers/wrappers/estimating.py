@@ -26,11 +26,13 @@ from fpirhc.plant.maps import response_age
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.gap import GAP
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 
 _BELIEVED = "_believed"
+_MODELLED: Latest[Problem] = Latest(8)
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,9 @@ class Estimating(Controller):
 
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the estimator's model of the plant."""
+        return _MODELLED.of((self.estimator, problem), (), lambda: self._modelled(problem))
+
+    def _modelled(self, problem: Problem) -> Problem:
         model = self.estimator.model(problem.plant)
         return problem if model is problem.plant else replace(problem, plant=model)
 

@@ -39,11 +39,13 @@ from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import quantities, response_names
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.following import Following, following
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
 from fpirhc.symbolic.live import live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
 _STALE = "the filter stays stable, and keeps the bandwidth of the old deviations"
+_GAINS: Latest[np.ndarray] = Latest(8)
 _SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as undamped
 
 
@@ -124,6 +126,9 @@ class DisturbanceKalman(Estimator):
         Raises:
             NotSupported: the Riccati equation has no stabilising solution.
         """
+        return _GAINS.of((self, problem), (), lambda: self._gain(problem)).copy()
+
+    def _gain(self, problem: Problem) -> np.ndarray:
         import scipy.linalg
 
         a, noise_input, c = self._matrices(problem)
