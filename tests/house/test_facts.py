@@ -422,14 +422,13 @@ GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/
 # Values that generic code builds for itself; it asks nobody whether he is one.
 BUILDS = {
     "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map
-    "review/linear.py": {"RungeKutta4", "Step"},  # of the linear problem
     "review/forms.py": {"Increment", "ModelReferenced"},  # the forms that are compared
     "review/prediction.py": {"Identity"},  # no adaptation
     "review/suggest.py": {"Filtered"},  # the suggested deformation
     "simulation/linearise/asked_loop.py": {"Jump"},  # the entry of signals at the inputs
     "studies/comparison/left_alone.py": {"Identity"},  # no controller: nothing is adapted
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
-    "task/map_task.py": {"MapSteps", "StepDifference"},  # what a map has in place of an integrator and of its response
+    "task/checks.py": {"MapSteps", "StepDifference"},  # what a map has in place of an integrator and of its response
 }
 
 
