@@ -18,7 +18,6 @@ from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
-from scipy.optimize import brentq
 
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.loops import Loops
@@ -124,7 +123,13 @@ def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
 def _roots(function: Callable[[float], float], at: np.ndarray, values: np.ndarray) -> list[float]:
     """Arguments at which a function is zero, one between each pair of neighbours of different signs."""
     changes = np.flatnonzero(np.sign(values[1:]) * np.sign(values[:-1]) < 0)
-    return [float(brentq(function, at[k], at[k + 1], rtol=1e-9)) for k in changes]
+    return [_root(function, at[k], at[k + 1], 1e-9) for k in changes]
+
+
+def _root(function: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
+    from scipy.optimize import brentq  # it takes longer to import than a problem to load
+
+    return float(brentq(function, low, high, rtol=tolerance))
 
 
 def _response(loop: LinearLoop, place: int) -> Callable[[float], complex]:
@@ -177,4 +182,4 @@ def _first(poles: Callable[[float], np.ndarray], most: float) -> float:
     beyond = next((k for k, x in enumerate(steps) if outside(float(x)) >= 0), None)
     if beyond is None:
         return math.inf
-    return float(brentq(outside, steps[beyond - 1], steps[beyond], rtol=1e-6)) if beyond else 0.0
+    return _root(outside, steps[beyond - 1], steps[beyond], 1e-6) if beyond else 0.0

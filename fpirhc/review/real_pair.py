@@ -14,7 +14,6 @@ from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
@@ -155,8 +154,9 @@ def _settling(problem: Problem, free: list[int]) -> Settling:
 
 def _beyond(every: np.ndarray, settled: np.ndarray) -> np.ndarray:
     """The poles that remain when each of the settled plant's has been paired with its nearest one."""
-    distances = np.abs(every[:, None] - settled[None, :])
-    paired, _ = linear_sum_assignment(distances)
+    from scipy.optimize import linear_sum_assignment  # it takes longer to import than a problem to load
+
+    paired, _ = linear_sum_assignment(np.abs(every[:, None] - settled[None, :]))
     rest = np.delete(every, paired)
     return rest[np.abs(rest) > _MOVES * max(1.0, float(np.abs(every).max(initial=0.0)))]
 
