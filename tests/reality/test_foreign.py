@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_reality import CONTROLLERS, SENSING, TAU, lagged, run, task
+from test_reality import CONTROLLERS, PAIRS, SENSING, TAU, lagged, run, task
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
@@ -93,8 +93,7 @@ def outside(problem: fp.Problem, **settings) -> fp.Problem:
     return replace(problem, reality=fp.Foreign(Wrapped(problem), measures=MEASURES, **settings))
 
 
-@pytest.mark.parametrize("sensing", ["ideal", "estimated", "noisy"])
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize(("controller", "sensing"), [pair for pair in PAIRS if pair[1] != "late"])
 def test_wrapped_plant_runs_as_the_plant_itself(controller, sensing):
     """Every signal that both runs have agrees, also behind an estimator and noisy sensors."""
     problem = task(**SENSING[sensing], disturbances={"u": fp.Sine(1.0, 2.0)})
