@@ -8,6 +8,7 @@ import numpy as np
 from fpirhc.contraction.gains import predicted_factor
 from fpirhc.contraction.spectrum import Array
 from fpirhc.errors import InvalidShape
+from fpirhc.plant.motion import controlled_places
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
@@ -102,7 +103,7 @@ def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tu
     states, entries = [after], []
     for _ in range(1, max(face.orders)):
         states.append(advance(states[-1], *held))
-    for name, k in zip(model.controlled_names, face.controlled_indices, strict=True):
+    for name, k in zip(model.controlled_names, controlled_places(face), strict=True):
         outputs = outputs_of(states[face.orders[k] - 1], *held)
         entries.append(outputs[face.state.elements.index(name)] / model.sampling ** face.orders[k])
     return ca.vertcat(*entries)

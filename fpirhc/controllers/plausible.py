@@ -34,6 +34,7 @@ from fpirhc.controllers.largest_response import response_scale
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.controllers.seeing import given_states, raw_signal
 from fpirhc.errors import Mistakes
+from fpirhc.plant.motion import controlled_places
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.limits import Interval
@@ -68,7 +69,7 @@ def _automatic(problem: Problem) -> Mapping[str, Interval]:
     """Intervals by the name of the measured quantity."""
     plant, ranges = problem.plant.face, _behind_outputs(problem)
     responses, values = _largest_responses(problem), _values(problem)
-    for k in plant.controlled_indices:
+    for k in controlled_places(plant):
         name, order = plant.names[k], plant.orders[k]
         middle, reach = _about(values[name])
         limit = responses[plant.controlled_names.index(name)]

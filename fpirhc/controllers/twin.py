@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.mirror_path import MEASURED, MEASURED_OUTPUT, Path, measured_output
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names, values_of
 from fpirhc.symbolic.block import Block, unseen
@@ -36,7 +37,7 @@ def twin_block(path: Path) -> Block:
     estimate = problem.sensing.estimator.block(plant, problem.period, start, Signal("_seen", names))
     own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
     twin = Signal("mirror_state", plant.state.elements, plant.state.units, tuple(map(float, start)))
-    seen, controlled = _seen(problem, names, response_names(plant)), list(plant.controlled_indices)
+    seen, controlled = _seen(problem, names, response_names(plant)), controlled_places(plant)
     resting = np.asarray(seen(start, problem.inputs_before, plant.approximate, 0).full()).ravel()
     late = (Signal("mirror_sample", names, start=tuple(map(float, resting))),) if path.fraction else ()
     advance, moves, past = (
@@ -81,7 +82,7 @@ class _Deformations:
         self._plant, self._names = plant, plant.controlled_names
         self._acting = path.queue
         estimator, period = path.problem.sensing.estimator, path.problem.period
-        every_weight = [estimator.weights(plant.orders[k], period) for k in plant.controlled_indices]
+        every_weight = [estimator.weights(plant.orders[k], period) for k in controlled_places(plant)]
         self._weights = [np.convolve(w, [1 - path.fraction, path.fraction]) for w in every_weight]
         self._length = max(max(w.size for w in self._weights) - 1, 1) + self._acting.length - 1
 
@@ -98,7 +99,7 @@ class _Deformations:
             total(v * late[j][k] for j, v in enumerate(weights) if v != 0) for k, weights in enumerate(self._weights)
         ]
         forcing: list[Expression] = [expression(0.0)] * len(self._plant.names)
-        for place, value in zip(self._plant.controlled_indices, ca.vertsplit(late[0]), strict=True):
+        for place, value in zip(controlled_places(self._plant), ca.vertsplit(late[0]), strict=True):
             forcing[place] = value
         remembered = {"mirror_deformations_next": column[: size * self._length]}
         return ca.vertcat(*forcing), ca.vertcat(*answered), remembered

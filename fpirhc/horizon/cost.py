@@ -195,14 +195,16 @@ class Quadratic(Cost):
 
     def _check_kind(self, plant: Plant, mistakes: Mistakes) -> None:
         """Add a mistake where weights of errors are not those of what has a reference."""
-        if self.outputs and not plant.outputs:
-            mistakes.add("outputs: the plant has no outputs; weigh its states, Quadratic(states=...)")
-        if plant.outputs and self.states:
+        if self.outputs and self.states:
+            mistakes.add(
+                "states and outputs: both weigh errors of what has a reference; give all weights in one of them"
+            )
+        if any(n in plant.state.elements and n not in plant.output.elements for n in self.states):
             mistakes.add(
                 f"states: the states of a plant with outputs have no reference; weigh {', '.join(plant.output.elements)}, "
                 "Quadratic(outputs=...), or write a CustomCost"
             )
-        if plant.outputs and isinstance(self.terminal, Terminal):
+        if plant.output.elements != plant.state.elements and isinstance(self.terminal, Terminal):
             mistakes.add(
                 f"terminal: {type(self.terminal).__name__} weighs the whole state, which has no reference on a plant with outputs; "
                 "give weights by the name of an output"

@@ -219,7 +219,7 @@ def _reach(limits: Limits, plant: Plant) -> ca.DM:
 def _check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
     mistakes = Mistakes("horizon")
     mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
-    if plant.outputs and horizon.terminal:
+    if plant.output.elements != plant.state.elements and horizon.terminal:
         mistakes.add(
             "terminal: the states of a plant with outputs have no reference to meet; leave it out, or weigh the end"
         )

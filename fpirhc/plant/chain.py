@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 
 from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression
-from fpirhc.plant.motion import outside_names
+from fpirhc.plant.motion import controlled_places, outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.symbolic.layout import Expression
@@ -80,10 +80,10 @@ def nominal_responses(
     """
     face, instant = plant.face, [name for name, order in plant.response_orders.items() if not order]
     if not instant:
-        return responses[list(face.controlled_indices)]
+        return responses[controlled_places(face)]
     ahead = outputs if later is None else later()
     places = [plant.output.elements.index(name) if name in instant else -1 for name in plant.controlled_names]
-    entries = (responses[k] if at < 0 else ahead[at] for k, at in zip(face.controlled_indices, places, strict=True))
+    entries = (responses[k] if at < 0 else ahead[at] for k, at in zip(controlled_places(face), places, strict=True))
     return ca.vertcat(*entries)
 
 

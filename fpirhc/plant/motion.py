@@ -19,7 +19,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotInvertible, NotSupported
+from fpirhc.errors import NotInvertible
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
 from fpirhc.fields.user_code import called, scalar_expression
@@ -107,19 +107,6 @@ class Motion(Checked):
                 f"controlled ones, as many as there are inputs: Plant(..., controlled=({names[0]!r},))"
             )
         return names
-
-    @cached_property
-    def controlled_indices(self) -> tuple[int, ...]:
-        """Places of the controlled coordinates among all coordinates.
-
-        Raises:
-            NotSupported: the controlled quantities are outputs; those of a face are coordinates.
-        """
-        if self.outputs:
-            raise NotSupported(
-                f"{', '.join(self.controlled_names)} are outputs of the plant and no coordinates, which this part does not cover"
-            )
-        return tuple(self.names.index(c) for c in self.controlled_names)
 
     @cached_property
     def time(self) -> Signal:
@@ -238,9 +225,19 @@ def words(motion: Motion) -> tuple[str, str]:
     return ("state", "rates") if motion.outputs and set(motion.orders) == {1} else ("coordinate", "response")
 
 
+def followed(motion: Motion) -> str:
+    """What a quantity is called that follows a reference: "output" or "coordinate"."""
+    return "output" if motion.outputs else "coordinate"
+
+
 def outside_names(motion: Motion) -> tuple[str, ...]:
     """Return the names of the parameters that are signals from outside."""
     return tuple(name for name, one in motion.parameters.items() if one.outside)
+
+
+def controlled_places(motion: Motion) -> list[int]:
+    """Return the places of the controlled coordinates among all coordinates; of outputs those of the face."""
+    return [motion.names.index(c) for c in motion.controlled_names]
 
 
 def places(motion: Motion, derivative: int) -> list[int]:

@@ -34,7 +34,7 @@ from fpirhc.plant.lie_derivatives import (
     structural_order,
 )
 from fpirhc.plant.maps import Differences, check_map
-from fpirhc.plant.motion import Motion
+from fpirhc.plant.motion import Motion, controlled_places
 from fpirhc.plant.output import Output
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
@@ -271,7 +271,7 @@ class Plant(Motion):
             entries = (chain[-1] + believed_disturbance(self, name, p) for name, chain in chains.items())
             responses = ca.densify(ca.vertcat(*entries))
         else:
-            responses = self.response_function(x, u, p)[list(self.controlled_indices)]
+            responses = self.response_function(x, u, p)[controlled_places(self)]
         return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
 
     @cached_property

@@ -13,7 +13,7 @@ from fpirhc.fields.user_code import called, named_results, place_of, scalar_expr
 from fpirhc.plant.algebraic_check import check_algebraic
 from fpirhc.plant.inverse import inverse_by_user
 from fpirhc.plant.lie_derivatives import structural_order
-from fpirhc.plant.motion import Motion, arguments_of, words
+from fpirhc.plant.motion import Motion, arguments_of, controlled_places, words
 from fpirhc.symbolic.layout import Expression
 
 HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mistyped 10**9 would fill the memory
@@ -156,7 +156,7 @@ def _check_inverse(plant: Motion, inverse: Callable[..., Mapping[str, Expression
 def _check_orders(plant: Motion, mistakes: Mistakes) -> None:
     if plant.outputs or (plant.controlled is None and len(plant.inputs) != len(plant.coordinates)):
         return  # orders of outputs are found, not stated
-    for k in plant.controlled_indices:
+    for k in controlled_places(plant):
         name, stated = plant.names[k], plant.orders[k]
         order = structural_order(plant, name)
         if order is None:

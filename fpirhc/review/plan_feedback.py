@@ -28,6 +28,7 @@ from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stag
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
@@ -194,7 +195,7 @@ def plan_gains(
     horizon = replace(horizon, terminal=(), margins={})
     ocp = transcribe(plant, problem.reference, horizon, cost, Limits())
     data_of = stage_data(plant, problem.reference, horizon, cost)
-    function, controlled = problem.reference.function(plant), list(plant.controlled_indices)
+    function, controlled = problem.reference.function(plant), controlled_places(plant)
     stages = linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp)
     nx, nu = plant.state.size, plant.input.size
     gains = []

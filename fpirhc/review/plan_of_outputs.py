@@ -33,6 +33,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.review.plan_feedback import PlanGain, PlanStart, plan_gains
 from fpirhc.task.limits import Limits
@@ -87,7 +88,7 @@ def output_plan_gains(
         shifted_reference(plant, ocp.data, ocp.stages + 1),
     )
     sweep = (linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp), *_slopes_by_data(ocp))
-    reference, controlled = problem.reference.function(plant), list(plant.face.controlled_indices)
+    reference, controlled = problem.reference.function(plant), controlled_places(plant.face)
     start_at = _starts(plant) if consistent else None
     gains = []
     for time, state in zip(times, states, strict=True):

@@ -12,6 +12,7 @@ import numpy as np
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.chain import derivatives_function
+from fpirhc.plant.motion import controlled_places
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.state_slopes import state_slopes
@@ -61,7 +62,7 @@ def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
     states = grid.states_at(times).T
     responses = np.asarray(problem.reference.function(plant).map(_POINTS)(times[None, :])[1].full())
     exact, model = (np.repeat(p[:, None], _POINTS, axis=1) for p in (plant.exact, believed))
-    commands = plant.inverse_function.map(_POINTS)(states, responses[list(plant.face.controlled_indices)], exact)
+    commands = plant.inverse_function.map(_POINTS)(states, responses[controlled_places(plant.face)], exact)
     requests = np.asarray(plant.controlled_response_function.map(_POINTS)(states, commands, model).full())
     speeds = np.linalg.norm(np.diff(requests, axis=1), axis=0) / (times[1] - times[0])
     return float(speeds[np.isfinite(speeds)].max(initial=0.0))

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import (
     Array,
@@ -91,7 +92,7 @@ class _Finite(DerivativeEstimator):
                 known |= {name + "'" * d: combine(row[d], samples) for d in range(plant.orders[k])}
                 responses.append(combine(row[-1], samples))
             state = ca.vertcat(*(known[e] for e in plant.state.elements))
-            realised = ca.vertcat(*(responses[k] for k in plant.controlled_indices))
+            realised = ca.vertcat(*(responses[k] for k in controlled_places(plant)))
             return {"state": state, "realised": realised, "estimate_past_next": ca.vertcat(*past_next)}
 
         reads, writes, memory = (

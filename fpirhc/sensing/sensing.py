@@ -24,6 +24,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, quantities, response_names
 from fpirhc.sensing.belief import Belief
@@ -172,17 +173,17 @@ class Sensing(Checked):
 
     def delay(self, plant: Plant, period: float) -> float:
         """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""
-        return max(self.estimator.delay(plant.orders[k], period) for k in plant.controlled_indices)
+        return max(self.estimator.delay(plant.orders[k], period) for k in controlled_places(plant))
 
     def warm_up_cycles(self, plant: Plant, late: float) -> float:
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""
         if self.estimator.measures_all:
             return 1
-        return ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
+        return ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in controlled_places(plant))
 
     def settling_cycles(self, plant: Plant, period: float) -> int:
         """Number of further cycles after a long gap until estimates are those of later samples alone."""
-        return max((self.estimator.settles(plant.orders[k], period) for k in plant.controlled_indices), default=0)
+        return max((self.estimator.settles(plant.orders[k], period) for k in controlled_places(plant)), default=0)
 
     @property
     def drawn(self) -> tuple[Signal, ...]:

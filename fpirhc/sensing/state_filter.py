@@ -18,6 +18,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, known_by_positions, spline_weights
 from fpirhc.symbolic.block import Block
@@ -119,7 +120,7 @@ class StateVariableFilter(DerivativeEstimator):
                 responses.append(self._derivative(chain, order, order))
             return {
                 "state": ca.vertcat(*(known[e] for e in plant.state.elements)),
-                "realised": ca.vertcat(*(responses[k] for k in plant.controlled_indices)),
+                "realised": ca.vertcat(*(responses[k] for k in controlled_places(plant))),
                 **_remembered(chains, memory),
                 **{f"{m.name}_next": expression(ca.DM.zeros(m.size)) for m in powers},
             }

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator
 from fpirhc.symbolic.block import Block
@@ -116,7 +117,7 @@ class LowPassDifference(DerivativeEstimator):
 
 
 def _highest(plant: Plant) -> tuple[str, ...]:
-    return tuple(plant.names[k] + "'" * (plant.orders[k] - 1) for k in plant.controlled_indices)
+    return tuple(plant.names[k] + "'" * (plant.orders[k] - 1) for k in controlled_places(plant))
 
 
 def _difference_block(

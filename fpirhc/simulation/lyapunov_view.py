@@ -28,6 +28,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.fields.checked import checked_call
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.units import derivative_unit, with_space
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
@@ -118,7 +119,7 @@ def _unit(problem: Problem) -> str:
 def _feedbacks(problem: Problem, controller: Controller) -> list[Feedback]:
     """The law's feedback for every controlled coordinate; empty without a law, and for a law without constant gains."""
     law, plant = tracking_law(controller), problem.plant.face
-    feedbacks = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law is not None else []
+    feedbacks = [law.feedback(plant.orders[k]) for k in controlled_places(plant)] if law is not None else []
     return [one for one in feedbacks if one is not None] if None not in feedbacks else []
 
 
@@ -127,7 +128,7 @@ def _signals(problem: Problem, laws: Sequence[Feedback], rate: float, run: Run) 
     plant, seen = problem.plant.face, problem.plant.output.name
     errors, feedback = run["reference"] - run[seen], run["desired"] - run["nominal"]
     surface = []
-    for k, (index, law) in enumerate(zip(plant.controlled_indices, laws, strict=True)):
+    for k, (index, law) in enumerate(zip(controlled_places(plant), laws, strict=True)):
         name, order, degree = plant.names[index], plant.orders[index], len(law.gains) - 1
         chain = [errors[:, plant.state.elements.index(name + "'" * s)] for s in range(order)]
         rising = chain if law.integral else chain[1:]

@@ -123,10 +123,7 @@ class FilterBank:
     def _chains(self, z: Sequence[Expression], held: Expression, rate: _Entry) -> list[Expression]:
         """(y, y', ..., y^(m)) of every coordinate; of a map the divided differences."""
         orders = enumerate(self.orders.values())
-        if self.plant.step is not None:
-            step = self.plant.sampling
-            return [ca.vertcat(*differences(rate, step, z[k], held[k], order)) for k, order in orders]
-        return [ca.vertcat(z[k], highest(rate, z[k], held[k], order)) for k, order in orders]
+        return [chain_of(self.plant, rate, z[k], held[k], order) for k, order in orders]
 
 
 def arranged(plant: Plant, chains: Sequence[Expression]) -> tuple[Expression, Expression]:
@@ -157,6 +154,13 @@ def _after_motion(phi: Sequence[Sequence[_Entry]], z: Expression, held: Expressi
     # At rest every difference is exactly zero, and so z stays exactly where it is.
     rows = [sum(entry * a for entry, a in zip(row, apart, strict=True)) for row in phi]
     return ca.vertcat(held + rows[0], *rows[1:])
+
+
+def chain_of(plant: Plant, rate: _Entry, z: Expression, held: Expression, order: int) -> Expression:
+    """Return (y, y', ..., y^(m)) of a filter in the state z, for w = `held`; of a map the divided differences."""
+    if plant.step is not None:
+        return ca.vertcat(*differences(rate, plant.sampling, z, held, order))
+    return ca.vertcat(z, highest(rate, z, held, order))
 
 
 def highest(rate: _Entry, z: Expression, held: Expression, order: int) -> Expression:

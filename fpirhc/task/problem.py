@@ -20,7 +20,7 @@ from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of
-from fpirhc.plant.motion import words
+from fpirhc.plant.motion import followed, words
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.units import derivative_unit
 from fpirhc.sensing.sensing import Sensing
@@ -106,9 +106,7 @@ class Problem(Checked):
         _check_start(self, mistakes)
         plant = self.plant
         _check_input_before(self, mistakes)
-        mistakes.unknown(
-            "judged: output" if plant.outputs else "judged: coordinate", self.judged or (), plant.face.coordinates
-        )
+        mistakes.unknown(f"judged: {followed(plant)}", self.judged or (), plant.face.coordinates)
         disturbed = [*plant.inputs, *(() if self.foreign else (*self.real_plant.coordinates, *plant.outputs))]
         what = "input, coordinate or output" if plant.outputs else "input or coordinate"
         mistakes.unknown(f"disturbances: {what}", self.disturbances, disturbed)

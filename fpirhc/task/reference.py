@@ -22,6 +22,7 @@ import numpy as np
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, named_results, scalar_expression
+from fpirhc.plant.motion import followed
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import kind
@@ -51,7 +52,7 @@ class Reference(Checked, ABC):
         Raises:
             InvalidProblem: a coordinate is missing, unknown, or not a scalar.
         """
-        matrix, what, plant = kind(self.opaque), "output" if plant.outputs else "coordinate", plant.face
+        matrix, what, plant = kind(self.opaque), followed(plant), plant.face
         t = matrix.sym("t")
         motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
         _check(plant, motion, what)

@@ -18,12 +18,13 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.kinds import Count, Positive
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
-from fpirhc.task.filter_bank import FILTER, FilterBank, arranged, differences, highest, transition
+from fpirhc.task.filter_bank import FILTER, FilterBank, arranged, chain_of, transition
 from fpirhc.task.reference import Reference, Steps
 from fpirhc.task.steps import pairs
 
@@ -153,7 +154,7 @@ class Setpoint(Reference):
     def largest_jump(self, plant: Plant) -> float:
         """Largest jump of the controlled responses at a change of `values`; zero where the filter's order is above the plant's."""
         jumps: dict[float, list[float]] = {}
-        for k in plant.controlled_indices:
+        for k in controlled_places(plant):
             name, order = plant.names[k], plant.orders[k]
             if self._orders(plant)[name] == order:
                 for time, change in self._changes(name):
@@ -163,9 +164,7 @@ class Setpoint(Reference):
     def _jump(self, plant: Plant, order: int) -> float:
         """Jump of the response at a set-point that changes by one."""
         rate = nominal(self.rate)
-        if plant.step is None:
-            return float(rate**order)
-        return float(ca.evalf(differences(rate, plant.sampling, ca.SX.zeros(order), ca.SX(1.0), order)[-1]))
+        return float(ca.evalf(chain_of(plant, rate, ca.SX.zeros(order), ca.SX(1.0), order))[-1])
 
     def _bank(self, plant: Plant, stages: int) -> FilterBank:
         return FilterBank(plant, self._orders(plant), self.rate, stages + 1 if self.announced else 1)
@@ -193,9 +192,7 @@ class Setpoint(Reference):
             z = [entry + change * ((1.0 if k == 0 else 0.0) - phi[k][0]) for k, entry in enumerate(z)]
             held = held + change * (t >= time * (1 - _ON_TIME))
         column = ca.vertcat(*z)
-        if plant.step is not None:
-            return ca.vertcat(*differences(rate, plant.sampling, column, held, order))
-        return ca.vertcat(column, highest(rate, column, held, order))
+        return chain_of(plant, rate, column, held, order)
 
     def _check_names(self, plant: Plant) -> None:
         mistakes = Mistakes("reference")

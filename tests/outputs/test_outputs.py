@@ -345,7 +345,10 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "reference": (lambda: replace(squared(lambda t: 1 + 0 * t), reference=fp.Trajectory(lambda t: {"yy": t})), "mean 'y'"),
     "judged": (lambda: squared(lambda t: 1 + 0 * t, judged=("z",)), "judged: output 'z' is unknown"),
     "states in the cost": (lambda: squared(lambda t: 1 + 0 * t, cost=fp.Quadratic(states={"a": 1.0})), "have no reference"),
-    "outputs in the cost": (lambda: replace(SHORT, cost=fp.Quadratic(outputs={"q1": 1.0})), "the plant has no outputs"),
+    "both in the cost": (
+        lambda: replace(SHORT, cost=fp.Quadratic(states={"q1": 1.0}, outputs={"q2": 1.0})),
+        "states and outputs: both weigh errors",
+    ),
     "reality": (lambda: replace(squared(lambda t: 1 + 0 * t), reality=fp.Reality(double({}))), "it has no output 'y'"),
 }  # fmt: skip
 

@@ -41,6 +41,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
+from fpirhc.plant.motion import controlled_places
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
@@ -124,7 +125,7 @@ class ResolvedAccelerationRate(Controller):
 def _nominal_block(problem: Problem) -> Block:
     """Block time -> nominal response now and one cycle later."""
     plant, function = problem.plant, motion_of(problem, ahead=problem.period)
-    controlled = list(plant.face.controlled_indices)
+    controlled = controlled_places(plant.face)
 
     def step(s: Signals) -> dict[str, Expression]:
         later = function(s.time, *own_values(problem, s))[1][controlled]
@@ -143,7 +144,7 @@ def _increment_block(problem: Problem) -> Block:
     response = plant.controlled_response_function(x, u, p)
     highest = plant.response_function(x, u, p)
     # The measured responses move the state; the model's response does where nothing is measured, and where outputs are.
-    for k, index in enumerate(() if plant.outputs else plant.controlled_indices):
+    for k, index in enumerate(() if plant.outputs else controlled_places(plant)):
         highest[index] = measured[k]
     rates = []
     for element in plant.state.elements:

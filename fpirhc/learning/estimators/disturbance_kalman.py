@@ -34,6 +34,7 @@ from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, Estimator, Seen, Wait
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import Differences, response_age
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.output import Output
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import quantities, response_names
@@ -325,7 +326,7 @@ def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
     state = ca.DM([value if place < 0 else float(seen[place]) for value, place in known])
     if plant.controlled is None and len(plant.inputs) != len(plant.face.names):
         return state, ca.DM.zeros(len(plant.inputs)), plant.approximate
-    needed = plant.inverse_function(state, response[list(plant.face.controlled_indices)], plant.approximate)
+    needed = plant.inverse_function(state, response[controlled_places(plant.face)], plant.approximate)
     return state, needed, plant.approximate
 
 
@@ -348,7 +349,7 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
     mistakes = Mistakes("disturbed")
     responses = dict(zip(response_names(plant.face), plant.controlled_names, strict=True)) if plant.outputs else {}
     what = "coordinate, output or response of an output" if plant.outputs else "coordinate"
-    mistakes.unknown(what, names, [*plant.names, *plant.outputs, *responses])
+    mistakes.unknown(what, names, [*plant.names, *plant.face.names, *responses])
     if not names:
         mistakes.add("name at least one coordinate whose response is disturbed")
     for name in (_disturbance_name(c) for c in names):
@@ -356,9 +357,7 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
             mistakes.add(f"the plant has a parameter '{name}' already; rename it")
     mistakes.raise_if_any()
     coordinates = [n for n in names if n in plant.coordinates]
-    units = {n: one.unit for n, one in plant.outputs.items()} | dict(
-        zip(plant.names, plant.response_units, strict=True)
-    )
+    units = dict(plant.face.coordinates) | dict(zip(plant.names, plant.response_units, strict=True))
     if responses:
         units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
     added = {_disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}

@@ -14,6 +14,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.plant.motion import controlled_places
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, each
 from fpirhc.review.question import ProblemQuestion
@@ -89,9 +90,7 @@ def _commands_before(grid: ReviewGrid) -> np.ndarray:
     earlier = np.maximum(grid.times - problem.horizon.step, 0.0)
     responses = np.asarray(problem.reference.function(plant).map(len(earlier))(earlier[None, :])[1].full())
     exact = np.tile(plant.exact, (len(earlier), 1))
-    return each(
-        plant.inverse_function, grid.states_at(earlier), responses[list(plant.face.controlled_indices)].T, exact
-    )
+    return each(plant.inverse_function, grid.states_at(earlier), responses[controlled_places(plant.face)].T, exact)
 
 
 QUESTION = ProblemQuestion(ask=reference_keeps_limits, order=30)
