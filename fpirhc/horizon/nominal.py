@@ -46,8 +46,9 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
     hidden = [e for e, place in zip(plant.state.elements, plant.known_by_outputs, strict=True) if place < 0]
     if hidden:
         raise NotSupported(
-            f"the input along the reference needs the states {', '.join(hidden)}, which no output gives and which so have no "
-            "reference; weigh the rate of the input, Quadratic(rate=...), in place of its deviation from a feedforward"
+            f"the input along the reference needs the states {', '.join(hidden)}, which are no outputs and do not follow from "
+            "them by linear equations, and so have no reference; weigh the rate of the input, Quadratic(rate=...), in place of "
+            "its deviation from a feedforward"
         )
     return outputs[list(plant.known_by_outputs)]
 

@@ -70,7 +70,8 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
         numbers["radius"] = radius
         text += f"; the slowest mode of the linear loop is multiplied by {radius:.6g} per cycle"
         if radius < 1:
-            return Answer(QUESTION, Verdict.YES, text, "", numbers)
+            held = text.replace("unstable: ", "unstable by themselves and held by the plan: ", 1)
+            return Answer(QUESTION, Verdict.YES, held, "", numbers)
         little = radius < 1 + NEUTRAL or radius**problem.cycles < 1 + _LITTLE
         verdict = Verdict.UNKNOWN if loops.learns or neutral or little else Verdict.NO
         return Answer(QUESTION, verdict, text, "Weigh the other states in the cost, or lengthen the horizon.", numbers)

@@ -59,7 +59,10 @@ def test_states_that_do_not_follow_are_refused_by_name(shown):
     """An inner state, which no output shows, and one that stands in it in a power: `rate` is named."""
     plant = lags(shown)
     assert followed_state(plant) is None
-    with pytest.raises(NotSupported, match=r"needs the states .*, which no output gives.*rate"):
+    with pytest.raises(
+        NotSupported,
+        match=r"needs the states .*, which are no outputs and do not follow from them by linear equations.*rate",
+    ):
         stage_data(plant, REFERENCE, HORIZON, fp.Quadratic(**COST, deviation={"u": 1e-2}))
 
 

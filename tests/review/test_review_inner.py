@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -13,6 +14,7 @@ import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.review.grid import review_grid
 from fpirhc.review.inner import inner_motion, inner_places
+from fpirhc.review.zero_dynamics import zero_dynamics
 
 PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-3))
 LAW = fp.ComputedTorque(fp.Exponential(rate=2.0))
@@ -61,6 +63,17 @@ def test_zero_dynamics_have_a_rate_and_a_sign(rate, controller, verdict, begin):
     one = answer(companion(rate), controller, "zero dynamics")
     assert (one.verdict, one.evidence[: len(begin)]) == (verdict, begin)
     assert one.numbers["rate"] == pytest.approx(rate, abs=1e-9)
+
+
+def test_unstable_zero_dynamics_that_a_plan_holds_are_told_as_both():
+    """The answer is yes, and its evidence does not begin with the opposite."""
+    held: Any = SimpleNamespace(loops=(None,), radii=np.array([0.99]), learns=False)
+    one = zero_dynamics(companion(19.0), 19.0, True, held)
+    assert one.verdict == "yes"
+    assert one.evidence == (
+        "unstable by themselves and held by the plan: while the reference is followed they grow at up to 19 1/s; the slowest mode "
+        "of the linear loop is multiplied by 0.99 per cycle"
+    )
 
 
 @pytest.mark.parametrize("rate", [19.0, -32.9])
