@@ -24,10 +24,10 @@ from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.held_deformation import with_held_deformation
-from fpirhc.controllers.largest_response import largest_response
 from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measured_state
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
 from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
+from fpirhc.controllers.reference_states import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.given import described

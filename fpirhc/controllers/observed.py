@@ -13,9 +13,9 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.believing import SampleTime
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.reference_states import nominal_motion
-from fpirhc.controllers.sample_time import SampleTime
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.nominal import known_on_reference, nominal_run, reference_state
 from fpirhc.plant.maps import growth_of

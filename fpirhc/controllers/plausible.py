@@ -30,8 +30,7 @@ from functools import lru_cache
 import numpy as np
 
 from fpirhc.controllers.face import measured_signals
-from fpirhc.controllers.largest_response import response_scale
-from fpirhc.controllers.reference_states import reference_states
+from fpirhc.controllers.reference_states import reference_states, response_scale
 from fpirhc.controllers.seeing import given_states, raw_signal
 from fpirhc.errors import Mistakes
 from fpirhc.plant.motion import controlled_places

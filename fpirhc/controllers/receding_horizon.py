@@ -20,13 +20,18 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
-from fpirhc.controllers.consistent_start import at_consistent_start, consistent_start
+from fpirhc.controllers.beside_plan import (
+    as_planned,
+    at_consistent_start,
+    built_first_memory,
+    consistent_start,
+    first_memory,
+    held_model,
+)
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.face import measured_signals
-from fpirhc.controllers.first_plan import built_first_memory, first_memory
 from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
-from fpirhc.controllers.planned_model import as_planned, held_model
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -65,7 +70,7 @@ class RecedingHorizon(Controller):
         cost: of the plan; None: the problem's.
         margins: by name of a state, the distances that plans keep from the state's limits; see `Horizon`. None: the horizon's.
         follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
-            `fpirhc.controllers.planned_model` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
+            `fpirhc.controllers.beside_plan` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
     """
 
     optimiser: Optimiser

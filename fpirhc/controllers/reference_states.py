@@ -1,12 +1,23 @@
-"""What a reference asks of the model: outputs and responses, and the states that belong to them."""
+"""What a reference asks of the model: its states and responses, and the largest response that the limits of the inputs allow.
+
+    L_i = max over the reference and the start of   |f_i(x, c)| + sum_k max |f_i(x, c with u_k at a limit) - f_i(x, c)|
+
+with the model f and the middle c of the limits; exact for a model that is affine in its inputs. Laws and maps compare what they
+remember with multiples of it, so that one absurd but finite sample does not stay with them.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.nominal import known_on_reference, nominal_run
 from fpirhc.plant.chain import nominal_responses
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem, nominal_start
 
 
@@ -26,3 +37,74 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
     states, _ = nominal_run(plant, problem.reference, *nominal_start(problem))
     places = np.minimum(np.round(times / problem.period).astype(int), states.shape[1] - 1)
     return states[:, places]
+
+
+_SAMPLES = 100  # instants at which the reference is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """How large responses are.
+
+    Args:
+        largest: L of every controlled coordinate; infinite where an input has no finite limits.
+        slope: largest change of a response per change of an input, shape (n, nu).
+    """
+
+    largest: tuple[float, ...]
+    slope: np.ndarray
+
+    def of(self, places: Sequence[int]) -> Scale:
+        """Return the scale of some responses."""
+        return Scale(tuple(self.largest[k] for k in places), self.slope[list(places)])
+
+
+def largest_response(problem: Problem) -> tuple[float, ...]:
+    """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
+
+    It is infinite too where the states that belong to the reference are not known before a run.
+    """
+    free = (float("inf"),) * len(problem.plant.controlled_names)
+    return response_scale(problem).largest if known_on_reference(problem.plant) else free
+
+
+@lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison
+def response_scale(problem: Problem) -> Scale:
+    """Return the scale of every controlled response, by the limits of the build; of outputs along the model's nominal run."""
+    task = nominal(problem)
+    plant = task.plant
+    lower, upper = task.limits.input_bounds(plant)
+    size, inputs = len(plant.controlled_names), len(plant.inputs)
+    if not np.isfinite(upper - lower).all():
+        return Scale((float("inf"),) * size, np.zeros((size, inputs)))
+    states, middle = _states(task), (lower + upper) / 2
+    corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
+    at_middle, *at_limits = (_responses(task, states, corner) for corner in corners)
+    with np.errstate(all="ignore"):
+        reach = [
+            np.fmax(abs(low - at_middle), abs(high - at_middle))
+            for low, high in zip(at_limits[::2], at_limits[1::2], strict=True)
+        ]
+        sizes = abs(at_middle) + sum(reach)
+        halves = np.maximum((upper - lower) / 2, 1e-300)
+        slopes = [np.where(np.isfinite(r), r, 0.0).max(axis=1) / h for r, h in zip(reach, halves, strict=True)]
+    finite = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=1)
+    return Scale(tuple(float(v) if v > 0 else float("inf") for v in finite), np.array(slopes).T)
+
+
+def _states(task: Problem) -> np.ndarray:
+    """States along the reference, and the start, shape (nx, number)."""
+    states = reference_states(task, _SAMPLES)
+    return np.hstack([states, np.asarray(task.start_state)[:, None]])
+
+
+def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.ndarray:
+    count = states.shape[1]
+    repeated = (np.repeat(v[:, None], count, axis=1) for v in (command, task.plant.approximate))
+    return np.asarray(task.plant.controlled_response_function.map(count)(states, *repeated).full())
+
+
+def _with(command: np.ndarray, k: int, value: float) -> np.ndarray:
+    other = command.copy()
+    other[k] = value
+    return other

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 
 from fpirhc.controllers.base import like
-from fpirhc.controllers.largest_response import largest_response
+from fpirhc.controllers.reference_states import largest_response
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.integrators import runge_kutta_4
 from fpirhc.plant.lie_derivatives import without_disturbances

@@ -20,7 +20,7 @@ import numpy as np
 
 from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.gate import HELD
-from fpirhc.controllers.largest_response import Scale, response_scale
+from fpirhc.controllers.reference_states import Scale, response_scale
 from fpirhc.controllers.seeing import raw_signal
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block

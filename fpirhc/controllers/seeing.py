@@ -11,7 +11,9 @@ them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
@@ -21,11 +23,13 @@ from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.controllers.observed import check_believed
 from fpirhc.controllers.own_reference import with_reference
-from fpirhc.controllers.steps_ahead import with_steps_ahead
+from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
-from fpirhc.symbolic.block import Block, Composite
+from fpirhc.symbolic.block import Block, Composite, bridged
+from fpirhc.symbolic.expression import Signals, Value
+from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.latest import Latest
-from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
 _LATEST: Latest[Composite] = Latest(4)
@@ -136,3 +140,83 @@ def _estimating_part(problem: Problem, raw: Signal, start: np.ndarray) -> list[B
     needed = Signal("_needed", names)
     select = Block("select", Layout((raw,)), Layout((needed,)), lambda s: {needed.name: getattr(s, raw.name)[places]})
     return [select, on_face(plant, estimator.block(plant.face, problem.period, start, needed))]
+
+
+_MEASURED, _PAST, _COUNT = "_differences", "outputs_expected", "outputs_measured"
+
+
+def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
+    """Return the estimator, and behind it the block that brings its differences to this cycle where an order is above one.
+
+    A law of order r needs y_k, delta y_k ... delta^(r-1) y_k. The forward difference delta^j y_k contains y_{k+1} ... y_{k+j},
+    which follow from the state without the command of this cycle, and are measured j cycles later. The model has both at the
+    measured states,
+
+        delta^j y_k = y^_j(x_k) + (delta^j y_{k-j} - y^_j(x_{k-j})),      j = 1 ... r - 1.
+
+    With an exact model it is exact, so that a law may be deadbeat. At rest the model does not count, and for short cycles the
+    measured difference alone is left. A prediction without the last measured difference would keep the model's error for ever.
+
+    Args:
+        plant: a map, or any other plant, whose estimator then stays alone.
+        estimate: writes the signal of the outputs.
+    """
+    if plant.step is None or max(plant.face.orders) == 1:
+        return [estimate]
+    measured = replace(plant.output, name=_MEASURED)
+
+    def step(s: Signals) -> dict[str, Value]:
+        return {_MEASURED if name == plant.output.name else name: value for name, value in estimate.step(s).items()}
+
+    writes = Layout(tuple(measured if w.name == plant.output.name else w for w in estimate.writes.signals))
+    lossy = None if estimate.bridged is None else lambda: with_steps_ahead(plant, bridged(estimate))[0]
+    return [replace(estimate, step=step, writes=writes, bridged=lossy), _ahead_block(plant, measured)]
+
+
+def _ahead_block(plant: Plant, measured: Signal, *, lost: bool = False) -> Block:
+    """Block (differences of the last cycles, state, parameters) -> outputs and their differences at this cycle.
+
+    Over a gap the expected outputs of the last cycles are on the line from the last ones to those of now.
+    """
+    elements = plant.output.elements
+    powers = [e.count("'") for e in elements]
+    x, u, p = plant.symbols()
+    no_input, calm = ca.SX.zeros(u.numel()), ca.SX.zeros(len(plant.names))
+    expected_at = ca.Function("fpirhc_expected", [x, p], [plant.output_function(x, no_input, p, calm)])
+    past = Signal(_PAST, tuple(f"{e}@{i}" for e, j in zip(elements, powers, strict=True) for i in range(1, j + 1)))
+    counted = Signal(_COUNT)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now, arrived = expected_at(s.state, s.parameters), getattr(s, _MEASURED)
+        before, count, at = getattr(s, _PAST), getattr(s, _COUNT), 0
+        outputs, remembered = [], []
+        for k, power in enumerate(powers):
+            past_outputs = [before[at + i] for i in range(power)]
+            if lost and power:
+                past_outputs = ca.vertsplit(straightened(ca.vertcat(*past_outputs), now[k], s.gap))
+            queue = [now[k], *past_outputs]
+            at += power
+            brought = now[k] + ca.if_else(count > power - 0.5, arrived[k] - queue[-1], 0)
+            outputs.append(brought if power else arrived[k])
+            remembered += queue[:power]
+        return {
+            plant.output.name: ca.vertcat(*outputs),
+            f"{_PAST}_next": ca.vertcat(*remembered),
+            f"{_COUNT}_next": ca.fmin(count + 1, max(powers)),
+        }
+
+    reads = Layout((measured, plant.state, plant.parameter))
+    writes, memory = Layout((plant.output,)), Layout((past, counted))
+    if not lost:
+        lossy = lambda: _ahead_block(plant, measured, lost=True)  # noqa: E731
+        return Block("steps_ahead", reads, writes, step, memory, bridged=lossy)
+
+    def wait(s: Signals) -> dict[str, Expression]:
+        before, at, again = getattr(s, _PAST), 0, list[Expression]()
+        for power in powers:
+            again += [before[at + max(i - 1, 0)] for i in range(power)]
+            at += power
+        return {f"{_PAST}_next": ca.vertcat(*again), f"{_COUNT}_next": getattr(s, _COUNT)}
+
+    waits = Block("steps_wait", Layout(), Layout(), wait, memory)
+    return Block("steps_ahead", reads + Layout((GAP,)), writes, step, memory, waits=waits)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
 from fpirhc.controllers.face import on_face
-from fpirhc.controllers.largest_response import largest_response
+from fpirhc.controllers.reference_states import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.problem import Problem

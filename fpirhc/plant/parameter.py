@@ -1,15 +1,21 @@
-"""Parameters of a plant, each with an approximate and an exact value."""
+"""Parameters of a plant, each with an approximate and an exact value, and how far the exact one may lie from that of the file.
+
+One percentage for all parameters is meaningless where they are of different kinds: 20 % of an activation energy changes a rate of
+reaction by a factor of hundreds. A spread says for its parameter what a mismatch of 100 % means. Every distribution has a finite
+range, so that a review covers what a study draws.
+"""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from statistics import NormalDist
 
-from fpirhc.errors import Mistakes
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import finite_number
-from fpirhc.plant.spread import Spread
+from fpirhc.fields.kinds import finite_number, real_number
 
 
 @dataclass(frozen=True)
@@ -103,3 +109,138 @@ def _spread_mistake(parameter: Parameter) -> str:
         return f"spread must be Uniform(...), Normal(...) or LogNormal(...), got {spread!r}"
     mistake = spread.mistake(float(parameter.exact))
     return f"spread: it {mistake}" if mistake else ""
+
+
+TAILS = 2.0  # standard deviations at which normal distributions are cut off; 95 % of the uncut one lie inside
+_NORMAL = NormalDist()
+_LEAST = _NORMAL.cdf(-TAILS)
+
+
+class Spread(Checked, ABC):
+    """Contract: the distribution of an exact parameter around its value, for a share of the full spread."""
+
+    @abstractmethod
+    def quantile(self, exact: float, share: float, probability: float) -> float:
+        """Return the value below which the parameter lies with this probability; finite at 0 and 1, increasing, exact at share 0.
+
+        Args:
+            exact: value in the problem file.
+            share: of the spread, 1 for all of it.
+            probability: from 0 to 1.
+        """
+
+    def interval(self, exact: float, share: float) -> tuple[float, float]:
+        """Return the least and the largest value."""
+        return self.quantile(exact, share, 0.0), self.quantile(exact, share, 1.0)
+
+    def mistake(self, exact: float) -> str:
+        """Return why the spread cannot belong to a parameter with this exact value; empty where it can."""
+        lowest, highest = self.interval(exact, 1.0)
+        return "" if lowest < highest else f"has the value {exact:g}, of which a share is nothing; give absolute=..."
+
+
+@dataclass(frozen=True)
+class Uniform(Spread):
+    """Uniform in exact -+ width.
+
+    Args:
+        absolute: width in the parameter's unit.
+        relative: width as a share of |exact|. One of the two is given.
+
+    Raises:
+        InvalidValue: both or neither are given, or the width is not positive.
+    """
+
+    absolute: float | None = None
+    relative: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_width(self, self.absolute, self.relative)
+
+    def quantile(self, exact: float, share: float, probability: float) -> float:
+        """Return exact + share width (2 probability - 1)."""
+        return exact + share * _width(exact, self.absolute, self.relative) * (2 * probability - 1)
+
+
+@dataclass(frozen=True)
+class Normal(Spread):
+    """Normal around exact, cut off at two standard deviations.
+
+    Args:
+        absolute: standard deviation in the parameter's unit.
+        relative: standard deviation as a share of |exact|. One of the two is given.
+
+    Raises:
+        InvalidValue: both or neither are given, or the deviation is not positive.
+    """
+
+    absolute: float | None = None
+    relative: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_width(self, self.absolute, self.relative)
+
+    def quantile(self, exact: float, share: float, probability: float) -> float:
+        """Return exact + share deviation z, with z the quantile of the cut standard normal."""
+        return exact + share * _width(exact, self.absolute, self.relative) * _standard(probability)
+
+
+@dataclass(frozen=True)
+class LogNormal(Spread):
+    """Log-normal around exact as its median, cut off at two standard deviations: the parameter keeps its sign.
+
+    Args:
+        factor: by which the parameter is larger or smaller at one standard deviation, above 1.
+
+    Raises:
+        InvalidValue: the factor is not above 1.
+    """
+
+    factor: float
+
+    def __post_init__(self) -> None:
+        if not _is_number(self.factor) or not 1 < self.factor < math.inf:
+            raise InvalidValue(f"LogNormal(factor={self.factor!r}): expected a number above 1, such as 1.3 for 30 %")
+
+    def quantile(self, exact: float, share: float, probability: float) -> float:
+        """Return exact factor^(share z), z the quantile of the cut standard normal, turned round for a negative exact value."""
+        z = _standard(probability if exact > 0 else 1 - probability)
+        return float(exact * self.factor ** (share * z))
+
+    def mistake(self, exact: float) -> str:
+        """Return why zero cannot be spread."""
+        return (
+            "" if exact else "has the value 0, which a factor does not change; use Uniform or Normal with absolute=..."
+        )
+
+
+def _standard(probability: float) -> float:
+    """Quantile of the standard normal cut off at -+TAILS; the ends are exact."""
+    if probability in (0.0, 1.0):
+        return TAILS * (2 * probability - 1)
+    return _NORMAL.inv_cdf(_LEAST + (1 - 2 * _LEAST) * probability)
+
+
+def _width(exact: float, absolute: float | None, relative: float | None) -> float:
+    return absolute if absolute is not None else (relative or 0.0) * abs(exact)
+
+
+def _check_width(spread: Spread, absolute: float | None, relative: float | None) -> None:
+    values = [v for v in (absolute, relative) if v is not None]
+    if len(values) != 1 or not _is_number(values[0]) or not 0 < values[0] < math.inf:
+        raise InvalidValue(
+            f"{spread!r}: expected one positive number, absolute=... in the parameter's unit or relative=... as a share"
+        )
+
+
+def _is_number(value: object) -> bool:
+    return real_number(value) is not None
+
+
+EXAMPLES = (
+    Uniform(absolute=0.5),
+    Uniform(relative=0.3),
+    Normal(absolute=0.2),
+    Normal(relative=0.1),
+    LogNormal(factor=1.3),
+)

@@ -13,7 +13,7 @@ from test_outputs import OPTIMISER, arm, circle, hill, planned, sedated, simulat
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.output_ahead import output_ahead
+from fpirhc.controllers.wrappers.predicted import output_ahead
 from fpirhc.errors import NotSupported
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along

@@ -12,7 +12,7 @@ from scipy import stats
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.plant.mismatch import exact_ranges
-from fpirhc.plant.spread import EXAMPLES, TAILS
+from fpirhc.plant.parameter import EXAMPLES, TAILS
 from fpirhc.review.grid import parameter_box
 from fpirhc.studies.scenarios.draws import COMPARING, draw
 

@@ -14,7 +14,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.largest_response import largest_response
+from fpirhc.controllers.reference_states import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.loop import close_loop

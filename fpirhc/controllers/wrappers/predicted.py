@@ -21,6 +21,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -31,7 +32,6 @@ import numpy as np
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
-from fpirhc.controllers.output_ahead import output_ahead
 from fpirhc.controllers.own_reference import own_signals
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
@@ -376,6 +376,31 @@ def _residual(plant: Plant, time: float, period: float) -> ca.Function:
     residual_now = ca.mtimes(effect.T, ca.solve(ca.mtimes(effect, effect.T), missing))
     share = 1 - float(np.exp(-period / time))
     return ca.Function("fpirhc_residual", [old, x, u, f, p], [ca.densify(old + share * (residual_now - old))])
+
+
+def output_ahead(plant: Plant) -> ca.Function:
+    """Return the Function (measured outputs, state, state ahead, parameters, time ahead) -> outputs ahead.
+
+    They are the model's at the predicted state, and the distance d of the measured ones,
+
+        y^(k)(t + tau) = h_k(x(t + tau), p) + sum_{j >= k} d^(j)(t) tau^(j-k) / (j-k)!,      d^(j) = y^(j) - h_j(x, p),   j < r,
+
+    where d^(r) is taken as zero: over a dead time, which is short. Over a horizon it is not, see `consistent_state`.
+
+    Args:
+        plant: the model, with outputs.
+    """
+    x, u, p = plant.symbols()
+    later, y, time = ca.SX.sym("later", x.numel()), ca.SX.sym("y", plant.output.size), ca.SX.sym("time")
+    held = ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names))
+    distance, ahead = y - plant.output_function(x, *held), plant.output_function(later, *held)
+    elements, entries = plant.output.elements, []
+    for k, element in enumerate(elements):
+        higher = [i for i, e in enumerate(elements) if e.startswith(element) and not e[len(element) :].strip("'")]
+        powers = [elements[i].count("'") - element.count("'") for i in higher]
+        terms = (distance[i] * time**n / math.factorial(n) for i, n in zip(higher, powers, strict=True))
+        entries.append(sum(terms, start=ahead[k]))
+    return ca.Function("fpirhc_output_ahead", [y, x, later, p, time], [ca.densify(ca.vertcat(*entries))])
 
 
 def examples(inner: Controller) -> tuple[Example, ...]:
