@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -29,7 +30,8 @@ T = TypeVar("T")
 _POINTS, _POINTS_OF_PLANS = 7, 3
 _DRAWN, _DRAWN_OF_PLANS = 16, 5  # draws of the parameters, of all points together
 _MOST_KEPT = 8
-_CYCLES = 400  # of the run to a point, at most
+_CYCLES = 400  # of the run to a point that laws and plans in every cycle take at most
+_PERIODS = 30  # of plans that the run to a point takes at least
 _SMALL = 1e-3  # feedback of a point at a limit, as a share of the others'
 
 
@@ -137,14 +139,20 @@ class Points:
             before=dict(zip(plant.inputs, map(float, command), strict=True)),
             exact=exact if reality is None else None,
         )
-        times = grid.times[place] + grid.problem.period * np.arange(1, _CYCLES + 1)
+        times = grid.times[place] + grid.problem.period * np.arange(1, self._cycles + 1)
         led = grid.states_at(times) + (state - grid.states[place])
         if reality is not None:  # what the model lacks moves by itself
             known = reality.shared(plant)
-            whole = np.full((_CYCLES, asked.problem.real_plant.state.size), np.nan)
+            whole = np.full((self._cycles, asked.problem.real_plant.state.size), np.nan)
             whole[:, list(known.values())] = led[:, list(known)]
             led = whole
-        return asked.quietest(asked.run(start, _CYCLES, led, self._fixed_point(state, command)))
+        return asked.quietest(asked.run(start, self._cycles, led, self._fixed_point(state, command)))
+
+    @cached_property
+    def _cycles(self) -> int:
+        """Cycles of the run to a point: as far as to the next one, where that is time enough for what the controller remembers."""
+        section = self.grid.problem.cycles // (_POINTS if self.asked.quick else _POINTS_OF_PLANS)
+        return max(min(_CYCLES, section), _PERIODS * self.asked.repeats, 4 * self.asked.warm)
 
     def _fixed_point(self, state: np.ndarray, command: np.ndarray) -> np.ndarray | None:
         """The request for which the model computes a command; None where the deformation acts on something else."""

@@ -1,7 +1,7 @@
 """Is the map fast enough? Its largest step per cycle is compared with the change of the request.
 
 Along the reference the request changes by |d r*/dt|. After a start off the reference a plan changes it faster: the step must also
-cover B^ (v_{k+1} - v_k), with the commands v of the linear loop of plant = model from this start.
+B^ (v_{k+1} - v_k), with the commands v of the linear loop of plant = model from this start, within the limits of the inputs.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop
     plant = grid.problem.plant
     command = np.nan_to_num(grid.commands[0, 0])
     slopes = state_slopes(plant, grid.states[0], command, believed)
-    commands = ideal.carried(ideal.placed @ _start_deviation(grid, slopes.y), _CYCLES)[1]
+    deviations = ideal.carried(ideal.placed @ _start_deviation(grid, slopes.y), _CYCLES)[1]
+    commands = np.clip(command + deviations, *grid.problem.limits.input_bounds(plant))
     count = len(ideal.cycles)  # plans move the command in steps
     changes = np.linalg.norm((commands[count:] - commands[:-count]) @ slopes.d.T, axis=1)
     return float(changes.max() / (count * grid.problem.period))

@@ -13,7 +13,10 @@ import pytest
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.deformation.base import with_inner
+from fpirhc.deformation.base import Deformation, with_inner
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import ideal_loops
+from fpirhc.review.slew import slew_enough
 
 
 def answer(problem: fp.Problem, controllers: dict[str, Controller], words: str) -> fp.Answer | None:
@@ -163,17 +166,23 @@ def test_advice_for_a_controller_without_a_map_names_no_gain():
     assert (one.verdict, one.change) == ("unknown", "Weigh the inputs more.")
 
 
-def test_a_map_has_all_cycles_between_two_plans_for_a_jump_of_the_plan():
-    """Plans every 20 cycles move the request by 50 m/s2 after the start, three steps of the map; no run without bound is better."""
-    task = fp.load_problem("delayed_mass")
-    controller = resolved(task.problem, task.controllers["RHC+FPI"])
-    one = answer(task.problem, {"it": controller}, "fast enough for reference")
-    assert one is not None
-    assert one.verdict == "yes"
-    deformation = controller.deformation
-    unbounded = with_inner(deformation, fp.Affine(gain=-2 * deformation.effective_gain()))
+@pytest.mark.parametrize("name", ["delayed_mass", "two_link_arm"])
+def test_a_map_has_all_cycles_between_two_plans_for_a_jump_of_the_plan(name: str):
+    """Plans every 20 and 10 cycles move the request by more than a step of the map; no run without that bound is better."""
+    task = fp.load_problem(name)
+    controller, grid = resolved(task.problem, task.controllers["RHC+FPI"]), review_grid(task.problem, 0.0, 0)
+    deformation, believed = controller.deformation, controller.plant_model(grid.problem).parameters(grid.problem.plant)
+    [ideal] = ideal_loops(grid, controller, 1)
+    assert slew_enough(grid, deformation, believed, ideal).verdict == "yes"
     errors = [
         fp.simulate(task.problem, c, seed=0, compiled=False)["error"]
-        for c in (controller, controller.with_deformation(unbounded))
+        for c in (controller, controller.with_deformation(unbounded(deformation)))
     ]
     assert np.linalg.norm(errors[0]) < 1.02 * np.linalg.norm(errors[1])
+
+
+def unbounded(deformation: Deformation) -> Deformation:
+    """The map with an affine one inside, of the same gain."""
+    if deformation.inner is None:
+        return fp.Affine(gain=-2 * deformation.effective_gain())
+    return with_inner(deformation, unbounded(deformation.inner))

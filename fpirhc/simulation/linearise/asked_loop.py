@@ -147,11 +147,11 @@ class AskedLoop:
                 break
             if led is not None:
                 memory_next[self._state] = np.where(np.isfinite(led[k]), led[k], memory_next[self._state])
-            if request is not None and k == self._warm and len(self._request) == request.size:
+            if request is not None and k == self.warm and len(self._request) == request.size:
                 memory_next[self._request] = request
             memories.append(memory_next)
             traces.append(trace)
-            if led is not None and k > self._warm:
+            if led is not None and k > self.warm:
                 command, before = trace[self._command], traces[-1 - self.repeats][self._command]
                 still = still + 1 if (np.abs(command - before) <= _STILL * np.abs(command).max()).all() else 0
                 if still > self._longest:
@@ -176,7 +176,7 @@ class AskedLoop:
         sizes = np.maximum(np.abs(commands).max(axis=0), 1e-300)
         change = (np.abs(commands[n:] - commands[:-n]) / sizes).max(axis=1)
         quiet = np.logical_and(inside[n:], inside[:-n])
-        quiet[: min(self._warm, len(quiet) - 1)] = False
+        quiet[: min(self.warm, len(quiet) - 1)] = False
         memories = passage.memories[n : n + len(quiet)]
         phased = (memories[:, self._phases] == passage.memories[0, self._phases]).all(axis=1)
         change = np.where(quiet & phased if (quiet & phased).any() else phased, change, np.inf)
@@ -227,7 +227,7 @@ class AskedLoop:
         return 2 * self.repeats + 2 * math.ceil(self.problem.response_delay) + 2
 
     @cached_property
-    def _warm(self) -> int:
+    def warm(self) -> int:
         """Cycles before which no deformation acts, or no command has gone all the way."""
         return self._longest + math.ceil(self.problem.warm_up_cycles)
 

@@ -24,7 +24,7 @@ from fpirhc.errors import NotSupported
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 
-_STEP = 2.0**-14  # of a deviation, in scales: beyond the tolerances with which plans stop, below what bends
+_STEP = 2.0**-19  # of a deviation, in scales: above rounding, and below what makes a line search choose another share
 _NEW = 1e-4  # what is new in a direction of length 1, below which it is left out
 _ROUNDING = 1e-9  # derivative in scales
 _LARGEST = 400  # directions
