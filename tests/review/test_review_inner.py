@@ -77,11 +77,11 @@ def test_unstable_zero_dynamics_that_a_plan_holds_are_told_as_both():
 
 
 @pytest.mark.parametrize("rate", [19.0, -32.9])
-def test_a_plan_without_a_linear_loop_has_the_sign_too(rate):
-    """A plan that is restarted and tracked has no linear loop: stable is yes, unstable is unknown with its rate."""
+def test_a_plan_that_is_tracked_has_the_sign_too(rate):
+    """A plan that is restarted and tracked holds no state that its cost does not weigh: stable is yes, unstable is no."""
     tracked = replace(PLAN, replanning=fp.FromMeasurementTracked(fp.Exponential(rate=2.0)))
     one = answer(companion(rate), tracked, "zero dynamics")
-    assert one.verdict == ("yes" if rate < 0 else "unknown")
+    assert one.verdict == ("yes" if rate < 0 else "no")
     assert f"{abs(rate):.3g} 1/s" in one.evidence
 
 
