@@ -251,9 +251,12 @@ class Plant(Motion):
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
-        face = self.face.coordinates
-        units = [derivative_unit(face[n], order, self.time_unit) for n, order in self.response_orders.items()]
-        return vector(name, self.controlled_names, units)
+        return vector(name, self.controlled_names, self._controlled_units)
+
+    @cached_property
+    def _controlled_units(self) -> tuple[str, ...]:
+        face, unit = self.face.coordinates, self.time_unit
+        return tuple([derivative_unit(face[n], order, unit) for n, order in self.response_orders.items()])
 
     @cached_property
     def controlled_response_function(self) -> ca.Function:

@@ -133,9 +133,8 @@ class Block:
     @cached_property
     def _results(self) -> dict[str, Signal]:
         """The signals that the step returns, by their keys."""
-        results = {s.name: s for s in self.writes.signals}
-        results.update({f"{s.name}_next": s for s in self.memory.signals})
-        return results
+        keys = (*self.writes.names, *[f"{name}_next" for name in self.memory.names])
+        return dict(zip(keys, (*self.writes.signals, *self.memory.signals), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
