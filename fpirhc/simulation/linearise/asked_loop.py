@@ -238,6 +238,8 @@ class AskedLoop:
             memory_next, _ = self._step(memories[-1])
             if np.array_equal(memory_next[self._phases], memory[self._phases]):
                 return memories
+            if not np.isfinite(memory_next).all():
+                raise NotSupported("the loop's run does not stay finite from one plan to the next")
             memories.append(memory_next)
 
     @cached_property
