@@ -72,7 +72,7 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
         if radius < 1:
             held = text.replace("unstable: ", "unstable by themselves and held by the plan: ", 1)
             return Answer(QUESTION, Verdict.YES, held, "", numbers)
-        little = radius < 1 + NEUTRAL or radius**problem.cycles < 1 + _LITTLE
+        little = radius < 1 + NEUTRAL or min(rate * problem.duration, radius**problem.cycles - 1) < _LITTLE
         verdict = Verdict.UNKNOWN if loops.learns or neutral or little else Verdict.NO
         return Answer(QUESTION, verdict, text, "Weigh the other states in the cost, or lengthen the horizon.", numbers)
     if rate < 0 and not neutral:
