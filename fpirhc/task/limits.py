@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
@@ -21,9 +21,20 @@ from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.expression import Expression, Value, total
+from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.live import nominal
 
 Interval = tuple[float, float]
+
+
+class OfStage(Protocol):
+    """What a limit is given of a stage: the `View` of costs, whose entries have names."""
+
+    state: Named
+    input: Named
+    input_before: Named
+    output: Named
+    parameters: Named
 
 
 class Limit(Checked, ABC):
@@ -52,7 +63,7 @@ class Limit(Checked, ABC):
         lower, upper, unit = -math.inf, math.inf, ""
 
     @abstractmethod
-    def value(self, view: Any) -> Value:
+    def value(self, view: OfStage) -> Value:
         """Return the limited scalar of a stage, of a `View`: view.state.q1, view.input.Q1, view.output.y, view.parameters.m1."""
 
     def named_value(self, name: str, view: object, symbols: Sequence[Expression] = ()) -> Expression:
@@ -90,7 +101,7 @@ class PathConstraint(Limit):
         if not takes(self.expression, 1):
             raise InvalidValue("PathConstraint.expression: expected a function of 1 argument, the view of a stage")
 
-    def value(self, view: Any) -> Value:
+    def value(self, view: OfStage) -> Value:
         """Return the expression."""
         return self.expression(view)
 
@@ -124,7 +135,7 @@ class Ellipsoid(Limit):
         for name in self.centre.keys() - self.axes.keys():
             raise InvalidValue(f"Ellipsoid(centre): '{name}' has no axis.{nearest(name, list(self.axes))}")
 
-    def value(self, view: Any) -> Value:
+    def value(self, view: OfStage) -> Value:
         """Return the sum of squares.
 
         Raises:
@@ -159,9 +170,9 @@ class _Rate(Limit):
     upper: float
     unit: str
 
-    def value(self, view: Any) -> Value:
+    def value(self, view: OfStage) -> Value:
         """Return (u_i - u_{i-1}) / step."""
-        return cast(Expression, (view.input[self.input] - view.input_before[self.input]) / self.step)
+        return (view.input[self.input] - view.input_before[self.input]) / self.step
 
 
 @dataclass(frozen=True, eq=False)
