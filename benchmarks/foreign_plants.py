@@ -361,7 +361,7 @@ def masses() -> ForeignPlant:
         row = sum(c * x[name] for c, name in zip(a[2], names, strict=True))
         return {"second": (x["x2"], (row + b[2] * p.effect * u.force - x["x2"]) / 0.5)}
 
-    plant = fp.Plant.of_map(
+    plant = fp.Plant.discrete(
         states=dict.fromkeys(names, "m"),
         inputs={"force": "N"},
         parameters=known(effect=(1.4, 1.0, "1")),

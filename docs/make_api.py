@@ -22,6 +22,39 @@ SECTIONS = {
     "Review, studies and reports": ("review", "studies", "report", "baselines"),
     "Testing and errors": ("conformance", "errors"),
 }
+BESIDE = {  # for authors of members and for tools; imported from the module
+    "Certificate": "fpirhc.optimisers.certificate",
+    "Combination": "fpirhc.plant.regressor",
+    "Comparison": "fpirhc.studies.comparison.comparison",
+    "Floquet": "fpirhc.controllers.slots.floquet",
+    "LyapunovView": "fpirhc.simulation.lyapunov_view",
+    "Metrics": "fpirhc.simulation.metrics",
+    "OutputChain": "fpirhc.plant.relative_order",
+    "Prediction": "fpirhc.review.response_prediction",
+    "Regressor": "fpirhc.plant.regressor",
+    "Review": "fpirhc.review.answer",
+    "ScenarioComparison": "fpirhc.studies.scenarios.scenario_comparison",
+    "Suggestion": "fpirhc.review.suggest",
+    "Tuning": "fpirhc.studies.tuning.tune",
+    "assess_gain": "fpirhc.contraction.gains",
+    "check_controller": "fpirhc.conformance",
+    "check_deformation": "fpirhc.conformance",
+    "check_gain": "fpirhc.contraction.gains",
+    "check_live": "fpirhc.conformance",
+    "check_observer": "fpirhc.conformance",
+    "check_optimiser": "fpirhc.conformance",
+    "check_plant": "fpirhc.conformance",
+    "check_tracking": "fpirhc.conformance",
+    "delayed_limit": "fpirhc.contraction.delayed",
+    "floquet_radius": "fpirhc.controllers.slots.floquet",
+    "leaky_margin": "fpirhc.deformation.leaky",
+    "leaky_pole": "fpirhc.deformation.leaky",
+    "output_chain": "fpirhc.plant.relative_order",
+    "response_jacobian": "fpirhc.contraction.spectrum",
+    "spectrum_over_box": "fpirhc.contraction.spectrum",
+    "spectrum_over_run": "fpirhc.contraction.spectrum",
+    "structural_order": "fpirhc.plant.plant",
+}
 WITH_MEMBERS = {
     "Run",
     "Stepper",
@@ -51,13 +84,17 @@ def by_section() -> dict[str, list[str]]:
 
 def page() -> str:
     """The page's text."""
-    about = "Every name below is imported from ``fpirhc``; the docstrings give equations, shapes, units and sources."
+    about = "Names are imported from ``fpirhc``, unless said otherwise; the docstrings give equations, shapes, units and sources."
     lines = ["API", "===", "", about, ""]
     for title, names in by_section().items():
         lines += [title, "-" * len(title), ""]
         for name in names:
             kind = "autoclass" if isinstance(getattr(fp, name), type) else "autofunction"
             lines += [f".. {kind}:: fpirhc.{name}"] + (["   :members:"] if name in WITH_MEMBERS else []) + [""]
+    lines += ["Beside the top level", "--------------------", "", "These are imported from their modules.", ""]
+    for name, module in BESIDE.items():
+        kind = "autoclass" if name[0].isupper() else "autofunction"
+        lines += [f".. {kind}:: {module}.{name}"] + (["   :members:"] if name in WITH_MEMBERS else []) + [""]
     return "\n".join(lines)
 
 

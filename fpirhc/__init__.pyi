@@ -1,18 +1,6 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .baselines.check import accept, bless, check_baseline
-from .conformance import (
-    check_belief,
-    check_controller,
-    check_deformation,
-    check_live,
-    check_optimiser,
-    check_plant,
-    check_tracking,
-)
-from .contraction.delayed import delayed_limit
-from .contraction.gains import assess_gain, check_gain
-from .contraction.spectrum import response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
 from .controllers.feedforward_only import FeedforwardOnly
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
@@ -28,7 +16,6 @@ from .controllers.rivals.resolved_rate import ResolvedAccelerationRate
 from .controllers.rivals.sliding_mode import SlidingMode
 from .controllers.rivals.slotine_li import SlotineLi
 from .controllers.slots.chosen_schedules import ByError, ByLookAhead
-from .controllers.slots.floquet import Floquet, floquet_radius
 from .controllers.slots.schedules import FixedSchedule, Periodic
 from .controllers.slots.slot import Slot
 from .controllers.slots.slotted import Slotted
@@ -39,7 +26,6 @@ from .controllers.wrappers.exact_model import ExactModel
 from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
 from .deformation.affine import Affine
 from .deformation.identity import Identity
-from .deformation.leaky import leaky_margin, leaky_pole
 from .deformation.model_referenced import ModelReferenced
 from .deformation.rfpt import RFPT, RFPTVector
 from .deformation.rotation import Rotation
@@ -62,7 +48,7 @@ from .learning.estimators.uncertain import Uncertain
 from .learning.rules.lyapunov_rule import LyapunovRule
 from .learning.rules.projection import Projection
 from .optimisers.anderson import Anderson
-from .optimisers.certificate import Certificate, certify
+from .optimisers.certificate import certify
 from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
@@ -75,16 +61,15 @@ from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.output import Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
-from .plant.plant import Parameter, Plant, structural_order
-from .plant.regressor import Combination, Regressor, linear_parameters
-from .plant.relative_order import OutputChain, output_chain
+from .plant.plant import Parameter, Plant
+from .plant.regressor import linear_parameters
 from .problem_files.problem_file import load_problem
 from .problem_files.settings import LogSpan, Span, with_settings
 from .report.html import write_report
-from .review.answer import Answer, Review
-from .review.response_prediction import Prediction, predict_response
+from .review.answer import Answer
+from .review.response_prediction import predict_response
 from .review.review import review
-from .review.suggest import Suggestion, suggest
+from .review.suggest import suggest
 from .review.tightening import state_margins, tightened
 from .sensing import (
     LowPassDifference,
@@ -97,12 +82,12 @@ from .sensing import (
     StepDifference,
     VelocityDifference,
 )
-from .sensing.beliefs.kalman_filter import KalmanFilter
-from .sensing.beliefs.model_states import ModelStates
-from .sensing.beliefs.moving_horizon_states import MovingHorizonStates
-from .simulation.lyapunov_view import LyapunovView, lyapunov_view
-from .simulation.machine import Watch
-from .simulation.metrics import Metric, Metrics, measure
+from .sensing.observers.kalman_filter import KalmanFilter
+from .sensing.observers.model_states import ModelStates
+from .sensing.observers.moving_horizon_states import MovingHorizonStates
+from .simulation.lyapunov_view import lyapunov_view
+from .simulation.machine import RunMonitor
+from .simulation.metrics import Metric, measure
 from .simulation.pictures.base import Quantity
 from .simulation.pictures.over_time import OverTime
 from .simulation.pictures.portrait import Portrait
@@ -112,16 +97,14 @@ from .simulation.simulate import simulate, simulator
 from .simulation.stepper import Stepper
 from .status import Status
 from .studies.comparison.compare import compare
-from .studies.comparison.comparison import Comparison
-from .studies.scenarios.scenario_comparison import ScenarioComparison
 from .studies.scenarios.scenario_study import compare_scenarios
-from .studies.tuning.tune import Tuning, tune
+from .studies.tuning.tune import tune
 from .symbolic.functions import signed_power
 from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
-from .task.foreign import Foreign
+from .task.exogenous import Believed, Known, Samples, Unknown
+from .task.external_plant import ExternalPlant
 from .task.limits import Ellipsoid, Limits, PathConstraint
-from .task.outside import Believed, Known, Samples, Unknown
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
@@ -146,10 +129,7 @@ __all__ = [
     "ByLookAhead",
     "ByModel",
     "Cascade",
-    "Certificate",
     "ColouredNoise",
-    "Combination",
-    "Comparison",
     "ComputedTorque",
     "CustomCost",
     "Cvodes",
@@ -163,15 +143,14 @@ __all__ = [
     "ExactHessian",
     "ExactModel",
     "Exponential",
+    "ExternalPlant",
     "Fatrop",
     "Feedforward",
     "FeedforwardOnly",
     "Filtered",
     "FixedPoint",
     "FixedSchedule",
-    "Floquet",
     "ForceMRAC",
-    "Foreign",
     "Formula",
     "FpirhcError",
     "Fractional",
@@ -199,10 +178,8 @@ __all__ = [
     "LowPassDifference",
     "LyapunovMRAC",
     "LyapunovRule",
-    "LyapunovView",
     "Measured",
     "Metric",
-    "Metrics",
     "ModelReferenced",
     "ModelStates",
     "MovingHorizon",
@@ -211,7 +188,6 @@ __all__ = [
     "Normal",
     "Osqp",
     "Output",
-    "OutputChain",
     "OverTime",
     "Paired",
     "Parameter",
@@ -222,7 +198,6 @@ __all__ = [
     "Portrait",
     "PositionDifference",
     "Predicted",
-    "Prediction",
     "Problem",
     "Projection",
     "Pulse",
@@ -236,15 +211,13 @@ __all__ = [
     "RecedingHorizon",
     "RecursiveLeastSquares",
     "ReducedGradient",
-    "Regressor",
     "ResolvedAccelerationRate",
-    "Review",
     "Rotation",
     "Run",
+    "RunMonitor",
     "RungeKutta4",
     "Samples",
     "SavitzkyGolay",
-    "ScenarioComparison",
     "SelfPaired",
     "Sensing",
     "Sensor",
@@ -265,55 +238,34 @@ __all__ = [
     "StepDifference",
     "Stepper",
     "StopRun",
-    "Suggestion",
     "Table",
     "ThroughModel",
     "Trajectory",
     "Tuned",
-    "Tuning",
     "Uncertain",
     "Uniform",
     "Unknown",
     "VelocityDifference",
-    "Watch",
     "accept",
-    "assess_gain",
     "bless",
     "certify",
     "check_baseline",
-    "check_belief",
-    "check_controller",
-    "check_deformation",
-    "check_gain",
-    "check_live",
-    "check_optimiser",
-    "check_plant",
-    "check_tracking",
     "compare",
     "compare_scenarios",
-    "delayed_limit",
     "disturbed",
-    "floquet_radius",
-    "leaky_margin",
-    "leaky_pole",
     "linear_parameters",
     "load_problem",
     "load_run",
     "lyapunov_view",
     "measure",
-    "output_chain",
     "outside",
     "predict_response",
-    "response_jacobian",
     "review",
     "signed_power",
     "simulate",
     "simulator",
     "solve",
-    "spectrum_over_box",
-    "spectrum_over_run",
     "state_margins",
-    "structural_order",
     "suggest",
     "tightened",
     "tune",

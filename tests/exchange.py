@@ -7,7 +7,7 @@ from typing import Any
 
 import fpirhc as fp
 from fpirhc.deformation import Deformation
-from fpirhc.task.outside import really_known
+from fpirhc.task.exogenous import really_known
 
 
 def exchanged(value: Any, deformation: Deformation) -> Any:

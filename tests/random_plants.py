@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.contraction.spectrum import response_jacobian
 from fpirhc.controllers import contract
 
 PERIOD = 5e-3  # s
@@ -122,7 +123,7 @@ def _plant(random: np.random.Generator, n: int, order: int, nonlinearity: float,
 def _largest(problem: fp.Problem) -> float:
     """Largest eigenvalue of J at the start, in size."""
     plant, wanted = problem.plant, np.zeros(len(problem.plant.inputs))
-    jacobian = fp.response_jacobian(plant)(problem.start_state, wanted, plant.exact, plant.approximate)
+    jacobian = response_jacobian(plant)(problem.start_state, wanted, plant.exact, plant.approximate)
     return float(np.abs(np.linalg.eigvals(jacobian.full())).max())
 
 

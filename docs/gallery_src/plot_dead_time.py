@@ -13,10 +13,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.contraction.delayed import delayed_limit
 
 delays = np.arange(0, 13)
-unpaired = [fp.delayed_limit(np.append(np.zeros(d), 1.0)) for d in delays]
-paired = [fp.delayed_limit(np.append(np.zeros(d), 1.0), pairing=d) for d in delays]
+unpaired = [delayed_limit(np.append(np.zeros(d), 1.0)) for d in delays]
+paired = [delayed_limit(np.append(np.zeros(d), 1.0), pairing=d) for d in delays]
 
 figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
 axis.plot(delays, unpaired, "o", label="unpaired")

@@ -14,6 +14,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.contraction.gains import assess_gain
+from fpirhc.contraction.spectrum import spectrum_over_run
 
 task = fp.load_problem("two_mass")
 tracking = fp.Exponential(rate=6.0)
@@ -37,10 +39,10 @@ for gain in gains:
 # %%
 # The response error falls as one over the gain, down to the sector limit.
 
-spectrum = fp.spectrum_over_run(
+spectrum = spectrum_over_run(
     task.problem.plant, run["state"][::50], run["deformed"][::50]
 )
-report = fp.assess_gain(fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), spectrum)
+report = assess_gain(fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), spectrum)
 print(report.text)
 
 figure, axis = plt.subplots(figsize=(8, 3.4), layout="constrained")

@@ -14,10 +14,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.controllers.slots.floquet import floquet_radius
 
 task = fp.load_problem("crane_slots")
 controller = task.controllers["slots+FPI"]
-floquet = fp.floquet_radius(
+floquet = floquet_radius(
     task.problem, controller.slots, controller.schedule, blend=controller.blend
 )
 print(f"Floquet radius {floquet.radius:.4f} per period of {floquet.period:g} s")

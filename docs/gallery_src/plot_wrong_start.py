@@ -22,19 +22,19 @@ gas = fp.Plant.of_states(
 )
 
 
-def batch(belief):
+def batch(observer):
     """The batch with its valve shut; the pressure is measured with a noise of 0.1 bar."""
     gauge = {"P": fp.Sensor(noise=fp.Noise(0.1))}
     return fp.Problem(
         plant=gas,
         reality=fp.Reality(gas, start={"A": 3.0, "B": 1.0}),
-        start={"A": 0.1, "B": 4.5},  # where the belief begins
+        start={"A": 0.1, "B": 4.5},  # where the observer begins
         reference=fp.Trajectory(lambda t: {"P": 2.5 + 1.5 * ca.exp(-t)}),
         limits=fp.Limits(inputs={"feed": (0.0, 1e-9)}),
         period=0.1,
         duration=10.0,
         sensing=fp.Sensing(
-            gauge, fp.PositionDifference(), measured=["P"], belief=belief
+            gauge, fp.PositionDifference(), measured=["P"], observer=observer
         ),
     )
 
@@ -49,7 +49,7 @@ known = {
     "start": {"A": 6.0, "B": 6.0},
 }
 positive = {"A": (0.0, float("inf")), "B": (0.0, float("inf"))}
-beliefs = {
+observers = {
     "extended Kalman filter": fp.KalmanFilter(**known),
     "window without bounds": fp.MovingHorizonStates(**known, window=5),
     "window, pressures above zero": fp.MovingHorizonStates(
@@ -57,7 +57,9 @@ beliefs = {
     ),
 }
 controller = fp.ComputedTorque(fp.Exponential(rate=1.0))
-runs = {name: fp.simulate(batch(b), controller, seed=0) for name, b in beliefs.items()}
+runs = {
+    name: fp.simulate(batch(b), controller, seed=0) for name, b in observers.items()
+}
 
 # %%
 # Two pressures of A explain why the sum falls: the true one and one below zero, for the

@@ -82,7 +82,7 @@ def plant_of(
         "time_unit": time_unit,
     }
     if model.dt:
-        return Plant.of_map(next=moved, step=float(model.dt), **common)
+        return Plant.discrete(next=moved, step=float(model.dt), **common)
     return Plant.of_states(rates=moved, **common)
 
 

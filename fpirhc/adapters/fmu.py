@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.adapters.names import counterparts, package
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Plant
-from fpirhc.task.foreign import Foreign, quantities
+from fpirhc.task.external_plant import ExternalPlant, quantities
 
 
 def fmu_body(
@@ -27,7 +27,7 @@ def fmu_body(
     measures: Mapping[str, str],
     inputs: Mapping[str, str] | None = None,
     parameters: Mapping[str, float] | None = None,
-) -> Foreign:
+) -> ExternalPlant:
     """Return a functional mock-up unit as a reality.
 
     Args:
@@ -58,7 +58,7 @@ def fmu_body(
     names = (list(parameters or {}), list(sent.values()), list(measures.values()))
     fixed, commands, answers = ([references[n] for n in some] for some in names)
     body = _Body(fmpy, str(path), described, period, (fixed, list((parameters or {}).values())), commands, answers)
-    return Foreign(body, measures={name: units[name] for name in measures})
+    return ExternalPlant(body, measures={name: units[name] for name in measures})
 
 
 class _Body:

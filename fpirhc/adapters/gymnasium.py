@@ -17,12 +17,12 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Plant
-from fpirhc.task.foreign import Foreign, quantities
+from fpirhc.task.external_plant import ExternalPlant, quantities
 
 Read = int | Callable[[Any], float]
 
 
-def gymnasium_body(env: Any, model: Plant, *, measures: Mapping[str, Read]) -> Foreign:
+def gymnasium_body(env: Any, model: Plant, *, measures: Mapping[str, Read]) -> ExternalPlant:
     """Return an environment as a reality.
 
     Args:
@@ -47,7 +47,7 @@ def gymnasium_body(env: Any, model: Plant, *, measures: Mapping[str, Read]) -> F
                 f"measures: {name} is entry {read} of the observation, which has {size} entries, 0 to {size - 1}"
             )
     mistakes.raise_if_any()
-    return Foreign(_Body(env, measures), measures={name: units[name] for name in measures})
+    return ExternalPlant(_Body(env, measures), measures={name: units[name] for name in measures})
 
 
 class _Body:

@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.adapters.names import base_and_order, counterparts, package, steps_per_cycle
 from fpirhc.errors import Mistakes
 from fpirhc.plant.plant import Plant
-from fpirhc.task.foreign import Foreign, quantities
+from fpirhc.task.external_plant import ExternalPlant, quantities
 
 
 def mujoco_body(
@@ -27,7 +27,7 @@ def mujoco_body(
     joints: Mapping[str, str] | None = None,
     actuators: Mapping[str, str] | None = None,
     start: Mapping[str, float] | None = None,
-) -> Foreign:
+) -> ExternalPlant:
     """Return a body of MuJoCo as a reality.
 
     Args:
@@ -61,7 +61,7 @@ def mujoco_body(
     count = steps_per_cycle("mujoco_body", period, body.opt.timestep)
     places = {q: (order, of_joint[joint[name]][order]) for q, (name, order) in ((q, base_and_order(q)) for q in units)}
     motors = [body.actuator(name).id for name in actuator.values()]
-    return Foreign(_Body(mujoco, body, count, motors, places, start or {}), measures=units)
+    return ExternalPlant(_Body(mujoco, body, count, motors, places, start or {}), measures=units)
 
 
 class _Body:

@@ -18,7 +18,7 @@ from fpirhc.adapters.names import package
 from fpirhc.adapters.real_time import RealTime
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Plant
-from fpirhc.task.foreign import Foreign, quantities
+from fpirhc.task.external_plant import ExternalPlant, quantities
 
 
 def opcua_body(
@@ -31,7 +31,7 @@ def opcua_body(
     oldest: float | None = None,
     holds: int = 0,
     clock: RealTime | None = None,
-) -> Foreign:
+) -> ExternalPlant:
     """Return an OPC UA server as a reality; it is connected to at the start of a run.
 
     Args:
@@ -41,7 +41,7 @@ def opcua_body(
         measures: quantity of the model -> node that holds it.
         inputs: input of the model -> node that takes it; all inputs.
         oldest: age of a source time stamp beyond which a value is bad, s; None: any age.
-        holds: consecutive bad answers that are bridged; see `Foreign`.
+        holds: consecutive bad answers that are bridged; see `ExternalPlant`.
         clock: of the cycles; None: the clock on the wall.
 
     Raises:
@@ -57,7 +57,7 @@ def opcua_body(
     mistakes.raise_if_any()
     sent = [inputs[name] for name in model.inputs]
     body = _Body(address, sent, list(measures.values()), period, oldest, clock or RealTime())
-    return Foreign(body, measures={name: units[name] for name in measures}, holds=holds)
+    return ExternalPlant(body, measures={name: units[name] for name in measures}, holds=holds)
 
 
 class _Body:

@@ -19,12 +19,12 @@ from fpirhc.adapters.names import package
 from fpirhc.adapters.real_time import RealTime
 from fpirhc.errors import Mistakes
 from fpirhc.plant.plant import Plant
-from fpirhc.task.foreign import Foreign
+from fpirhc.task.external_plant import ExternalPlant
 
 _SENSORS, _HEATERS = ("T1", "T2"), ("Q1", "Q2")
 
 
-def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) -> Foreign:
+def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) -> ExternalPlant:
     """Return the lab as a reality.
 
     Args:
@@ -41,7 +41,7 @@ def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) ->
     mistakes.unknown("input", model.inputs, _HEATERS)
     mistakes.raise_if_any()
     body = _Twin(tclab, model, period) if board is None else _Board(tclab, model, period, board)
-    return Foreign(body, measures=dict.fromkeys(model.output.elements, "degC"))
+    return ExternalPlant(body, measures=dict.fromkeys(model.output.elements, "degC"))
 
 
 class _Twin:

@@ -4,7 +4,7 @@
     check_tracking(MyLaw(rate=6.0), seed=1)
     check_optimiser(MyOptimiser(tolerance=1e-6), tolerance=1e-6, seed=1)
     check_controller(MyController(...), seed=1)
-    check_belief(MyBelief(...), seed=1)
+    check_observer(MyBelief(...), seed=1)
     check_plant(my_plant, seed=1)
     check_live(problem, MyController(...))
 
@@ -12,19 +12,19 @@ Each raises one AssertionError for the first law that is broken, with the number
 every number). The laws are the tuples `LAWS` of the modules, one module per family.
 """
 
-from fpirhc.conformance.belief import check_belief
 from fpirhc.conformance.controller import check_controller
 from fpirhc.conformance.deformation import check_deformation
 from fpirhc.conformance.live import check_live
+from fpirhc.conformance.observer import check_observer
 from fpirhc.conformance.optimiser import check_optimiser
 from fpirhc.conformance.plant import check_plant
 from fpirhc.conformance.tracking import check_tracking
 
 __all__ = [
-    "check_belief",
     "check_controller",
     "check_deformation",
     "check_live",
+    "check_observer",
     "check_optimiser",
     "check_plant",
     "check_tracking",

@@ -1,4 +1,4 @@
-"""Short closed loops in which the laws of controllers and beliefs are tried."""
+"""Short closed loops in which the laws of controllers and observers are tried."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
+from fpirhc.task.exogenous import really_known
 from fpirhc.task.limits import Limits
-from fpirhc.task.outside import really_known
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
 
@@ -217,7 +217,7 @@ def spelled_by_states(problem: Problem) -> Problem | None:
 def coarse_steps() -> Problem:
     """Return two stocks that are filled once in 100 s, exactly known: a map in whose steps a law for derivatives diverges."""
     step = 100.0
-    plant = Plant.of_map(
+    plant = Plant.discrete(
         states={"a": "m", "b": "m"},
         inputs={"Fa": "m/s", "Fb": "m/s"},
         parameters={"k": Parameter(approximate=0.9, exact=0.9, unit="1")},

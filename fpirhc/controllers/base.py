@@ -22,11 +22,11 @@ import casadi as ca
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.exogenous_block import ACTED, NOW, KnownSignals
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.held_deformation import with_held_deformation
 from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measured_state
-from fpirhc.controllers.outside_block import ACTED, NOW, Told
-from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
+from fpirhc.controllers.online_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.controllers.reference_states import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
@@ -104,7 +104,7 @@ def compose_informed(
         ahead: whether the time is the one at which the command will act.
     """
     model = ready.plant_model(problem)
-    known = Told(model.plant, model.signals, problem.period)
+    known = KnownSignals(model.plant, model.signals, problem.period)
     compares = any(ACTED in block.reads for block in blocks)
     first = known.block(remembers=compares and not ahead)
     if first is None:

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.demands import plan_demand, reference_demand
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.form_check import check_form, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
+from fpirhc.controllers.scale_selection import plan_demand, reference_demand
 from fpirhc.deformation.base import Deformation, automatic, with_inner
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import replaced
@@ -32,7 +32,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.live import nominal
-from fpirhc.task.outside import External
+from fpirhc.task.exogenous import Exogenous
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -83,7 +83,7 @@ class PlantModel:
     """
 
     plant: Plant
-    signals: Mapping[str, External]
+    signals: Mapping[str, Exogenous]
     exact: bool = False
     given: Mapping[str, float] = field(default_factory=dict)
 

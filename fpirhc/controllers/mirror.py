@@ -108,7 +108,7 @@ def map_mirror(path: Path, *, lost: bool = False) -> Block:
         acting, _, remembered = path.acted(s)
         last = getattr(s, _BEFORE)
         last = straightened(last, getattr(s, MEASURED), s.gap) if lost else last
-        parameters, signals = path.told.acted(s, path.late)
+        parameters, signals = path.known.acted(s, path.late)
         answers = ca.vertsplit(plant.controlled_response_function(last, acting, parameters))
         past = ca.vertsplit(getattr(s, _ANSWERS)) if waiting else []
         modelled, later, at = [], [], 0
@@ -138,7 +138,7 @@ def _instant_block(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, _, remembered = path.acted(s)
-        parameters, signals = path.told.acted(s, path.late)
+        parameters, signals = path.known.acted(s, path.late)
         return {"_modelled": response(getattr(s, MEASURED), end, parameters), **remembered, **signals}
 
     writes = Layout((plant.response_signal("_modelled"),))

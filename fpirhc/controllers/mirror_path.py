@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.outside_block import Told
+from fpirhc.controllers.exogenous_block import KnownSignals
 from fpirhc.deformation.base import Mirror
 from fpirhc.deformation.queue import Queue, every
 from fpirhc.plant.plant import Plant
@@ -49,9 +49,9 @@ class Path:
     counts: bool
 
     @property
-    def told(self) -> Told:
+    def known(self) -> KnownSignals:
         """What the model is told of signals from outside."""
-        return Told(self.problem.plant, self.problem.signals, self.problem.period)
+        return KnownSignals(self.problem.plant, self.problem.signals, self.problem.period)
 
     @property
     def late(self) -> int:
@@ -86,14 +86,14 @@ class Path:
         queued = (Signal("mirror_commands", names, start=start * (length - 1)),) if length > 1 else ()
         lagging = (Signal("mirror_actuators", plant.input.elements, plant.input.units, start),) if self.decays else ()
         counted = (scalar("mirror_cycles"),) if self.counts else ()
-        return (*queued, *lagging, *counted, *self.told.memory(self.late))
+        return (*queued, *lagging, *counted, *self.known.memory(self.late))
 
     @property
     def reads(self) -> tuple[Signal, ...]:
         """Signals that every mirror reads."""
         plant = self.problem.plant
         before = Signal("_command_before", plant.input.elements, plant.input.units)
-        return measured_state(plant), before, plant.parameter, *self.told.reads
+        return measured_state(plant), before, plant.parameter, *self.known.reads
 
     def acted(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
         """Return the input that acted in the last cycle, at its end and in the mean, and what is remembered."""

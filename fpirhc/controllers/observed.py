@@ -13,15 +13,15 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.believing import SampleTime
 from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.observed_state import SampleTime
 from fpirhc.controllers.reference_states import nominal_motion
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.nominal import known_on_reference, nominal_run, reference_state
 from fpirhc.plant.maps import growth_of
 from fpirhc.sensing.base import values_of
 from fpirhc.sensing.observability import members, slowest
-from fpirhc.task.outside import told_places
+from fpirhc.task.exogenous import known_places
 from fpirhc.task.problem import Problem, nominal_start
 
 _INSTANTS = 25
@@ -45,43 +45,43 @@ class FreeErrors:
 
 @lru_cache(maxsize=8)  # several controllers are checked on one problem
 def free_errors(problem: Problem) -> FreeErrors:
-    """Return the errors of the believed states that no measurement corrects; of a problem without a belief there are none."""
-    plant, belief = problem.plant, problem.sensing.belief
-    if belief is None:
+    """Return the errors of the believed states that no measurement corrects; of a problem without an observer there are none."""
+    plant, observer = problem.plant, problem.sensing.observer
+    if observer is None:
         return FreeErrors((), -np.inf, decays=True)
-    names = belief.uses(problem.sensing.measures(plant))
+    names = observer.uses(problem.sensing.measures(plant))
     states, slopes, shown = _linearised(problem, names)
     size = np.maximum(np.abs(states).max(axis=0), np.abs(problem.start_state))
     size[size == 0] = 1.0
     known = [plant.state.elements.index(e) for e in problem.sensing.known(plant)]
     scaled = [a * size / size[:, None] for a in slopes]
-    basis = belief.free(scaled, [c * size for c in shown], known)
+    basis = observer.free(scaled, [c * size for c in shown], known)
     pole = slowest(scaled, basis, growth_of(plant))
     fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
     return FreeErrors(tuple(plant.state.elements[k] for k in members(basis)), pole, decays=pole < -_STAYS * fastest)
 
 
 def check_observed(problem: Problem) -> None:
-    """Raise if errors are neither observed nor decay, and the belief cannot bear that.
+    """Raise if errors are neither observed nor decay, and the observer cannot bear that.
 
     Raises:
         NotSupported: with the states, and what would help.
     """
-    belief = problem.sensing.belief
-    if belief is None or not belief.must_decay:
+    observer = problem.sensing.observer
+    if observer is None or not observer.needs_detectability:
         return
     free = free_errors(problem)
     if not free.decays:
-        measured = ", ".join(belief.uses(problem.sensing.measures(problem.plant)))
+        measured = ", ".join(observer.uses(problem.sensing.measures(problem.plant)))
         raise NotSupported(
-            f"{type(belief).__name__}: {' and '.join(free.states)} cannot be observed along the reference from {measured}, and an "
-            f"error of what is believed does not decay (pole {free.pole:.3g} {problem.rate_unit}); measure {free.states[0]}, or "
+            f"{type(observer).__name__}: {' and '.join(free.states)} cannot be observed along the reference from {measured}, and "
+            f"an error of what is believed does not decay (pole {free.pole:.3g} {problem.rate_unit}); measure {free.states[0]}, or "
             "another quantity that depends on it; ModelStates() believes the model alone"
         )
 
 
 def check_believed(problem: Problem, controller: Controller) -> None:
-    """Raise if a controller cannot be given believed states, or the belief cannot be right.
+    """Raise if a controller cannot be given believed states, or the observer cannot be right.
 
     Raises:
         NotSupported: an adaptive controller whose response nobody measures; a measurement that is late by a fraction of a cycle
@@ -89,7 +89,7 @@ def check_believed(problem: Problem, controller: Controller) -> None:
             decay.
     """
     sensing, plant = problem.sensing, problem.plant
-    if sensing.belief is None:
+    if sensing.observer is None:
         return
     lost = sensing.believed_response(plant)
     if lost and controller.deformation.adapts:
@@ -103,14 +103,14 @@ def check_believed(problem: Problem, controller: Controller) -> None:
     if model.parameter.elements != plant.parameter.elements:
         raise NotSupported(
             f"{type(controller).__name__} has a model with other parameters than the problem's, and states are believed by the "
-            "problem's; leave the belief out, or give both the same parameters"
+            "problem's; leave the observer out, or give both the same parameters"
         )
     check_observed(problem)
 
 
 def _check_late(problem: Problem) -> None:
     """Raise where the signals of the time of the samples are not known."""
-    if SampleTime(problem).fraction and told_places(problem.plant, problem.signals):
+    if SampleTime(problem).fraction and known_places(problem.plant, problem.signals):
         late, unit = problem.dead_time.measurement, problem.time_unit
         raise NotSupported(
             f"believed states beside signals from outside need a measurement that is late by whole cycles, and {late:g} {unit} are "

@@ -31,7 +31,7 @@ import numpy as np
 
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.reference_states import reference_states, response_scale
-from fpirhc.controllers.seeing import given_states, raw_signal
+from fpirhc.controllers.sensing_chain import given_states, raw_signal
 from fpirhc.errors import Mistakes
 from fpirhc.plant.motion import controlled_places
 from fpirhc.sensing.base import response_names

@@ -31,7 +31,7 @@ from fpirhc.controllers.beside_plan import (
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
-from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
+from fpirhc.controllers.online_reference import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -51,7 +51,7 @@ from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.functions import nan_where, numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, live_numbers, nominal, settled
-from fpirhc.task.outside import previewed_values
+from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))

@@ -21,7 +21,7 @@ import numpy as np
 from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.reference_states import Scale, response_scale
-from fpirhc.controllers.seeing import raw_signal
+from fpirhc.controllers.sensing_chain import raw_signal
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals

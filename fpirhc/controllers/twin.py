@@ -48,7 +48,7 @@ def twin_block(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
-        parameters, signals = path.told.acted(s, path.late)
+        parameters, signals = path.known.acted(s, path.late)
         acting, answered, next_deformations = past.seen(s)
         waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
         at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, -acting))
@@ -196,7 +196,7 @@ def twin_of_outputs(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
-        parameters, signals = path.told.acted(s, path.late)
+        parameters, signals = path.known.acted(s, path.late)
         waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
         at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, calm))
         offset = ca.if_else(waits, s.mirror_offset, ahead @ s.mirror_offset)

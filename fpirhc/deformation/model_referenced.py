@@ -29,7 +29,7 @@ import casadi as ca
 from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing
 from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every, several
-from fpirhc.deformation.wrappers.base import Wrapper, of_map
+from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.expression import is_finite
@@ -109,7 +109,7 @@ class ModelReferenced(Wrapper):
         size, queue, past = request.numel(), self._queue, memory["own_deformation"]
         before, pole = past[:size], self._leak
         undeformed = request - queue.delayed(past, size)
-        next_request, next_memory = self.map.step(request, response, undeformed, of_map(self, memory, size))
+        next_request, next_memory = self.map.step(request, response, undeformed, discrete(self, memory, size))
         deformation = next_request - undeformed
         if nominal(pole):
             deformation = pole * before + (1 - pole) * deformation

@@ -17,7 +17,7 @@ from functools import cache, wraps
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import ClassVar, ParamSpec, TypeVar, get_origin
+from typing import TYPE_CHECKING, ClassVar, ParamSpec, TypeVar, get_origin
 
 import casadi as ca
 
@@ -26,6 +26,7 @@ from fpirhc.errors import InvalidField, nearest
 from fpirhc.fields.expected import Anything, Expected, Number, accepts, expected_by
 from fpirhc.fields.given import call_of, described, shortened, signature_of
 from fpirhc.fields.user_code import users_place
+from fpirhc.members import FORMER_MEMBERS
 
 
 class _CheckedWhenCalled(ABCMeta):
@@ -41,6 +42,11 @@ class _CheckedWhenCalled(ABCMeta):
         find_by_name(value)
         return value
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(cls, name: str) -> object:
+            raise missing(cls, name)
+
 
 class Checked(metaclass=_CheckedWhenCalled):
     """A value whose arguments are checked when it is made; dictionaries in its fields are found by name.
@@ -53,6 +59,16 @@ class Checked(metaclass=_CheckedWhenCalled):
     def _lacks(self) -> Iterator[str]:
         """Yield what the contract of the class asks for and this value does not have, beside abstract methods."""
         yield from ()
+
+
+def missing(owner: type, name: str) -> AttributeError:
+    """The error of an attribute that is not there, with the name that took the place of an earlier one."""
+    now = next(
+        (FORMER_MEMBERS[k] for k in (f"{base.__name__}.{name}" for base in owner.__mro__) if k in FORMER_MEMBERS), None
+    )
+    return AttributeError(
+        f"{owner.__name__} has no attribute '{name}'" + (f"; it is called '{now}' now" if now else ""), name=name
+    )
 
 
 def mistakes_of(owner: type, named: Mapping[str, object]) -> Iterator[str]:
@@ -198,7 +214,9 @@ class _Arguments:
             if key in values:
                 yield f"{name}: '{key}' is given twice, by its place and by its name"
             elif key not in self.expected and not self.open:
-                yield f"{name} has no {self.noun} '{key}'.{nearest(key, self.expected)}"
+                now = FORMER_MEMBERS.get(f"{name}({key})")
+                hint = f" It is called '{now}' now." if now else nearest(key, self.expected)
+                yield f"{name} has no {self.noun} '{key}'.{hint}"
         if len(arguments) > len(self.positional) and not self.open:
             extra = described(arguments[len(self.positional)])
             yield f"{name} takes {len(self.positional)} values without a name, got {len(arguments)}; {extra} is too many"

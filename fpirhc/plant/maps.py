@@ -73,7 +73,7 @@ def check_map(plant: Motion, mistakes: Mistakes) -> None:
     """Add every mistake of the steps to `mistakes`."""
     if plant.step is None:
         if plant.next is not None or plant.steps != 1:
-            mistakes.add("step is missing: a map needs the length of its step; write Plant.of_map(..., step=...)")
+            mistakes.add("step is missing: a map needs the length of its step; write Plant.discrete(..., step=...)")
         return
     step = plant.step
     if not (finite_number(step) and step > 0):
@@ -82,7 +82,7 @@ def check_map(plant: Motion, mistakes: Mistakes) -> None:
         mistakes.add("order: every state of a map has the order 1; later steps are found from outputs")
     elif plant.next is not None and getattr(plant.response, "next", None) is not plant.next:
         mistakes.add(
-            "response: that of a map is the difference of its steps; give the map alone, Plant.of_map(next=...)"
+            "response: that of a map is the difference of its steps; give the map alone, Plant.discrete(next=...)"
         )
 
 

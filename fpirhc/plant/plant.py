@@ -67,7 +67,7 @@ class Plant(Motion):
         outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
             coordinates themselves. Their relative orders are found from the symbols.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
-        step: of a map, the time from one state to the next; None: differential equations. See `Plant.of_map`.
+        step: of a map, the time from one state to the next; None: differential equations. See `Plant.discrete`.
         next: of a map, the function of (x, u, p) that returns {state: its value one step later}.
         steps: of a map, how many a control cycle has, with the command held; `Problem` counts them.
 
@@ -135,7 +135,7 @@ class Plant(Motion):
         )
 
     @classmethod
-    def of_map(
+    def discrete(
         cls,
         *,
         states: Mapping[str, str],
@@ -151,7 +151,7 @@ class Plant(Motion):
     ) -> Self:
         """Return the map x+ = f(x, u, p), y = h(x, p), which steps and has no differential equation.
 
-            plant = Plant.of_map(states={"stock": "t"}, inputs={"catch": "t/year"}, parameters={...}, next=grown, step=1.0, ...)
+            plant = Plant.discrete(states={"stock": "t"}, inputs={"catch": "t/year"}, parameters={...}, next=grown, step=1.0, ...)
 
         A response is a divided difference, (y_{k+1} - y_k) / T for an output that an input reaches in one control cycle of T; see
         `fpirhc.plant.maps`. `Problem` takes no integrator for a map, and its period is a whole number of steps.

@@ -80,7 +80,7 @@ def _responses(name: str, run: Run, edges: np.ndarray) -> list[dict[str, Any]]:
     for c in run.layout["deformed"].elements:
         requested, real = run[f"deformed.{c}"], run[f"plant_realised.{c}"]
         lines = [("the model expected", np.concatenate([real[:1], requested[:-1]])), ("the reality did", real)]
-        title = f"{name}: response of {c}, belief and reality"
+        title = f"{name}: response of {c}, observer and reality"
         charts.append({**_chart(title, run.unit(f"deformed.{c}"), lines, edges), "only": name})
     return charts
 

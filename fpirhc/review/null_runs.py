@@ -18,7 +18,7 @@ from fpirhc.review.prediction import NominalRun, exactly
 from fpirhc.simulation.error_pair import ErrorPair
 from fpirhc.simulation.model_as_plant import shortened, with_believed_way
 from fpirhc.simulation.simulate import simulate
-from fpirhc.task.outside import as_told
+from fpirhc.task.exogenous import as_known
 from fpirhc.task.problem import Problem
 
 _ROUNDING = 1e-9  # of the reference's size
@@ -54,7 +54,7 @@ def null_problem(problem: Problem, controller: Controller) -> Problem:
     known = ready.plant_model(problem)
     plant = exactly(problem.plant, known.parameters(problem.plant))
     sensing = replace(problem.sensing, sensors={})
-    signals = as_told(problem.plant, known.signals)
+    signals = as_known(problem.plant, known.signals)
     model = replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
     return with_believed_way(shortened(model, CYCLES), ready.deformation)
 

@@ -122,9 +122,11 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
     if loops is None:
         return (Answer("Is there a linear loop along the reference?", Verdict.UNKNOWN, broken[0]),)
     case = Case(grid, ready, loops, runs)
-    of_map = _of_target if ready.deforms == "target" else _of_map
+    discrete = _of_target if ready.deforms == "target" else _of_map
     inner = (
-        attempted("the answers about the map", of_map, case, general, broken=broken) if ready.deformation.adapts else []
+        attempted("the answers about the map", discrete, case, general, broken=broken)
+        if ready.deformation.adapts
+        else []
     )
     if inner is None:
         inner = [Answer("Does the iteration converge?", Verdict.UNKNOWN, broken[0])]

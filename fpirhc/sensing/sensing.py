@@ -6,7 +6,7 @@ Where sensing is not ideal, a run's `state` and `realised` are the estimates tha
 `plant_state` and `plant_realised`, the sensors' output is `measured`, which reaches the estimator after the dead time as `arrived`,
 and `true_error` counts in the metrics. Random series are drawn before the run, so the loop itself stays a function.
 
-An estimator and the controller behind it are one step from raw measurements to the command (`fpirhc.controllers.seeing`): a
+An estimator and the controller behind it are one step from raw measurements to the command (`fpirhc.controllers.sensing_chain`): a
 controller on a machine is given what its sensors show.
 
 Before the run there are no samples, so the first estimates of the response are not measured ones. The deformation therefore waits
@@ -27,9 +27,9 @@ from fpirhc.fields.checked import Checked
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, quantities, response_names
-from fpirhc.sensing.belief import Belief
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.sensor import Sensor
+from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import ceil
@@ -44,9 +44,9 @@ def uncovered(
     estimator: DerivativeEstimator,
     named: Sequence[str] | None,
     measured: tuple[str, ...],
-    belief: Belief | None,
+    observer: StateObserver | None,
 ) -> Iterator[str]:
-    """Yield a sentence for everything that is needed and neither measured nor believed, and for a belief without need.
+    """Yield a sentence for everything that is needed and neither measured nor believed, and for an observer without need.
 
     The outputs that controllers follow are measured or estimated, never believed: an output that the wrong model computes would be
     followed in place of the true one.
@@ -56,23 +56,23 @@ def uncovered(
         estimator: of state, or outputs, and response.
         named: names of the measured quantities where a user names them.
         measured: names of all measured quantities.
-        belief: how other states are believed.
+        observer: how other states are believed.
     """
     missing = [n for n in estimator.measures(plant.face) if n not in measured]
     if named is not None and not measured:
         yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
-    elif belief is not None and named is None and not plant.outputs:
+    elif observer is not None and named is None and not plant.outputs:
         yield (
-            f"belief: everything that {type(estimator).__name__} needs is measured; name what sensors show: "
+            f"observer: everything that {type(estimator).__name__} needs is measured; name what sensors show: "
             f"Sensing(measured={list(measured)!r}, ...)"
         )
-    elif belief is None and missing:
+    elif observer is None and missing:
         yield (
             f"measured: {type(estimator).__name__} also needs {', '.join(missing)}; measure it, or state how it is "
-            "believed: Sensing(measured=..., belief=ModelStates())"
+            "believed: Sensing(measured=..., observer=ModelStates())"
         )
     if plant.outputs:
-        yield from _of_outputs(plant, estimator, missing, measured, believes=belief is not None)
+        yield from _of_outputs(plant, estimator, missing, measured, believes=observer is not None)
 
 
 def _of_outputs(
@@ -87,8 +87,8 @@ def _of_outputs(
     states = [n for n in measured if n not in plant.output.elements and n in plant.state.elements]
     if not believes and states:
         yield (
-            f"measured: {', '.join(states)} is given as it is to controllers of a plant with outputs, unless a belief is stated: "
-            "leave it out, or add Sensing(..., belief=KalmanFilter(...))"
+            f"measured: {', '.join(states)} is given as it is to controllers of a plant with outputs, unless an "
+            "observer is stated: leave it out, or add Sensing(..., observer=KalmanFilter(...))"
         )
 
 
@@ -99,18 +99,18 @@ class Sensing(Checked):
     Args:
         sensors: by name of the measured quantity, which is a state element ("q1", "q1'") or, where the estimator measures it, the
             highest derivative of a controlled coordinate ("q1''"). A quantity that is not named is measured perfectly. Of a plant
-            with outputs, coordinates are its outputs; with a belief, states may be measured beside them.
+            with outputs, coordinates are its outputs; with an observer, states may be measured beside them.
         estimator: of state and response from the measured quantities: Measured, VelocityDifference, LowPassDifference,
             PositionDifference, SavitzkyGolay, StateVariableFilter.
         measured: names of the quantities that sensors show; None: all that the estimator needs.
-        belief: how the states that no sensor shows are known: ModelStates, KalmanFilter, MovingHorizonStates. See
-            `fpirhc.sensing.belief`.
+        observer: how the states that no sensor shows are known: ModelStates, KalmanFilter, MovingHorizonStates. See
+            `fpirhc.sensing.state_observer`.
     """
 
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     estimator: DerivativeEstimator = field(default_factory=Measured)
     measured: Sequence[str] | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
-    belief: Belief | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    observer: StateObserver | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def ideal(self) -> bool:
@@ -120,7 +120,7 @@ class Sensing(Checked):
     @property
     def estimates(self) -> bool:
         """Whether state or response are estimated, so that a controller's step begins with raw measurements."""
-        return not self.estimator.measures_all or self.measured is not None or self.belief is not None
+        return not self.estimator.measures_all or self.measured is not None or self.observer is not None
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured quantities: states, outputs, and highest derivatives of controlled ones."""
@@ -139,8 +139,8 @@ class Sensing(Checked):
         return tuple(e for e in elements if e in by_outputs or e in measures)
 
     def believed(self, plant: Plant) -> tuple[str, ...]:
-        """State elements that a controller is given from the belief."""
-        return self.belief.believes(plant, self.known(plant)) if self.belief is not None else ()
+        """State elements that a controller is given from the observer."""
+        return self.observer.believes(plant, self.known(plant)) if self.observer is not None else ()
 
     def believed_response(self, plant: Plant) -> tuple[str, ...]:
         """Quantities that the response follows from and no sensor shows."""
@@ -157,13 +157,16 @@ class Sensing(Checked):
         mistakes.unknown("sensors: quantity", self.sensors, every)
         for name in self.sensors:
             if name in every and name not in measures:
-                by = self.belief if name in self.believed(plant) else self.estimator
+                by = self.observer if name in self.believed(plant) else self.estimator
                 what = f"'{name}' is estimated by {type(by).__name__}, not measured"
                 mistakes.add(f"sensors: {what}; sensors are those of {', '.join(measures)}")
         mistakes.unknown("measured: quantity", self.measured or (), every)
-        for mistake in uncovered(plant, self.estimator, self.measured, measures, self.belief):
+        for mistake in uncovered(plant, self.estimator, self.measured, measures, self.observer):
             mistakes.add(mistake)
-        parts = (lambda: self.estimator.check(plant.face), lambda: self.belief and self.belief.check(plant, measures))
+        parts = (
+            lambda: self.estimator.check(plant.face),
+            lambda: self.observer and self.observer.check(plant, measures),
+        )
         for part in parts:
             try:
                 part()

@@ -28,7 +28,7 @@ import casadi as ca
 
 from fpirhc.plant.motion import outside_names
 from fpirhc.sensing.base import values_of
-from fpirhc.sensing.belief import Model
+from fpirhc.sensing.state_observer import Model
 from fpirhc.symbolic.layout import Expression
 
 _STAYS = 0.1  # share of its distance from a bound that a step leaves at least

@@ -16,12 +16,12 @@ from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gap import BRIDGED, across_gaps, gap_of
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.own_reference import given_signals
+from fpirhc.controllers.online_reference import given_signals
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.response_jumps import response_jumps
-from fpirhc.controllers.seeing import compose_seeing, seeing_blocks
+from fpirhc.controllers.sensing_chain import compose_seeing, seeing_blocks
 from fpirhc.plant.plant import Plant
-from fpirhc.simulation.outside_blocks import outside_blocks, real_name
+from fpirhc.simulation.exogenous_blocks import outside_blocks, real_name
 from fpirhc.simulation.path import (
     SENT,
     acting_blocks,

@@ -17,10 +17,10 @@ from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.gap import across_gaps, gap_of
 from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.live_settings import LiveSettings
+from fpirhc.controllers.monitor import watch_block
 from fpirhc.controllers.response_jumps import response_jumps
-from fpirhc.controllers.seeing import compose_seeing, given_states, raw_signal
+from fpirhc.controllers.sensing_chain import compose_seeing, given_states, raw_signal
 from fpirhc.controllers.step_outcome import was_skipped
-from fpirhc.controllers.watch import watch_block
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported
 from fpirhc.sensing.base import names_of_responses
@@ -39,7 +39,7 @@ _STATUS, _GATED = "_status_of_cycle", "_status_of_gate"
 
 
 @dataclass(frozen=True)
-class Watch:
+class RunMonitor:
     """How long something may be wrong before a cycle's status says so.
 
     Args:
@@ -51,18 +51,18 @@ class Watch:
     window: int = 50
 
 
-def machine_step(problem: Problem, controller: Controller, gate: Gate, watch: Watch) -> Composite:
+def machine_step(problem: Problem, controller: Controller, gate: Gate, monitor: RunMonitor) -> Composite:
     """Return the step (memory, sample, parameters) -> (memory, trace, command); `Gate.named` names its memory.
 
     Args:
         problem: of the controller.
         controller: resolved.
         gate: around the controller's step.
-        watch: the limits of the watch.
+        monitor: the limits of the monitor.
     """
     block = _renamed(gate.block(), "status", _GATED)
-    longest = round(watch.saturated_after / problem.period)
-    watched = watch_block(problem, controller, _STATUS, longest=longest, window=watch.window)
+    longest = round(monitor.saturated_after / problem.period)
+    watched = watch_block(problem, controller, _STATUS, longest=longest, window=monitor.window)
     own = _identity_block(fingerprint(problem, controller, block.memory))
     block, jumps = fed(block, "time", Signal(CLOCK)), response_jumps(nominal(problem), gate.reads)
     gated = [block] if jumps is None else jumps.around(block)
@@ -112,12 +112,12 @@ def composed_step(
     ready: Controller,
     plausible: Mapping[str, Interval],
     max_age: float | None,
-    watch: Watch,
+    monitor: RunMonitor,
     bridged: int,
 ) -> tuple[Composite, Layout]:
     """Return the step behind its gate, and the layout of its memory.
 
-    Gate and watch have the numbers of the build, and no live ones.
+    Gate and monitor have the numbers of the build, and no live ones.
     """
     gates: list[Gate] = []
 
@@ -125,7 +125,7 @@ def composed_step(
         gap = gap_of(live.problem, bridged)
         inner = across_gaps(compose_seeing(problem, controller))
         gates.append(Gate(live.problem, inner, plausible=plausible, max_age=max_age, gap=gap))
-        return machine_step(live.problem, ready, gates[-1], watch)
+        return machine_step(live.problem, ready, gates[-1], monitor)
 
     composite = live.composed(compose) if live.paths else compose(live.problem, ready)
     return composite, gates[-1].named(composite.memory)

@@ -12,7 +12,7 @@ from fpirhc.plant.behind_actuators import behind_actuators
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.task.dead_time import DeadTime
-from fpirhc.task.outside import as_told
+from fpirhc.task.exogenous import as_known
 from fpirhc.task.problem import Problem
 from fpirhc.task.reality import Reality
 
@@ -60,7 +60,7 @@ class ModelAsPlant:
     def __init__(self, problem: Problem, *, seed: int) -> None:
         """Take the problem of the loops, and the seed of the sensors' noise."""
         own = problem.of_model
-        self._own = replace(own, signals=as_told(own.plant, own.signals)) if own.signals else own
+        self._own = replace(own, signals=as_known(own.plant, own.signals)) if own.signals else own
         # The loops have the real plant and signals.
         self._foreign = problem.reality is not None or bool(problem.signals)
         self._seed = seed

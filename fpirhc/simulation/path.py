@@ -16,11 +16,11 @@ import numpy as np
 
 from fpirhc.controllers.base import Response, error_signal, like, rename
 from fpirhc.controllers.face import measured_signals, on_face
-from fpirhc.controllers.own_reference import own_signals
-from fpirhc.controllers.seeing import first_estimates, first_shown
+from fpirhc.controllers.online_reference import own_signals
+from fpirhc.controllers.sensing_chain import first_estimates, first_shown
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import backward_difference, combine, response_names
-from fpirhc.simulation.outside_blocks import real_name
+from fpirhc.simulation.exogenous_blocks import real_name
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
@@ -130,7 +130,7 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
     first, resting = first_estimates(problem)
     starts = (problem.start_state, first) if plant.outputs else (first,)
-    states_pass = sensing.belief is None  # a believed state is the controller's own
+    states_pass = sensing.observer is None  # a believed state is the controller's own
     states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if states_pass else []
     if not sensing.ideal:
         others = states[:-1]

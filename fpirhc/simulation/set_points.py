@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from fpirhc.controllers.own_reference import given_signals
+from fpirhc.controllers.online_reference import given_signals
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.fields.given import described
 from fpirhc.fields.kinds import named_entries, real_number

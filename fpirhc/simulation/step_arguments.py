@@ -16,8 +16,8 @@ from fpirhc.by_name import ByName
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
-from fpirhc.controllers.own_reference import given_signals
-from fpirhc.controllers.seeing import given_states, raw_signal
+from fpirhc.controllers.online_reference import given_signals
+from fpirhc.controllers.sensing_chain import given_states, raw_signal
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue
 from fpirhc.fields.kinds import named_entries
 from fpirhc.simulation.machine import SKIPPED
@@ -198,7 +198,7 @@ class NumbersNow:
         self.numbers = numbers
         return True
 
-    def aim(self, setpoints: SetpointsNow) -> bool:
+    def set_reference(self, setpoints: SetpointsNow) -> bool:
         """Put set-points in force, by coordinate or output, and return whether they were accepted.
 
         Raises:
@@ -225,9 +225,9 @@ class NumbersNow:
         }
         return ByName(values, "Stepper.setpoints")
 
-    def stale(self) -> dict[str, str]:
+    def outdated(self) -> dict[str, str]:
         """Return what follows from live settings by way of Python, and what becomes of a device that keeps the old number."""
-        return ByName(self._composite.derived(self.numbers).stale if self.numbers else {}, "Stepper.stale()")
+        return ByName(self._composite.derived(self.numbers).stale if self.numbers else {}, "Stepper.outdated()")
 
     def _write(self, numbers: Mapping[str, float]) -> None:
         """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import isnan, nan
 from time import perf_counter
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -17,11 +17,11 @@ from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.errors import ConcurrentUse
-from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked import Checked, missing
 from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.simulation.clock import Clock, Deadline, missed_cycles, most_missed
 from fpirhc.simulation.harm_warning import warn_of_harm, with_recommended_gain
-from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, composed_step, measures, refuse_unbounded
+from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, measures, refuse_unbounded
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
 from fpirhc.simulation.set_points import SetpointsNow
@@ -86,7 +86,7 @@ class Stepper(Checked):
         compiled: bool = True,
         plausible: Mapping[str, Interval] | None = None,
         max_age: float | None = None,
-        watch: Watch | None = None,
+        monitor: RunMonitor | None = None,
         bounded: bool = True,
         live: Sequence[str] = (),
         deadline: float | None = None,
@@ -102,7 +102,7 @@ class Stepper(Checked):
             plausible: intervals (lower, upper) by name of a state ("q1", "q1'") or response ("q1''"), which replace the automatic
                 ones (see `fpirhc.controllers.plausible`).
             max_age: oldest sample that is used, s; the time stamps of samples must then increase. None: they are not looked at.
-            watch: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
+            monitor: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
             bounded: whether an optimiser whose call may take any time is refused.
             live: paths of the live settings.
             deadline: longest time of a step, s; longer ones are counted, see `deadline`. None: no step is timed.
@@ -126,7 +126,7 @@ class Stepper(Checked):
         if bounded:
             refuse_unbounded(ready)
         ranges = plausible_range(problem, plausible)
-        self._composite, self.memory = composed_step(settings, ready, ranges, max_age, watch or Watch(), bridged)
+        self._composite, self.memory = composed_step(settings, ready, ranges, max_age, monitor or RunMonitor(), bridged)
         backend = native(self._composite.function, required=bool(live)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
         self.signals: Layout = self._composite.trace
@@ -152,6 +152,11 @@ class Stepper(Checked):
         self._skipped = self.memory.slice(f"{SKIPPED}_before").start
         self._late, self._most = 1.5 * self._period, most_missed(problem, bridged)
         warn_of_harm(problem, controller)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> object:
+            raise missing(type(self), name)
 
     def __repr__(self) -> str:
         """What it is of, how it runs, and how it keeps its deadline."""
@@ -189,7 +194,7 @@ class Stepper(Checked):
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
                 the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
             setpoints: set-points from this step on, by coordinate or output: a number, or where they are announced one number per
-                node of the horizon; see `aim`.
+                node of the horizon; see `set_reference`.
 
         Raises:
             InvalidShape: a wrong number of entries, named.
@@ -266,7 +271,7 @@ class Stepper(Checked):
         """
         return self._now.change(settings)
 
-    def aim(self, setpoints: SetpointsNow) -> bool:
+    def set_reference(self, setpoints: SetpointsNow) -> bool:
         """Put set-points in force from the next step on, by coordinate or output, and return whether they were accepted.
 
         A set-point that is not finite, or outside the range or the limits of its state, is refused with all others of the call: the
@@ -276,7 +281,7 @@ class Stepper(Checked):
             InvalidName: a coordinate without set-point.
             InvalidShape: neither one number nor one per node.
         """
-        return self._now.aim(setpoints)
+        return self._now.set_reference(setpoints)
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -298,13 +303,13 @@ class Stepper(Checked):
         """Reason of the last change that was refused."""
         return self._now.why_refused
 
-    def stale(self) -> dict[str, str]:
+    def outdated(self) -> dict[str, str]:
         """Return what follows from live settings by way of Python, and the effect of a deployed build with the outdated value.
 
         Gains, scales, limits, weights and dead times themselves are data, and may be written at any time. An empty text
         says that the number must not stay as it was: change the settings that it follows from only where Python computes it.
         """
-        return self._now.stale()
+        return self._now.outdated()
 
     def trace(self) -> dict[str, np.ndarray]:
         """Return every signal of the last step by name.
@@ -329,7 +334,7 @@ class Stepper(Checked):
         if settings is not None:
             self.change(settings)
         if setpoints is not None:
-            self.aim(setpoints)
+            self.set_reference(setpoints)
         if isinstance(time, _TRUTHS):
             one_number("time", time)
 

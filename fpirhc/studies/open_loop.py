@@ -14,7 +14,7 @@ from fpirhc.optimisers.certificate import Certificate, certify
 from fpirhc.optimisers.plan import Plan, solve
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
-from fpirhc.task.outside import previewed_values
+from fpirhc.task.exogenous import previewed_values
 
 
 @dataclass(frozen=True, eq=False)

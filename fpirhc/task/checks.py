@@ -89,10 +89,10 @@ def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes
             f"sensing: {type(sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
             "have; leave the estimator out, and differences of its steps are taken"
         )
-    if max(model.face.orders) > 1 and (sensing.belief is not None or sensing.measured is not None):
+    if max(model.face.orders) > 1 and (sensing.observer is not None or sensing.measured is not None):
         mistakes.add(
             "sensing: believed states are not covered where an output of a map has an order above 1, because its next values are "
-            "predicted from measured states; leave measured and belief out"
+            "predicted from measured states; leave measured and observer out"
         )
     later = [name for name, order in zip(model.face.names, model.face.orders, strict=True) if order > 1]
     if later and reality is not None and reality.plant.step is None:
@@ -118,7 +118,7 @@ def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
 
 def needed_measurements(plant: Plant, sensing: Sensing) -> tuple[str, ...]:
     """Return the names of what is measured: by sensors, and the state that is given beside outputs where nothing is believed."""
-    states = plant.state.elements if plant.outputs and sensing.belief is None else ()
+    states = plant.state.elements if plant.outputs and sensing.observer is None else ()
     return tuple(dict.fromkeys((*states, *sensing.measures(plant))))
 
 
@@ -130,7 +130,7 @@ def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -
         sensing: of the problem.
         judged: names whose errors are judged beside the controlled ones; None: no other need be there.
     """
-    if sensing.belief is None:
+    if sensing.observer is None:
         return frozenset((*plant.coordinates, *plant.face.coordinates))
     measured = (name.rstrip("'") for name in needed_measurements(plant, sensing))
     return frozenset((*measured, *(judged or ()), *(plant.outputs or plant.controlled_names)))

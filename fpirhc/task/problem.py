@@ -29,9 +29,9 @@ from fpirhc.symbolic.live import nominal
 from fpirhc.task.checks import check_maps, check_stage, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
-from fpirhc.task.foreign import Foreign
+from fpirhc.task.exogenous import Exogenous, check_signals, not_held, real_values, rows_of, signals_of
+from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
-from fpirhc.task.outside import External, check_signals, not_held, real_values, rows_of, signals_of
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
 from fpirhc.task.steps import check_steps
@@ -66,7 +66,7 @@ class Problem(Checked):
         judged: coordinates, or outputs of a plant that has some, whose errors are logged and measured; None: the controlled ones,
             and those that the cost weighs.
         reality: what a run moves, where it is not `plant` with its exact parameters: another plant (`Reality`), or an object
-            outside (`Foreign`). `plant` is then the model alone.
+            outside (`ExternalPlant`). `plant` is then the model alone.
         signals: values over time of every signal from outside that the plants declare, by name: `Known`, `Unknown` or `Believed`.
         name: of the problem in results; the problem of a file has the name of the file.
 
@@ -92,8 +92,8 @@ class Problem(Checked):
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
-    reality: Reality | Foreign | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
-    signals: Mapping[str, External] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
+    reality: Reality | ExternalPlant | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    signals: Mapping[str, Exogenous] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -187,7 +187,7 @@ class Problem(Checked):
         return self.reality.symbolic if self.reality is not None else None
 
     @property
-    def foreign(self) -> Foreign | None:
+    def foreign(self) -> ExternalPlant | None:
         """The reality where it is an object outside."""
         return self.reality.foreign if self.reality is not None else None
 
@@ -492,7 +492,7 @@ def _other_rows(problem: Problem) -> list[tuple[str, str]]:
     believed = problem.sensing.believed(problem.plant)
     if believed:
         rows.append(("measured", ", ".join(problem.sensing.measures(problem.plant))))
-        rows.append(("believed", f"{', '.join(believed)}, by {type(problem.sensing.belief).__name__}"))
+        rows.append(("believed", f"{', '.join(believed)}, by {type(problem.sensing.observer).__name__}"))
     return rows
 
 

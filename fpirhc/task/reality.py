@@ -35,7 +35,7 @@ class Reality(Checked):
 
     Args:
         plant: with the model's inputs, and a coordinate or an output of the same name and unit for what is measured, controlled or
-            judged of the model; without a belief that is all of it. Its exact parameters act; the approximate ones are not used,
+            judged of the model; without an observer that is all of it. Its exact parameters act; the approximate ones are not used,
             unless it is the model of an `ExactModel`.
         start: first values of states that the model does not have. Those that are not named settle: their rates are zero while
             the model's states and the inputs before the first cycle are held.
@@ -273,7 +273,7 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
     if own not in units:
         if name not in seen:
             followed = name in (model.controlled or model.face.names)
-            believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
+            believed = "" if followed else ", or have it believed: Sensing(measured=..., observer=ModelStates())"
             mistakes.add(
                 f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
                 f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"

@@ -35,7 +35,7 @@ def grown(x, u, p):
     }
 
 
-plant = fp.Plant.of_map(
+plant = fp.Plant.discrete(
     states={"adults": "kt", "recruits": "kt"},
     inputs={"effort": "kd"},
     next=grown,

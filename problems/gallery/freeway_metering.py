@@ -87,7 +87,7 @@ def ramp_demand(t):
     return joined(t, (0.0, 0.15, 0.35, 0.5), (500.0, 1500.0, 1500.0, 500.0))
 
 
-plant = fp.Plant.of_map(
+plant = fp.Plant.discrete(
     states={
         **{f"rho{i}": "veh/km" for i in range(1, SEGMENTS + 1)},  # per lane
         **{f"v{i}": "km/h" for i in range(1, SEGMENTS + 1)},

@@ -45,7 +45,7 @@ def unit(tmp_path_factory):
     return builder.FmuBuilder.build_FMU(folder / "tank.py", dest=folder)
 
 
-def problem(reality: fp.Foreign | None) -> fp.Problem:
+def problem(reality: fp.ExternalPlant | None) -> fp.Problem:
     return fp.Problem(
         plant=TANK,
         reality=reality,

@@ -47,7 +47,7 @@ class Server:
         self.level += seconds * (self.sent.read_value() - 0.5 * self.level)
         self.shown.write_value(self.level)
 
-    def body(self, **settings) -> fp.Foreign:
+    def body(self, **settings) -> fp.ExternalPlant:
         """The server as a reality."""
         return opcua_body(
             ADDRESS, TANK, period=PERIOD, clock=RealTime(lambda: self.now, self.sleep), **self.names, **settings

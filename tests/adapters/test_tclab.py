@@ -31,7 +31,7 @@ LAB = fp.Plant(
 )
 
 
-def problem(reality: fp.Foreign) -> fp.Problem:
+def problem(reality: fp.ExternalPlant) -> fp.Problem:
     return fp.Problem(
         plant=LAB,
         reality=reality,

@@ -189,7 +189,7 @@ def test_a_number_that_stands_for_a_symbol_is_a_number_and_a_bare_symbol_is_none
 
 
 @dataclass(frozen=True)
-class Foreign(Deformation):
+class ExternalPlant(Deformation):
     """A map of another distribution, which has no line for checks."""
 
     gain: float
@@ -222,23 +222,26 @@ class Foreign(Deformation):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"gain": "a"}, "Foreign.gain: expected a number, got the text 'a'"),
+        ({"gain": "a"}, "ExternalPlant.gain: expected a number, got the text 'a'"),
         (
             {"gain": 1.0, "inner": fp.Sigmoid},
-            "Foreign.inner: expected a Deformation or None, got the class Sigmoid; write Sig",
+            "ExternalPlant.inner: expected a Deformation or None, got the class Sigmoid; write Sig",
         ),
-        ({"gain": 1.0, "spans": {"a": (1.0, "b")}}, r"Foreign.spans\['a'\]\[1\]: expected a number, got the text 'b'"),
-        ({"gain": 1.0, "spans": {1: (1.0, 2.0)}}, "Foreign.spans: name 1: expected a text, got 1"),
+        (
+            {"gain": 1.0, "spans": {"a": (1.0, "b")}},
+            r"ExternalPlant.spans\['a'\]\[1\]: expected a number, got the text 'b'",
+        ),
+        ({"gain": 1.0, "spans": {1: (1.0, 2.0)}}, "ExternalPlant.spans: name 1: expected a text, got 1"),
         ({"gain": True}, "expected a number, got True"),
         ({"gain": float("nan")}, "expected a number, got nan"),
-        ({}, r"Foreign needs gain; write Foreign\(gain=\.\.\.\)"),
+        ({}, r"ExternalPlant needs gain; write ExternalPlant\(gain=\.\.\.\)"),
     ],
 )
 def test_a_class_of_another_distribution_is_checked_without_a_line_of_its_own(settings, message):
     with pytest.raises(InvalidField, match=message):
-        Foreign(**settings)
+        ExternalPlant(**settings)
     whole: Any = np.int64(2)
-    assert Foreign(np.float64(1.0), Foreign(2), {"a": (1, whole)}).gain == 1.0
+    assert ExternalPlant(np.float64(1.0), ExternalPlant(2), {"a": (1, whole)}).gain == 1.0
 
 
 def test_what_an_annotation_does_not_say_is_not_checked():

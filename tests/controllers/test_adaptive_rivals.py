@@ -16,6 +16,7 @@ from fpirhc.controllers.base import compose_controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Evidence
+from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.native import native
 
 FREE = (-np.inf, np.inf)
@@ -282,7 +283,7 @@ def test_mass_matrix_stays_positive_definite():
     ends = np.array(list(wild.bounds.values()))
     assert np.all((run["estimate"] >= ends[:, 0]) & (run["estimate"] <= ends[:, 1]))
     assert np.any((run["estimate"] == ends[:, 0]) | (run["estimate"] == ends[:, 1]))
-    mass = fp.Regressor(problem.plant, tuple(wild.bounds)).mass_function
+    mass = Regressor(problem.plant, tuple(wild.bounds)).mass_function
     for k in range(0, run.cycles, 50):
         matrix = mass(run["state"][k], run["estimate"][k], problem.plant.approximate).full()
         assert np.linalg.eigvalsh(matrix)[0] > 0
@@ -310,8 +311,8 @@ def test_informed_starts_from_the_exact_parameters():
 def test_combinations_are_learned_like_parameters():
     """A pendulum's inertia and weight instead of its mass and length: the error ends."""
     combinations = {
-        "inertia": fp.Combination(lambda p: p.m * p.l**2, "kg m^2"),
-        "weight": fp.Combination(lambda p: p.m * p.l, "kg m"),
+        "inertia": Combination(lambda p: p.m * p.l**2, "kg m^2"),
+        "weight": Combination(lambda p: p.m * p.l, "kg m"),
     }
     problem = fp.Problem(
         pendulum(),

@@ -34,8 +34,8 @@ from fpirhc.controllers.contract import (
     with_optimiser,
     without_deformation,
 )
-from fpirhc.controllers.demands import command_demand, plan_demand, reference_demand
 from fpirhc.controllers.mirror import MEASURED
+from fpirhc.controllers.scale_selection import command_demand, plan_demand, reference_demand
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import InvalidField, InvalidValue, NotContractive, NotSupported
 from fpirhc.status import Status

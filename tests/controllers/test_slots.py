@@ -15,6 +15,7 @@ from plants import pendulum
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.slots.floquet import floquet_radius
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.plant.relative_order import output_chain
@@ -49,7 +50,7 @@ def switches(run_: fp.Run) -> np.ndarray:
 def test_crane_schedule_is_stable_although_no_slot_is():
     """The pendulum swings undamped in a cart slot, the cart rolls on in an angle slot; one period shrinks both."""
     slots = CRANE.controllers["slots"]
-    floquet = fp.floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend)
+    floquet = floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend)
     assert floquet.radius == pytest.approx(0.0485, abs=5e-4)
     assert floquet.period == pytest.approx(5.3)
     for values in floquet.eigenvalues.values():
@@ -76,7 +77,7 @@ def period_map(problem: fp.Problem, controller: Controller, period: float) -> np
 def test_nonlinear_run_shrinks_by_the_floquet_radius():
     """Near the set-point, by the wrong model with the deformation: 0.0493 at 5 ms and 0.0487 at 1 ms for 0.0485."""
     slots = CRANE.controllers["slots+FPI"]
-    radius = fp.floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend).radius
+    radius = floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend).radius
     away = []
     for period in (5e-3, 1e-3):
         problem = crane({}, period=period, duration=10.6 + 2 * period, limits=fp.Limits())
@@ -96,7 +97,7 @@ def test_integrals_and_offsets_are_part_of_the_radius(of_cart, of_angle, blend, 
     laws = fp.Exponential(rate=1.0, integral=of_cart), fp.Exponential(rate=3.0, integral=of_angle)
     pair = tuple(replace(s, tracking=law) for s, law in zip(slots.slots, laws, strict=True))
     slots = replace(slots, slots=pair, blend=blend)
-    assert fp.floquet_radius(CRANE.problem, pair, slots.schedule, blend=blend).radius == pytest.approx(radius, rel=1e-3)
+    assert floquet_radius(CRANE.problem, pair, slots.schedule, blend=blend).radius == pytest.approx(radius, rel=1e-3)
     problem = crane({}, period=1e-3, duration=21.3, limits=fp.Limits())
     assert np.abs(np.linalg.eigvals(period_map(problem, slots, 5.3))).max() == pytest.approx(radius, rel=0.02)
 
@@ -104,7 +105,7 @@ def test_integrals_and_offsets_are_part_of_the_radius(of_cart, of_angle, blend, 
 def test_an_unstable_schedule_is_seen_and_grows_so():
     """The cart-pole's schedule grows by 1.09 per period by Floquet, and the run grows as it says."""
     slots, problem = POLE.controllers["slots+FPI"], POLE.problem
-    radius = fp.floquet_radius(problem, slots.slots, slots.schedule, blend=slots.blend).radius
+    radius = floquet_radius(problem, slots.slots, slots.schedule, blend=slots.blend).radius
     assert radius == pytest.approx(1.094, abs=1e-3)
     still = replace(problem, duration=1.21, measure_from=0.0, limits=fp.Limits())
     assert np.abs(np.linalg.eigvals(period_map(still, slots, 0.6))).max() == pytest.approx(radius, rel=0.02)
@@ -114,7 +115,7 @@ def test_one_slot_alone_has_the_radius_of_its_eigenvalues():
     """Without a switch one period is e^(A T), whose radius is e^(largest real part T)."""
     for integral in (False, True):
         slot = fp.Slot("q2", fp.Exponential(rate=4.0, integral=integral))
-        floquet = fp.floquet_radius(MASSES.problem, [slot], fp.Periodic({"q2": 1.5}), blend=0.1)
+        floquet = floquet_radius(MASSES.problem, [slot], fp.Periodic({"q2": 1.5}), blend=0.1)
         assert floquet.eigenvalues["q2"].size == 4 + integral
         assert floquet.eigenvalues["q2"].real.max() == pytest.approx(-0.1, abs=1e-3)
         assert floquet.radius == pytest.approx(np.exp(1.5 * floquet.eigenvalues["q2"].real.max()), rel=1e-9)
@@ -124,11 +125,11 @@ def test_no_radius_without_a_set_point_or_a_period():
     """The reason is said."""
     slots = CRANE.controllers["slots"]
     selection = fp.ByError({"cart": 1.0, "angle": 1.0}, dwell=0.5)
-    floquet = fp.floquet_radius(CRANE.problem, slots.slots, selection)
+    floquet = floquet_radius(CRANE.problem, slots.slots, selection)
     assert floquet.radius is None
     assert floquet.reason == "the schedule is not periodic"
     moving = replace(CRANE.problem, reference=fp.Trajectory(lambda t: {"cart": 0.1 * t, "angle": 0 * t}))
-    floquet = fp.floquet_radius(moving, slots.slots, slots.schedule)
+    floquet = floquet_radius(moving, slots.slots, slots.schedule)
     assert floquet.radius is None
     assert "still moves" in floquet.reason
 

@@ -12,6 +12,7 @@ from test_dead_time import DUFFING, LAW, affine, iteration_radius
 import fpirhc as fp
 from fpirhc.contraction.delayed import leaking_limit, loop_polynomial
 from fpirhc.deformation import Deformation
+from fpirhc.deformation.leaky import leaky_margin, leaky_pole
 from fpirhc.errors import InvalidValue, NotSupported
 
 
@@ -32,13 +33,13 @@ def test_theorem_on_random_draws():
         believed, wrong = int(random.integers(0, 61)), int(random.integers(1, 8))
         true = max(0, believed + int(random.integers(-wrong, wrong + 1)))
         product = float(random.uniform(0.02, 1.98))
-        assert radius(product, 1.001 * fp.leaky_pole(product, wrong), believed, true) < 1
+        assert radius(product, 1.001 * leaky_pole(product, wrong), believed, true) < 1
 
 
 @pytest.mark.parametrize("product", [0.5, 1.0, 1.5])
 def test_bound_is_tight_for_one_cycle(product):
     """A pole 1 % below the bound of m = 1 leaves some dead time unstable: the bound could not be lower."""
-    pole = 0.99 * fp.leaky_pole(product, 1)
+    pole = 0.99 * leaky_pole(product, 1)
     assert max(radius(product, pole, d, d + wrong) for d in (40, 80, 120) for wrong in (-1, 1)) > 1
 
 
@@ -51,11 +52,11 @@ def test_poles_and_margins():
     }
     for product, poles in table.items():
         for wrong, pole in zip((1, 2, 3, 5, 10), poles, strict=True):
-            result = fp.leaky_pole(product, wrong)
+            result = leaky_pole(product, wrong)
             assert result == pytest.approx(pole, abs=0.006)
             assert 4 * result / (1 - result) ** 2 == pytest.approx(product * (2 + product) * wrong**2, rel=1e-12)
-            assert fp.leaky_margin(product, result) == pytest.approx(wrong, rel=1e-12)
-    assert fp.leaky_pole(1.0, 0) == 0
+            assert leaky_margin(product, result) == pytest.approx(wrong, rel=1e-12)
+    assert leaky_pole(1.0, 0) == 0
 
 
 MARGINS = {  # cycles at d = 20 for the poles 0, .3, .5, .8, .9, .95; 20: any
@@ -73,7 +74,7 @@ def test_margin_table(product):
         while counted < 20 and all(radius(product, pole, 20, 20 + s * (counted + 1)) < 1 for s in (-1, 1)):
             counted += 1
         assert counted == margin
-        assert min(20, math.floor(fp.leaky_margin(product, pole))) <= margin
+        assert min(20, math.floor(leaky_margin(product, pole))) <= margin
 
 
 @pytest.mark.parametrize("form", [fp.Increment, fp.ModelReferenced])
@@ -110,7 +111,7 @@ def referenced_radius(deformation: fp.ModelReferenced, delay: int) -> float:
 
 def test_leak_is_faster_than_the_mean():
     """At the right dead time of 20 cycles and g = 1 the leak's slowest mode is .57 per cycle; a triangular mean does not decay."""
-    assert radius(1.0, fp.leaky_pole(1.0, 2), 20, 20) == pytest.approx(0.57, abs=0.01)
+    assert radius(1.0, leaky_pole(1.0, 2), 20, 20) == pytest.approx(0.57, abs=0.01)
     assert iteration_radius(fp.Paired(affine(1.0), cycles=20, uncertainty=2), 20) > 0.999
 
 
@@ -203,9 +204,9 @@ def test_a_dead_time_for_every_channel():
         (lambda: fp.Increment(affine(0.5), cycles=4, pole=1.0), r"Increment\(pole=1.0\): expected a number from 0"),
         (lambda: fp.Increment(affine(0.5), cycles=()), "or a tuple with one for every controlled coordinate"),
         (lambda: fp.ModelReferenced(affine(0.5), cycles=900, measurement=200), "between 0 and 1000"),
-        (lambda: fp.leaky_pole(2.0, 1), r"leaky_pole\(product=2.0\): expected .* in \(0, 2\)"),
-        (lambda: fp.leaky_pole(1.0, -1), "uncertainty=-1"),
-        (lambda: fp.leaky_margin(1.0, 1.0), "pole=1.0"),
+        (lambda: leaky_pole(2.0, 1), r"leaky_pole\(product=2.0\): expected .* in \(0, 2\)"),
+        (lambda: leaky_pole(1.0, -1), "uncertainty=-1"),
+        (lambda: leaky_margin(1.0, 1.0), "pole=1.0"),
     ],
 )
 def test_bad_settings(build, sentence):

@@ -24,7 +24,7 @@ PAGES = {
         'CHOICES = {"projected-gradient": ("projected gradient", lambda t: ProjectedGradient(30, t))}',
     ),
     "gradient": ("estimator", 'EXAMPLES = (Gradient("m", gain=0.02, largest=0.6),)'),
-    "observer": ("belief", 'EXAMPLES = (Observer({"a": {"a": 0.3}, "b": {"b": 0.3}}),)'),
+    "observer": ("observer", 'EXAMPLES = (Observer({"a": {"a": 0.3}, "b": {"b": 0.3}}),)'),
     "saturated": ("controller", "EXAMPLES = (Saturated(6.0, 20.0),)"),
 }
 MEMBERS = {
@@ -33,7 +33,7 @@ MEMBERS = {
     "optimisers": "ProjectedGradient",
     "estimators": "Gradient",
     "controllers": "Saturated",
-    "beliefs": "Observer",
+    "observers": "Observer",
 }
 # Two wrappers in each other, neither of them known to fpirhc: a controller whose user wants to name it.
 NAMED = '''
@@ -70,6 +70,7 @@ PROBLEM = '''
 from dataclasses import replace
 
 import fpirhc as fp
+from fpirhc.conformance import check_deformation, check_optimiser, check_tracking
 from abroad.clipped import Clipped
 from abroad.gradient import Gradient
 from abroad.named import Named
@@ -125,9 +126,9 @@ def test_members_from_abroad_are_found_and_keep_the_laws(abroad: Path) -> None:
         "import json; import fpirhc as fp; from fpirhc.studies.comparison.optimiser_choices import optimiser_choices\n"
         "from fpirhc.members import FAMILIES, examples, member_classes\n"
         "mine = lambda f: [e for e in examples(f) if type(e).__module__.startswith('abroad')]\n"
-        "[fp.check_deformation(m, seed=1) for m in mine('deformations')]\n"
-        "[fp.check_tracking(m, seed=1, period=2e-3, duration=6.0) for m in mine('tracking laws')]\n"
-        "[fp.check_optimiser(m, tolerance=1e-6, seed=1) for m in mine('optimisers')]\n"
+        "[check_deformation(m, seed=1) for m in mine('deformations')]\n"
+        "[check_tracking(m, seed=1, period=2e-3, duration=6.0) for m in mine('tracking laws')]\n"
+        "[check_optimiser(m, tolerance=1e-6, seed=1) for m in mine('optimisers')]\n"
         "assert 'projected-gradient' in optimiser_choices()\n"
         "families = {f: [c.__name__ for c in member_classes(f)] for f in FAMILIES}\n"
         "print(json.dumps([families, [len(mine(f)) for f in families], fp.Poles.__module__, fp.Named.__module__]))"

@@ -55,7 +55,7 @@ def stepped() -> Any:
     """What a stepper tells, with live settings."""
     stepper = fp.Stepper(TASK.problem, TASK.controllers[HEADLINE[1]], live=["deformation.gain"], compiled=False)
     stepper.step_measured(0.0, np.zeros(len(stepper.measures)), stepper.start())
-    return stepper.trace(), stepper.numbers, stepper.setpoints, stepper.stale()
+    return stepper.trace(), stepper.numbers, stepper.setpoints, stepper.outdated()
 
 
 def compared() -> Any:

@@ -25,6 +25,7 @@ import fpirhc.conformance.tracking as tracking_laws
 import fpirhc.controllers
 import fpirhc.optimisers
 import fpirhc.tracking
+from fpirhc.conformance import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
 from fpirhc.conformance.laws import within
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.base import Controller
@@ -67,12 +68,12 @@ TRACKINGS = examples("tracking laws")
 def test_tracking_laws(tracking):
     """Whatever is shipped decays on ideal plants of mixed order, forgets, and does not wind up."""
     period = getattr(tracking, "step", 5e-3)  # poles in z belong to one cycle
-    fp.check_tracking(tracking, seed=1, period=period, duration=6.0)
+    check_tracking(tracking, seed=1, period=period, duration=6.0)
 
 
 def test_exponential_decays_as_it_promises():
     """Not only to zero: along the curve of its equation."""
-    fp.check_tracking(fp.Exponential(rate=2.0, integral=False), seed=2, duration=6.0, decay=promised)
+    check_tracking(fp.Exponential(rate=2.0, integral=False), seed=2, duration=6.0, decay=promised)
 
 
 def test_every_member_has_examples():
@@ -167,13 +168,13 @@ class Thawed(Tracking):
 def test_wrong_tracking_laws_are_caught(wrong, law):
     """One message that names the class and the law."""
     with pytest.raises(AssertionError, match=f"{type(wrong).__name__} {breaks(law)}"):
-        fp.check_tracking(wrong, seed=1, period=2e-3, duration=6.0)
+        check_tracking(wrong, seed=1, period=2e-3, duration=6.0)
 
 
 def test_a_decay_that_is_not_the_promised_one_is_caught():
     """The numbers are told: where, how much, and what was promised."""
     with pytest.raises(AssertionError, match=r"the error's share is 0\.\d+ at t = \d.*promised is 0\.\d+"):
-        fp.check_tracking(fp.Exponential(rate=3.0, integral=False), seed=2, duration=6.0, decay=promised)
+        check_tracking(fp.Exponential(rate=3.0, integral=False), seed=2, duration=6.0, decay=promised)
 
 
 # Optimisers
@@ -191,7 +192,7 @@ SINGLE = fp.FixedPoint(iterations=1, tolerance=FINE)
 @pytest.mark.parametrize("optimiser", OPTIMISERS, ids=named(OPTIMISERS))
 def test_optimiser_laws(optimiser):
     """Riccati, finite differences and least squares agree with what each finds and says."""
-    fp.check_optimiser(optimiser, tolerance=FINE, seed=1)
+    check_optimiser(optimiser, tolerance=FINE, seed=1)
 
 
 @dataclass(frozen=True)
@@ -266,12 +267,12 @@ class Dishonest(Optimiser):
 def test_wrong_optimisers_are_caught(wrong, law):
     """Each lie is caught by the law that is about it."""
     with pytest.raises(AssertionError, match=f"Dishonest {breaks(law)}"):
-        fp.check_optimiser(wrong, tolerance=FINE, seed=1)
+        check_optimiser(wrong, tolerance=FINE, seed=1)
 
 
 def test_the_tolerance_must_tell_a_solution():
     with pytest.raises(InvalidValue, match="up to 1e-3"):
-        fp.check_optimiser(SETTLED, tolerance=0.1, seed=1)
+        check_optimiser(SETTLED, tolerance=0.1, seed=1)
 
 
 # Controllers
@@ -303,7 +304,7 @@ def test_controller_laws(example):
     """Limits, bad measurements, and one command however it is computed; C is compared where it compiles quickly."""
     controller, problem = on_problem(example)
     left = getattr(example, "left", None) or 0.05
-    fp.check_controller(controller, problem=problem, seed=1, left=left, compiled=example is CONTROLLERS[1])
+    check_controller(controller, problem=problem, seed=1, left=left, compiled=example is CONTROLLERS[1])
 
 
 class Counter(ca.Callback):
@@ -423,7 +424,7 @@ class Backwards(Tracking):
 def test_wrong_controllers_are_caught(wrong, law):
     """Also the clamp that turns a NaN into a full command."""
     with pytest.raises(AssertionError, match=f"Faulty {breaks(law)}"):
-        fp.check_controller(wrong, seed=1, compiled=False)
+        check_controller(wrong, seed=1, compiled=False)
 
 
 # Plants
@@ -434,7 +435,7 @@ def test_plant_laws(name):
     """Every shipped plant near its start."""
     problem = fp.load_problem(name).problem
     box = {e: (v - 0.1, v + 0.1) for e, v in zip(problem.plant.state.elements, problem.start_state, strict=True)}
-    fp.check_plant(problem.plant, seed=1, box=box)
+    check_plant(problem.plant, seed=1, box=box)
 
 
 def oscillator(response=None, inverse=None, cls=fp.Plant) -> fp.Plant:
@@ -493,14 +494,14 @@ PLANTS = (
 def test_wrong_plants_are_caught(wrong, law, sentence):
     """A sign in an inverse, a number where a parameter belongs, a lost derivative."""
     with pytest.raises(AssertionError, match=f"{breaks(law)}.*{sentence}"):
-        fp.check_plant(wrong, seed=1)
+        check_plant(wrong, seed=1)
 
 
 def test_the_box_is_checked():
     """A misspelt state is offered the right one; the box decides where a root is asked for."""
     with pytest.raises(InvalidProblem, match="Did you mean 'y'"):
-        fp.check_plant(oscillator(), seed=1, box={"yy": (0, 1)})
-    fp.check_plant(PLANTS[0][0], seed=1, box={"y": (1.0, 2.0)})
+        check_plant(oscillator(), seed=1, box={"yy": (0, 1)})
+    check_plant(PLANTS[0][0], seed=1, box={"y": (1.0, 2.0)})
 
 
 # The laws themselves
@@ -541,7 +542,7 @@ def test_deformations_are_named_too():
             return request + 0.4 * self.gain * (response - desired), {}
 
     with pytest.raises(AssertionError, match=f"Bare {breaks(deformation_laws.first_step_is_effective_gain)}"):
-        fp.check_deformation(Bare(-0.5), seed=1)
+        check_deformation(Bare(-0.5), seed=1)
 
 
 def test_what_a_class_raises_is_noted():
@@ -554,5 +555,5 @@ def test_what_a_class_raises_is_noted():
             return len(problem.plant.names) / 0
 
     with pytest.raises(ZeroDivisionError) as raised:
-        fp.check_controller(Broken(TRACKING), seed=1)
+        check_controller(Broken(TRACKING), seed=1)
     assert any("Broken" in note and "law" in note for note in raised.value.__notes__)

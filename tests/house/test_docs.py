@@ -11,7 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.seeing import compose_seeing
+from fpirhc.controllers.sensing_chain import compose_seeing
 from fpirhc.members import FAMILIES, member_classes
 from fpirhc.simulation.loop import close_loop
 

@@ -393,7 +393,7 @@ CONTRACTS = (
     "controllers.wrappers.predicted.Predictor",
     "deformation.base.Deformation",
     "horizon.cost.Cost",
-    "learning.estimators.base.Estimator",
+    "learning.estimators.base.ParameterEstimator",
     "learning.rules.base.Rule",
     "optimisers.base.Optimiser",
     "plant.integrators.Integrator",

@@ -14,9 +14,10 @@ from wrong import controllers, maps, observers, optimisers
 from wrong.tables import CONTROLLER_MEMBERS, CONTROLLERS, MAP_MEMBERS, MAPS, OBSERVERS, OPTIMISERS
 
 import fpirhc as fp
+from fpirhc import conformance
+from fpirhc.conformance import check_deformation, check_observer, deformation_facts
 from fpirhc.conformance import controller as controller_laws
 from fpirhc.conformance import deformation as deformation_laws
-from fpirhc.conformance import deformation_facts
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller
 from fpirhc.deformation.base import Deformation
@@ -33,11 +34,11 @@ def caught(check, member, law, sentence):
 
 
 def check_controller(member):
-    fp.check_controller(member, seed=1, compiled=False)
+    conformance.check_controller(member, seed=1, compiled=False)
 
 
 def check_optimiser(member):
-    fp.check_optimiser(member, tolerance=1e-6, seed=1)
+    conformance.check_optimiser(member, tolerance=1e-6, seed=1)
 
 
 @pytest.mark.parametrize("wrong", CONTROLLERS, ids=lambda c: c.__name__)
@@ -49,7 +50,7 @@ def test_a_wrong_controller_is_caught(wrong):
 @pytest.mark.parametrize("wrong", MAPS, ids=lambda c: c.__name__)
 def test_a_wrong_map_is_caught(wrong):
     """Its facts are another map's."""
-    caught(lambda m: fp.check_deformation(m, seed=1), wrong(0.3, 5.0), *MAPS[wrong])
+    caught(lambda m: check_deformation(m, seed=1), wrong(0.3, 5.0), *MAPS[wrong])
 
 
 @pytest.mark.parametrize("wrong", OPTIMISERS, ids=lambda c: c.__name__)
@@ -61,13 +62,13 @@ def test_a_wrong_optimiser_is_caught(wrong):
 @pytest.mark.parametrize("wrong", OBSERVERS, ids=lambda c: c.__name__)
 def test_a_wrong_observer_is_caught(wrong):
     """It uses what it cannot know, or does not come to the truth."""
-    caught(lambda m: fp.check_belief(m, seed=1), wrong(0.4), *OBSERVERS[wrong])
+    caught(lambda m: check_observer(m, seed=1), wrong(0.4), *OBSERVERS[wrong])
 
 
 def test_a_diverging_observer_is_caught():
     """The same class with a gain above two: every correction is wrong by more than the error was."""
     caught(
-        lambda m: fp.check_belief(m, seed=1),
+        lambda m: check_observer(m, seed=1),
         observers.ConstantGain(3.0),
         "wrong start is corrected",
         "does not converge",
@@ -92,9 +93,9 @@ def test_every_member_of_a_contract_has_a_law(contract, table, laws):
 def test_the_right_members_are_not_refused():
     """Every wrong member is one change away from a right one."""
     check_controller(controllers.Gentle(6.0, DEFORMATION))
-    fp.check_deformation(maps.Softsign(0.3, 5.0), seed=1)
+    check_deformation(maps.Softsign(0.3, 5.0), seed=1)
     check_optimiser(optimisers.HeavyBall(100, 1e-6))
-    fp.check_belief(observers.ConstantGain(0.4), seed=1)
+    check_observer(observers.ConstantGain(0.4), seed=1)
 
 
 def test_nobody_wrong_is_left_out():

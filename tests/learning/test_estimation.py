@@ -356,7 +356,7 @@ TWO_TASK = fp.Problem(
             r"'k' is 20 in the model, outside \[0, 10\]",
         ),
         (
-            task(spring(), sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y"], belief=fp.ModelStates())),
+            task(spring(), sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y"], observer=fp.ModelStates())),
             fp.RecursiveLeastSquares(SPRING, NOISE, 1.0),
             NotSupported,
             "RecursiveLeastSquares learns from the response, which needs y', and no sensor shows it",

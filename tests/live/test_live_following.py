@@ -73,7 +73,7 @@ def test_every_derived_number_says_what_an_old_one_does():
         stepper = fp.Stepper(problem, controller, compiled=False, live=paths)
         derived = {name for name in stepper._composite.settings.names if ".derived." in name}
         assert derived
-        assert stepper.stale().keys() == derived
-        assert {bool(words) for words in stepper.stale().values()} == safe
+        assert stepper.outdated().keys() == derived
+        assert {bool(words) for words in stepper.outdated().values()} == safe
     plain = fp.Stepper(two.problem, two.controllers["CTC+FPI (eq 6)"], compiled=False, live=["deformation.gain"])
-    assert plain.stale() == {}
+    assert plain.outdated() == {}

@@ -107,7 +107,7 @@ SETPOINTS = [HUGE, "0.3", None, {}, 1j, True, np.timedelta64(1, "s"), np.array([
 def test_wrong_set_points_are_refused_and_counted(value, stepper):
     """A text, a truth value and a duration are no set-points, though numpy makes numbers of them."""
     before, points = stepper.refused, stepper.setpoints
-    assert not stepper.aim({"q1": value})
+    assert not stepper.set_reference({"q1": value})
     assert (stepper.refused, stepper.setpoints) == (before + 1, points)
     assert "q1" in stepper.why_refused
 
@@ -115,11 +115,11 @@ def test_wrong_set_points_are_refused_and_counted(value, stepper):
 def test_right_numbers_of_every_kind_are_taken(stepper):
     """A number of numpy, an array with one entry, and an array as an interval."""
     assert stepper.change({GAIN: np.float32(-0.5), ENDS: np.array([-40.0, 40.0])})
-    assert stepper.aim({"q1": np.array([0.25]), "q2": np.int64(1)})
+    assert stepper.set_reference({"q1": np.array([0.25]), "q2": np.int64(1)})
     assert stepper.numbers[GAIN] == -0.5
     assert stepper.setpoints == {"q1": 0.25, "q2": 1.0}
     with pytest.raises(InvalidShape, match="expected one number, got 2"):
-        stepper.aim({"q1": [0.1, 0.2]})
+        stepper.set_reference({"q1": [0.1, 0.2]})
 
 
 @pytest.mark.parametrize("time", [np.timedelta64(1, "s"), np.datetime64("2020-01-01"), "0", None, HUGE, [0.0], 1j])

@@ -243,7 +243,7 @@ class Road:
 def test_a_body_outside_is_the_same_freeway() -> None:
     """Reset and step in place of the symbolic reality: the same commands. Without a lag nothing depends on the start before it."""
     problem = replace(task("freeway").problem, duration=1.0)
-    outside = replace(problem, reality=fp.Foreign(Road(problem), measures={"w2": "veh", "emission": "kg/h"}))
+    outside = replace(problem, reality=fp.ExternalPlant(Road(problem), measures={"w2": "veh", "emission": "kg/h"}))
     cascade = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-1.0), fp.ThroughModel(lag=0.0))
     one, other = (fp.simulate(p, cascade, seed=0, compiled=False) for p in (problem, outside))
     for name in ("command.r", "output.emission", "shift.emission", "realised.emission"):

@@ -37,7 +37,7 @@ def discretised(period: float) -> fp.Plant:
         after = ca.DM(a) @ ca.vertcat(x.y, x.v) + ca.DM(b) * p.effect * u.force
         return {"y": after[0], "v": after[1]}
 
-    return fp.Plant.of_map(**NAMES, next=next_state, step=period, outputs=SPEED)
+    return fp.Plant.discrete(**NAMES, next=next_state, step=period, outputs=SPEED)
 
 
 def differential(period: float) -> fp.Plant:
@@ -56,7 +56,7 @@ def euler(period: float) -> fp.Plant:
     def next_state(x: Any, u: Any, p: Any) -> dict[str, Any]:
         return {"y": x.y + period * x.v, "v": x.v + period * (-2.0 * x.y - 0.6 * x.v + 1.5 * p.effect * u.force)}
 
-    return fp.Plant.of_map(**NAMES, next=next_state, step=period, outputs={"y": fp.Output("m", lambda x, _: x.y)})
+    return fp.Plant.discrete(**NAMES, next=next_state, step=period, outputs={"y": fp.Output("m", lambda x, _: x.y)})
 
 
 def spring(period: float) -> fp.Plant:
@@ -119,8 +119,8 @@ def test_for_short_steps_the_map_is_the_differential_equation(form: str, pair: s
     between = []
     for period in (0.04, 0.02, 0.01):
         controller = fp.ComputedTorque(LAW, FORMS[form])
-        of_map, of_rates = (error_of(task(make(period), period), controller) for make in PAIRS[pair])
-        between.append(float(np.abs(of_map - of_rates).max()))
+        discrete, of_rates = (error_of(task(make(period), period), controller) for make in PAIRS[pair])
+        between.append(float(np.abs(discrete - of_rates).max()))
     assert between[0] < 0.04
     ratios = np.array(between[:-1]) / between[1:]
     assert np.all((ratios > 1.6) & (ratios < 2.4)), (between, ratios)
@@ -137,7 +137,7 @@ def harvested(x: Any, u: Any, p: Any) -> dict[str, Any]:
 @cache
 def stock(steps: int = 1) -> fp.Problem:
     """A stock with a horizon of six stages of two cycles, a cycle of `steps` maps."""
-    plant = fp.Plant.of_map(
+    plant = fp.Plant.discrete(
         states={"stock": "1"},
         inputs={"catch": "1"},
         parameters={"growth": fp.Parameter(0.8, 1.1, "1")},

@@ -27,7 +27,7 @@ def chain(order: int, wrong: float = 1.0) -> fp.Plant:
         last = p.a * x.x1 + 0.1 * x[names[-1]] ** 2 + p.b * u.u
         return {**{n: x[m] for n, m in pairwise(names)}, names[-1]: last}
 
-    return fp.Plant.of_map(
+    return fp.Plant.discrete(
         states=dict.fromkeys(names, "m"),
         inputs={"u": "N"},
         parameters={"a": fp.Parameter(0.4 * wrong, 0.4, "1"), "b": fp.Parameter(2.0 * wrong, 2.0, "1")},

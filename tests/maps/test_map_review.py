@@ -28,7 +28,7 @@ def grown(x: Any, u: Any, p: Any) -> dict[str, Any]:
 
 def task(**changes: Any) -> fp.Problem:
     """The first stock rests at a half."""
-    plant = fp.Plant.of_map(
+    plant = fp.Plant.discrete(
         states={"a": "1", "b": "1"},
         inputs={"catch": "1/s"},
         parameters={"growth": fp.Parameter(0.02, 0.03, "1/s"), "caught": fp.Parameter(1.0, 0.7, "1")},
@@ -107,7 +107,7 @@ def test_zero_dynamics_have_the_zeros_of_the_sampled_plant() -> None:
         after = ca.DM(a) @ ca.vertcat(x.y, x.v) + ca.DM(b) * p.effect * u.force
         return {"y": after[0], "v": after[1]}
 
-    plant = fp.Plant.of_map(
+    plant = fp.Plant.discrete(
         states={"y": "m", "v": "m/s"},
         inputs={"force": "N"},
         parameters={"effect": fp.Parameter(1.0, 1.0, "1")},
@@ -125,7 +125,7 @@ def test_zero_dynamics_have_the_zeros_of_the_sampled_plant() -> None:
 
 def test_the_loop_of_a_map_of_the_second_order_has_the_poles_of_its_law() -> None:
     """(q - 1 + rate T)^2 of the error: 0.6 twice, a double pole, which rounding splits."""
-    plant = fp.Plant.of_map(
+    plant = fp.Plant.discrete(
         states={"y": "1", "v": "1"},
         inputs={"u": "1"},
         parameters={},

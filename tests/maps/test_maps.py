@@ -18,6 +18,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.plant.maps import over
+from fpirhc.plant.relative_order import output_chain
 from fpirhc.report.series import chart_data
 
 T = 10.0  # s, one step
@@ -43,7 +44,7 @@ def fishery(**changes: Any) -> fp.Plant:
         "step": T,
         "ranges": {"stock": (0.0, 2.0)},
     }
-    return fp.Plant.of_map(**{**arguments, **changes})
+    return fp.Plant.discrete(**{**arguments, **changes})
 
 
 def task(plant: fp.Plant | None = None, **changes: Any) -> fp.Problem:
@@ -139,7 +140,7 @@ def chain(order: int) -> fp.Plant:
         return {**{n: x[m] for n, m in pairwise(names)}, names[-1]: p.a * x.x1 + p.b * u.u}
 
     parameters = {"a": fp.Parameter(0.4, 0.4, "1"), "b": fp.Parameter(2.0, 2.0, "1")}
-    return fp.Plant.of_map(
+    return fp.Plant.discrete(
         states=dict.fromkeys(names, "m"),
         inputs={"u": "N"},
         parameters=parameters,
@@ -213,7 +214,7 @@ def test_derivatives_of_a_map_are_refused() -> None:
     with pytest.raises(
         NotSupported, match="output_chain differentiates with respect to time, which a map does not have"
     ):
-        fp.output_chain(fishery(), "stock")
+        output_chain(fishery(), "stock")
 
 
 def test_a_page_draws_steps() -> None:
@@ -302,13 +303,13 @@ class Pond:
 def test_a_map_outside_is_the_map() -> None:
     """What is measured is the stock; the difference of the last cycle is the controller's own."""
     controller = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.ModelReferenced(fp.Affine(gain=-1.0)))
-    outside = simulated(task(reality=fp.Foreign(Pond(), measures={"stock": "1"})), controller)
+    outside = simulated(task(reality=fp.ExternalPlant(Pond(), measures={"stock": "1"})), controller)
     assert np.abs(outside["command"] - simulated(task(), controller)["command"]).max() < 1e-12
 
 
 def test_a_state_of_a_map_that_nobody_measures_is_believed() -> None:
-    """With an exact model the belief is the state; a filter's covariance is that of the map's own matrices."""
-    plant = fp.Plant.of_map(
+    """With an exact model the observer is the state; a filter's covariance is that of the map's own matrices."""
+    plant = fp.Plant.discrete(
         states={"a": "1", "b": "1"},
         inputs={"u": "1"},
         parameters={},
@@ -316,15 +317,15 @@ def test_a_state_of_a_map_that_nobody_measures_is_believed() -> None:
         step=1.0,
         controlled=("a",),
     )
-    beliefs = fp.ModelStates(), fp.KalmanFilter(measured={"a": 1e-3}, noise={"a": 1e-3, "b": 1e-3})
-    for belief in beliefs:
+    observers = fp.ModelStates(), fp.KalmanFilter(measured={"a": 1e-3}, noise={"a": 1e-3, "b": 1e-3})
+    for observer in observers:
         problem = fp.Problem(
             plant,
             fp.Trajectory(lambda t: {"a": ca.sin(0.05 * t), "b": 0 * t}),
             {"a": 0.0, "b": 0.3},
             1.0,
             60.0,
-            sensing=fp.Sensing(measured=["a"], belief=belief),
+            sensing=fp.Sensing(measured=["a"], observer=observer),
         )
         run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.3)))
         assert np.abs(run["state.b"] - run["plant_state.b"]).max() < 1e-14

@@ -158,7 +158,7 @@ def shifting(order: int) -> fp.Problem:
         "ab": lambda x, u, p: {"a": x.a + 0.2 * x.b, "b": 0.5 * x.b + u.u},
     }
     names = "ab"[:order]
-    plant = fp.Plant.of_map(
+    plant = fp.Plant.discrete(
         states=dict.fromkeys(names, "m"), inputs={"u": "N"}, parameters={}, next=chain[names], step=0.1,
         outputs={"y": fp.Output("m", lambda x, p: x.a)},
     )  # fmt: skip

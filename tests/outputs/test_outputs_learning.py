@@ -172,7 +172,7 @@ def test_a_disturbance_reaches_a_model_with_algebraic_states() -> None:
 
 
 def test_a_disturbance_of_a_map_adds_to_its_difference() -> None:
-    plant = fp.Plant.of_map(
+    plant = fp.Plant.discrete(
         states={"a": "m", "b": "m"}, inputs={"u": "N"}, parameters={}, step=0.1,
         next=lambda x, u, p: {"a": x.a + 0.2 * x.b, "b": 0.5 * x.b + u.u}, outputs={"y": fp.Output("m", lambda x, p: x.a)},
     )  # fmt: skip

@@ -85,8 +85,8 @@ def test_it_works_behind_an_estimator_as_where_the_response_is_measured(estimato
 
 
 def test_believed_states_have_a_twin():
-    """The hand alone is measured, and the angle is the model's belief: it converges, and an exact model is left alone."""
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["y"], belief=fp.ModelStates())
+    """The hand alone is measured, and the angle is the model's observer: it converges, and an exact model is left alone."""
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["y"], observer=fp.ModelStates())
     problem = task(fp.PositionDifference(), sensing=sensing, duration=2.0, measure_from=1.2)
     runs = run(problem, PLAIN), run(problem, referenced(problem))
     errors = [fp.measure(problem, r).rms_error["y"] for r in runs]

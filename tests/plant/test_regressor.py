@@ -14,12 +14,13 @@ from plants import chain, pendulum
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported
 from fpirhc.plant.motion import places
+from fpirhc.plant.regressor import Combination, Regressor
 
 INERTIAS = {
-    "a1": fp.Combination(lambda p: p.I1 + p.m1 * p.lc1**2 + p.Ie + p.me * (p.lce**2 + p.l1**2), "kg m^2"),
-    "a2": fp.Combination(lambda p: p.Ie + p.me * p.lce**2, "kg m^2"),
-    "a3": fp.Combination(lambda p: p.me * p.l1 * p.lce * ca.cos(p.delta), "kg m^2"),
-    "a4": fp.Combination(lambda p: p.me * p.l1 * p.lce * ca.sin(p.delta), "kg m^2"),
+    "a1": Combination(lambda p: p.I1 + p.m1 * p.lc1**2 + p.Ie + p.me * (p.lce**2 + p.l1**2), "kg m^2"),
+    "a2": Combination(lambda p: p.Ie + p.me * p.lce**2, "kg m^2"),
+    "a3": Combination(lambda p: p.me * p.l1 * p.lce * ca.cos(p.delta), "kg m^2"),
+    "a4": Combination(lambda p: p.me * p.l1 * p.lce * ca.sin(p.delta), "kg m^2"),
 }
 
 
@@ -28,9 +29,9 @@ def regressor(name):
     """The shipped arms' regressors; the two-link arm's model is nonlinear in its parameters and needs combinations."""
     plant = fp.load_problem(name).problem.plant
     if name == "two_link_arm":
-        return fp.Regressor(plant, (*INERTIAS, "b"), INERTIAS)
+        return Regressor(plant, (*INERTIAS, "b"), INERTIAS)
     nonlinear = {"planar_arm": {"vs"}}.get(name, set())
-    return fp.Regressor(plant, [n for n in plant.parameters if n not in nonlinear])
+    return Regressor(plant, [n for n in plant.parameters if n not in nonlinear])
 
 
 ARMS = ("two_link_arm", "planar_arm", "three_link_arm", "puma560")
@@ -126,18 +127,18 @@ def test_more_combinations_than_parameters():
     """A pendulum of mass m and length l: inertia m l^2 and weight m l; three functions of two parameters need two points."""
     plant = pendulum()
     combinations = {
-        "inertia": fp.Combination(lambda p: p.m * p.l**2, "kg m^2"),
-        "weight": fp.Combination(lambda p: p.m * p.l, "kg m"),
-        "square": fp.Combination(lambda p: p.m**2, "kg^2"),
+        "inertia": Combination(lambda p: p.m * p.l**2, "kg m^2"),
+        "weight": Combination(lambda p: p.m * p.l, "kg m"),
+        "square": Combination(lambda p: p.m**2, "kg^2"),
     }
-    result = fp.Regressor(plant, ("inertia", "weight"), combinations)
+    result = Regressor(plant, ("inertia", "weight"), combinations)
     y, rest = (m.full() for m in result.function([0.3, 0.7], [2.0], plant.approximate))
     np.testing.assert_allclose(y, [[2.0, 9.81 * np.sin(0.3)]], atol=1e-9)
     np.testing.assert_allclose(rest, [[0.07]], atol=1e-9)
     with pytest.raises(InvalidValue, match="'square' does not enter"):
-        fp.Regressor(plant, ("inertia", "weight", "square"), combinations)
+        Regressor(plant, ("inertia", "weight", "square"), combinations)
     with pytest.raises(InvalidValue, match=r"not linear in inertia.*'l' enter"):
-        fp.Regressor(plant, ("inertia",), combinations)
+        Regressor(plant, ("inertia",), combinations)
 
 
 def test_linear_parameters_are_found():
@@ -151,24 +152,24 @@ def test_linear_parameters_are_found():
 def test_parameters_that_enter_nonlinearly_are_refused_by_name():
     """With the products they appear in, and what to do."""
     with pytest.raises(InvalidValue, match=r"'l' enter\(s\) nonlinearly; in products: 'm' with 'l'.*Combination"):
-        fp.Regressor(pendulum(), ("m", "l"))
+        Regressor(pendulum(), ("m", "l"))
     plant = fp.load_problem("planar_arm").problem.plant
     with pytest.raises(InvalidValue, match=r"'vs' enter.*'s1' with 'vs'"):
-        fp.Regressor(plant, tuple(plant.parameters))
+        Regressor(plant, tuple(plant.parameters))
     with pytest.raises(InvalidName, match="Did you mean 'load'"):
-        fp.Regressor(plant, ("lod",))
-    double = {"twice": fp.Combination(lambda p: 2 * p.load, "kg")}
+        Regressor(plant, ("lod",))
+    double = {"twice": Combination(lambda p: 2 * p.load, "kg")}
     with pytest.raises(InvalidValue, match="depend on each other"):
-        fp.Regressor(plant, ("load", "twice"), double)
+        Regressor(plant, ("load", "twice"), double)
 
 
 def test_plants_without_a_regressor_are_refused():
     """Fewer inputs than coordinates; an inverse that only a root finder has."""
     with pytest.raises(NotSupported, match="fully actuated"):
-        fp.Regressor(fp.load_problem("cart_pole").problem.plant, ("m",))
+        Regressor(fp.load_problem("cart_pole").problem.plant, ("m",))
     nonlinear = fp.Plant(
         {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1, 1, "kg")}, lambda q, v, u, p: {"y": ca.sinh(u.u) / p.m}
     )
     with pytest.raises(NotSupported, match="root finder"):
-        fp.Regressor(nonlinear, ("m",))
+        Regressor(nonlinear, ("m",))
     assert fp.linear_parameters(chain(1)) == ("m",)

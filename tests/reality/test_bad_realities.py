@@ -30,7 +30,7 @@ class Cart:
 plant = fp.Plant({{"x": "m"}}, {{"u": "N"}}, {{"m": fp.Parameter(1.5, 1.0, "kg")}}, lambda q, v, u, p: {{"x": u.u / p.m}})
 problem = fp.Problem(
     plant=plant,
-    reality=fp.Foreign(Cart(), {{"x": "m", "x'": "m/s", "x''": "m/s^2"}}, deadline=0.2),
+    reality=fp.ExternalPlant(Cart(), {{"x": "m", "x'": "m/s", "x''": "m/s^2"}}, deadline=0.2),
     reference=fp.Trajectory(lambda t: {{"x": ca.sin(2 * t)}}),
     start={{"x": 0.0, "x'": 2.0}},
     period=1e-3,
@@ -69,7 +69,8 @@ def test_a_bad_answer_ends_the_run_with_its_reason(kind, tmp_path, monkeypatch, 
     assert code == 4
     assert f"ended early: step of Cart {message}" in shown
     assert (
-        "at t = 0.021 s (cycle 21); the run keeps the cycles before it; Foreign(holds=1) bridges a bad answer" in shown
+        "at t = 0.021 s (cycle 21); the run keeps the cycles before it; ExternalPlant(holds=1) bridges a bad answer"
+        in shown
     )
     assert list(tmp_path.rglob("*.npz"))
 

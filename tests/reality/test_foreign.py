@@ -90,7 +90,7 @@ BAD: dict[str, tuple[Any, str]] = {
 
 def outside(problem: fp.Problem, **settings) -> fp.Problem:
     """The problem with its own plant outside."""
-    return replace(problem, reality=fp.Foreign(Wrapped(problem), measures=MEASURES, **settings))
+    return replace(problem, reality=fp.ExternalPlant(Wrapped(problem), measures=MEASURES, **settings))
 
 
 @pytest.mark.parametrize(("controller", "sensing"), [pair for pair in PAIRS if pair[1] != "late"])
@@ -115,7 +115,7 @@ def test_dead_times_stand_around_the_body():
 def test_positions_alone_are_enough_for_an_estimator():
     """A body that measures y only runs with an estimator; errors are then those of the estimate."""
     problem = task(sensing=fp.Sensing(estimator=fp.PositionDifference()))
-    foreign = fp.Foreign(Wrapped(problem, ("y",)), measures={"y": "m"})
+    foreign = fp.ExternalPlant(Wrapped(problem, ("y",)), measures={"y": "m"})
     one, other = run(problem), run(replace(problem, reality=foreign))
     assert np.abs(one["command"] - other["command"]).max() < 1e-9 * np.abs(one["command"]).max()
     assert np.array_equal(other["foreign.y"], other["measured.y"])
@@ -133,11 +133,11 @@ def test_bad_answer_ends_the_run_and_loses_nothing(kind):
     """A hundred good answers are kept; the reason names the method, what it did, and when."""
     bad, message = BAD[kind]
     problem = task()
-    result = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad), MEASURES)))
+    result = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad), MEASURES)))
     assert result.stop is not None
     assert re.search(message, result.stop)
     assert "at t = 0.1 s (cycle 100)" in result.stop
-    assert result.stop.endswith("Foreign(holds=1) bridges a bad answer with the last good one")
+    assert result.stop.endswith("ExternalPlant(holds=1) bridges a bad answer with the last good one")
     assert result.cycles == 100
     assert np.array_equal(result["command"], run(outside(problem))["command"][:100])
 
@@ -146,7 +146,7 @@ def test_an_implausible_answer_is_a_skipped_cycle():
     """A body that answers 1e9 m once: the command of that cycle is the last one, and the run goes on as if nothing had been."""
     problem = task()
     body = Faulty(problem, lambda answer: np.full_like(answer, 1e9))
-    spiked, clean = run(replace(problem, reality=fp.Foreign(body, MEASURES))), run(outside(problem))
+    spiked, clean = run(replace(problem, reality=fp.ExternalPlant(body, MEASURES))), run(outside(problem))
     assert spiked.stop is None
     assert np.flatnonzero(spiked["status"] == fp.Status.BAD_SAMPLE).tolist() == [100]
     assert np.array_equal(spiked["command"][100], spiked["command"][99])
@@ -160,20 +160,20 @@ def test_bad_answers_are_held_as_stated(kind):
     """Two bad answers are bridged with the last good one and marked; the third ends the run."""
     problem = task()
     bad = BAD[kind][0]
-    two = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad, range(100, 102)), MEASURES, holds=2)))
+    two = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad, range(100, 102)), MEASURES, holds=2)))
     assert two.stop is None
     assert np.flatnonzero(two["foreign_held"]).tolist() == [100, 101]
     assert np.array_equal(two["state"][100:102], two["state"][[99, 99]])
-    three = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad, range(100, 103)), MEASURES, holds=2)))
+    three = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad, range(100, 103)), MEASURES, holds=2)))
     assert three.cycles == 102
-    assert str(three.stop).endswith("after 2 in a row that were held; Foreign(holds=3) bridges one more")
+    assert str(three.stop).endswith("after 2 in a row that were held; ExternalPlant(holds=3) bridges one more")
 
 
 def test_answer_after_the_deadline():
     """A clock that jumps in the hundredth step stands for a body that is late."""
     problem = task()
     body = Wrapped(problem)
-    foreign = fp.Foreign(body, MEASURES, deadline=100.0, clock=lambda: 1e3 * (body.calls >= 100))
+    foreign = fp.ExternalPlant(body, MEASURES, deadline=100.0, clock=lambda: 1e3 * (body.calls >= 100))
     result = run(replace(problem, reality=foreign))
     assert result.cycles == 100
     assert "took 1e+03 s, and its deadline is 100 s" in str(result.stop)
@@ -203,7 +203,7 @@ def test_a_body_that_blocks_is_given_up():
     """The run ends as with every bad answer, and keeps what was before it; the body is not interrupted."""
     problem = task()
     body = Blocking(problem)
-    result = run(replace(problem, reality=fp.Foreign(body, MEASURES, deadline=0.05)))
+    result = run(replace(problem, reality=fp.ExternalPlant(body, MEASURES, deadline=0.05)))
     body.released.set()
     assert (result.cycles, body.calls) == (100, 100)
     assert "step of Blocking did not return within 0.05 s, its deadline; it was given up at t = 0.1 s" in str(
@@ -215,7 +215,7 @@ def test_a_body_that_blocks_is_not_called_before_it_has_returned():
     """Two calls at the same time would be two masters of one device: answers are held meanwhile, and a new run waits."""
     problem = task(duration=0.2)
     body = Blocking(problem)
-    held = replace(problem, reality=fp.Foreign(body, MEASURES, deadline=0.02, holds=3))
+    held = replace(problem, reality=fp.ExternalPlant(body, MEASURES, deadline=0.02, holds=3))
     stopped = run(held)
     assert body.calls == 100
     assert np.flatnonzero(stopped["foreign_held"]).tolist() == [100, 101, 102]
@@ -292,7 +292,7 @@ class WithoutLength:
 def test_whatever_raises_in_an_answer_is_a_bad_answer(bad, words, deadline):
     """A stranger's object may raise where it is turned into numbers, measured, or written down."""
     problem = task(duration=0.11)
-    result = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad), MEASURES, deadline=deadline)))
+    result = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad), MEASURES, deadline=deadline)))
     assert re.search(words, str(result.stop))
     assert result.cycles == 100
 
@@ -302,23 +302,23 @@ def test_bad_first_answer_is_an_error():
     problem = task()
     body = Wrapped(problem, ("y",))
     with pytest.raises(InvalidProblem, match="reset of Wrapped returned the shape"):
-        run(replace(problem, reality=fp.Foreign(body, MEASURES)))
+        run(replace(problem, reality=fp.ExternalPlant(body, MEASURES)))
 
 
 def test_mistakes_are_named():
     """Quantities and units are compared with what the model and its sensing need, before a run."""
     body = Wrapped(task())
     with pytest.raises(InvalidProblem, match=r"does not measure y'' .* Sensing\(estimator=...\)"):
-        task(reality=fp.Foreign(body, {"y": "m", "y'": "m/s"}))
+        task(reality=fp.ExternalPlant(body, {"y": "m", "y'": "m/s"}))
     with pytest.raises(InvalidProblem, match="measures y in mm, the model has it in m"):
-        task(reality=fp.Foreign(body, {**MEASURES, "y": "mm"}))
+        task(reality=fp.ExternalPlant(body, {**MEASURES, "y": "mm"}))
     with pytest.raises(InvalidProblem, match="'z' is unknown"):
-        task(reality=fp.Foreign(body, {**MEASURES, "z": "m"}))
+        task(reality=fp.ExternalPlant(body, {**MEASURES, "z": "m"}))
     with pytest.raises(InvalidProblem, match="disturbances"):
-        task(reality=fp.Foreign(body, MEASURES), disturbances={"y": fp.Step(0.0, 1.0)})
+        task(reality=fp.ExternalPlant(body, MEASURES), disturbances={"y": fp.Step(0.0, 1.0)})
     no_body: Any = object()
     with pytest.raises(InvalidValue, match="no method reset"):
-        fp.Foreign(no_body, MEASURES)
+        fp.ExternalPlant(no_body, MEASURES)
 
 
 def test_nothing_is_drawn_and_no_model_is_exact():
@@ -359,7 +359,7 @@ def test_lagged_body_is_the_lagged_reality():
 
     controller = CONTROLLERS["plain form"]
     one = run(problem, controller)
-    other = run(replace(problem, reality=fp.Foreign(Actuated(task()), MEASURES)), controller)
+    other = run(replace(problem, reality=fp.ExternalPlant(Actuated(task()), MEASURES)), controller)
     assert np.abs(one["command"] - other["command"]).max() < 1e-6 * np.abs(one["command"]).max()
 
 

@@ -14,7 +14,7 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem, NotSupported
 
 PERIOD, PARAMETERS = 0.05, {"b": fp.Parameter(approximate=1.0, exact=1.3, unit="1/l")}
-BELIEVED = fp.Sensing(measured=["c1", "c1'"], belief=fp.ModelStates())
+BELIEVED = fp.Sensing(measured=["c1", "c1'"], observer=fp.ModelStates())
 TRACK = fp.ComputedTorque(fp.Exponential(rate=1.0))
 FPI = fp.Sigmoid(gain=-0.8, scale=20.0)
 

@@ -61,7 +61,7 @@ def test_state_of_a_reality_and_of_a_body_outside():
     assert "state 'F' is " in str(result.stop)
     assert np.all(result["reality_state.F"] <= 0.5)
     problem = task(plant=replace(task().plant, ranges={"y'": (-1.0, 1.0)}))
-    outside = run(replace(problem, reality=fp.Foreign(Wrapped(problem), MEASURES)))
+    outside = run(replace(problem, reality=fp.ExternalPlant(Wrapped(problem), MEASURES)))
     assert outside.stop == run(problem).stop
     assert '"y\'"' in str(outside.stop) or "y'" in str(outside.stop)
 

@@ -18,7 +18,7 @@ PERIOD = 1 / 12  # min
 TRACK = fp.ComputedTorque(fp.Exponential(rate=1.5))
 FPI = fp.Sigmoid(gain=-2.0, shift=0.3, scale=20.0)
 PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-1))
-BELIEVED = fp.Sensing(belief=fp.ModelStates())
+BELIEVED = fp.Sensing(observer=fp.ModelStates())
 FIRST = {"C1": 2.0, "C2": 0.6, "C3": 0.1, "Ce": 1.5}
 START = 93.0 / (1 + (1.5 / 4.1) ** 1.36)
 RATES = (1.9 + 1.1 + 0.84, 1.1, 0.84, 4.27, 16.0, 238.0)  # clearances, l/min, and volumes, l
@@ -172,7 +172,7 @@ def test_a_flexible_joint_behind_a_rigid_model(estimator):
         duration=2.0,
         measure_from=1.0,
         reality=fp.Reality(flexible(), start=still, integrator=fp.RungeKutta4(substeps=4)),
-        sensing=fp.Sensing(estimator=estimator, belief=fp.ModelStates()),
+        sensing=fp.Sensing(estimator=estimator, observer=fp.ModelStates()),
         limits=fp.Limits(inputs={"u": (-40.0, 40.0)}),
     )
     law, map_ = fp.Exponential(rate=6.0), fp.Increment(fp.Sigmoid(gain=-0.3, scale=60.0), cycles=0)
@@ -211,7 +211,7 @@ def test_mistakes_of_a_reality_are_named(mistake):
 def test_without_a_belief_the_states_are_needed():
     """The controller would be given states that the patient does not have; the message says how they are believed."""
     with pytest.raises(
-        InvalidProblem, match=r"(?s)no coordinate 'c'.*believed: Sensing\(measured=..., belief=ModelStates\(\)\)"
+        InvalidProblem, match=r"(?s)no coordinate 'c'.*believed: Sensing\(measured=..., observer=ModelStates\(\)\)"
     ):
         task(sensing=fp.Sensing())
 
@@ -274,28 +274,28 @@ def test_a_body_with_outputs_is_the_reality_of_these_outputs(controller, estimat
     slope = -92 * 1.5 * (site / 4.5) ** 1.5 / site / (1 + (site / 4.5) ** 1.5) ** 2
     first = Patient(("bis'",)).reset(0)[0]
     start = {"e": site, "c": site + first / slope / 0.3}
-    sensing = fp.Sensing(estimator=estimator, belief=fp.ModelStates())
+    sensing = fp.Sensing(estimator=estimator, observer=fp.ModelStates())
     problem = task(duration=3.0, sensing=sensing, start=start)
     names = problem.sensing.measures(problem.plant)
-    body = fp.Foreign(Patient(names), {n: UNITS[n] for n in names})
+    body = fp.ExternalPlant(Patient(names), {n: UNITS[n] for n in names})
     one, other = run(problem, controller), run(replace(problem, reality=body), controller)
     np.testing.assert_allclose(other["command"], one["command"], atol=1e-9 * np.abs(one["command"]).max())
     np.testing.assert_allclose(other["true_error"], one["true_error"], atol=1e-10)
 
 
 def test_a_body_must_measure_what_the_controller_is_given():
-    """Without a belief also the model's states; units are compared."""
+    """Without an observer also the model's states; units are compared."""
     body = Patient(tuple(UNITS))
     with pytest.raises(InvalidProblem, match=r"(?s)does not measure c .*does not measure e"):
-        task(reality=fp.Foreign(body, UNITS), sensing=fp.Sensing())
+        task(reality=fp.ExternalPlant(body, UNITS), sensing=fp.Sensing())
     with pytest.raises(InvalidProblem, match="measures bis in %, the model has it in 1"):
-        task(reality=fp.Foreign(body, {**UNITS, "bis": "%"}))
+        task(reality=fp.ExternalPlant(body, {**UNITS, "bis": "%"}))
     with pytest.raises(InvalidProblem, match="does not measure bis'' "):
-        task(reality=fp.Foreign(body, {"bis": "1", "bis'": "1/min"}))
+        task(reality=fp.ExternalPlant(body, {"bis": "1", "bis'": "1/min"}))
 
 
 def test_a_body_that_measures_states_and_outputs():
-    """Given as they are, without a belief: the model's plant outside, to rounding."""
+    """Given as they are, without an observer: the model's plant outside, to rounding."""
     problem = task(reality=None, sensing=fp.Sensing(), duration=2.0)
     plant = problem.plant
     x, u, p = plant.symbols()
@@ -320,7 +320,7 @@ def test_a_body_that_measures_states_and_outputs():
 
     measures = {"c": "mg/l", "e": "mg/l", **UNITS}
     controller = replace(PLAN, deformation=FPI)
-    one, other = run(problem, controller), run(replace(problem, reality=fp.Foreign(Own(), measures)), controller)
+    one, other = run(problem, controller), run(replace(problem, reality=fp.ExternalPlant(Own(), measures)), controller)
     np.testing.assert_allclose(other["command"], one["command"], atol=1e-10 * np.abs(one["command"]).max())
     np.testing.assert_allclose(other["plant_state"], one["plant_state"], atol=1e-12)
     assert "cost" in other.layout

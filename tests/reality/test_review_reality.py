@@ -172,7 +172,7 @@ def test_comparison_shows_belief_beside_reality():
         factor = comparison.entries[1].metrics.values["contraction.predicted"][""]
         reached = 1 - np.exp(-1e-3 / 0.01) if name == "real" else 1.0
         assert factor == pytest.approx(1 - 0.1 * 2.0 * reached, abs=1e-6)
-    assert {"reality: F", "CTC+FPI: response of y, belief and reality"} <= set(titles["real"]) - set(titles["model"])
+    assert {"reality: F", "CTC+FPI: response of y, observer and reality"} <= set(titles["real"]) - set(titles["model"])
 
 
 def test_pole_that_is_fast_away_from_the_start():

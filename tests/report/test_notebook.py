@@ -20,6 +20,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run
 from fpirhc.review.answer import Answer, Review, Verdict
+from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.scenarios.paired import percent
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 from fpirhc.summary import printable, table
@@ -53,7 +54,7 @@ def hostile_problem(duration: float = 0.3) -> fp.Problem:
 
 
 @pytest.fixture(scope="module")
-def comparison() -> fp.Comparison:
+def comparison() -> Comparison:
     """A pair with hostile names, a controller that ends early, and one that is skipped."""
     tracking = fp.Exponential(rate=6.0)
     planner = fp.FixedPoint(iterations=1, tolerance=1e-3)
@@ -105,7 +106,7 @@ def read(page: str) -> Tags:
     return parser
 
 
-def shown(comparison: fp.Comparison, plan: fp.Plan) -> dict[str, Any]:
+def shown(comparison: Comparison, plan: fp.Plan) -> dict[str, Any]:
     entry = comparison[HOSTILE]
     assert entry.contraction is not None
     return {

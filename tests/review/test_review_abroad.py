@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.review.answer import Review
 
 
 @cache
-def reviewed(name: str, variant: str = "problem") -> fp.Review:
+def reviewed(name: str, variant: str = "problem") -> Review:
     task = abroad.load(name, variant)
     return fp.review(task.problem, task.controllers, mismatch=0.0, seed=0)
 
 
-def about(review: fp.Review, words: str, controller: str | None = None) -> fp.Answer:
+def about(review: Review, words: str, controller: str | None = None) -> fp.Answer:
     """The answer to the question with these words, about the problem or a controller."""
     answers = review.problem if controller is None else review.controllers[controller]
     [one] = [a for a in answers if words in a.question]

@@ -1,4 +1,4 @@
-"""Every belief keeps the public laws, and every law catches a belief that breaks it."""
+"""Every observer keeps the public laws, and every law catches an observer that breaks it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import casadi as ca
 import numpy as np
 import pytest
 
-import fpirhc.conformance.belief as laws
-from fpirhc.conformance import check_belief
+import fpirhc.conformance.observer as laws
+from fpirhc.conformance import check_observer
 from fpirhc.members import examples
-from fpirhc.sensing.belief import Correct, Model, Predict
-from fpirhc.sensing.beliefs.model_states import ModelStates
+from fpirhc.sensing.observers.model_states import ModelStates
+from fpirhc.sensing.state_observer import Correct, Model, Predict
 
-BELIEFS = examples("beliefs")
+BELIEFS = examples("observers")
 
 
 @pytest.mark.parametrize("number", range(len(BELIEFS)), ids=[f"{type(b).__name__}-{k}" for k, b in enumerate(BELIEFS)])
 def test_belief_laws(number: int) -> None:
-    check_belief(BELIEFS[number], seed=4)
+    check_observer(BELIEFS[number], seed=4)
 
 
 class Thawed(ModelStates):
@@ -46,7 +46,7 @@ class Slow(ModelStates):
     def predict(self, model: Model) -> Predict:
         """Nine tenths of a cycle."""
         whole = ModelStates().predict(model)
-        return lambda e, m: m["belief_state"] + 0.9 * (whole(e, m) - m["belief_state"])
+        return lambda e, m: m["observer_state"] + 0.9 * (whole(e, m) - m["observer_state"])
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Eager(ModelStates):
     def predict(self, model: Model) -> Predict:
         """A whole cycle wherever the sample is later at all."""
         calm = np.zeros(len(model.plant.names))
-        return lambda e, m: model.move(m["belief_state"], e.command, e.parameters, calm, e.moves > 0)
+        return lambda e, m: model.move(m["observer_state"], e.command, e.parameters, calm, e.moves > 0)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Fragile(ModelStates):
             state, after = ModelStates().correct(model)(evidence, memory, predicted)
             error = evidence.measured["a"] - predicted[0]
             part = 1e-20 * ca.if_else(ca.fabs(error) > 1e-9, ca.sqrt(error), 0)
-            return state + part, after | {"belief_state": after["belief_state"] + part}
+            return state + part, after | {"observer_state": after["observer_state"] + part}
 
         return corrected
 
@@ -87,5 +87,5 @@ BROKEN = {
 @pytest.mark.parametrize("law", BROKEN)
 def test_a_broken_law_is_named(law: str) -> None:
     with pytest.raises(AssertionError, match=f"{type(BROKEN[law]).__name__} breaks the law '{law.replace('_', ' ')}'"):
-        check_belief(BROKEN[law], seed=4)
+        check_observer(BROKEN[law], seed=4)
     assert law in {one.__name__ for one in laws.LAWS}

@@ -18,8 +18,8 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed import free_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
-from fpirhc.sensing.belief import Belief
 from fpirhc.sensing.observability import unobservable
+from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
@@ -29,30 +29,30 @@ FPI = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.Affine(gain=-0.5))
 KALMAN = fp.KalmanFilter(measured={"C1": 1e-2}, noise={"C1": 0.3, "C2": 0.05, "C3": 0.05})
 
 
-def infusion(belief: Belief, **changes: Any) -> fp.Problem:
+def infusion(observer: StateObserver, **changes: Any) -> fp.Problem:
     """Propofol: the plasma is measured, three compartments are not; time in minutes."""
-    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["C1"], belief=belief)
+    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["C1"], observer=observer)
     settings: dict[str, Any] = {"duration": 30.0, "measure_from": 5.0, "sensing": sensing}
     return replace(abroad.load("drug_infusion").problem, **(settings | changes))
 
 
-def tanks(belief: Belief, **changes: Any) -> fp.Problem:
+def tanks(observer: StateObserver, **changes: Any) -> fp.Problem:
     """Four tanks whose lower levels are measured."""
     problem = abroad.load("quadruple_tank").problem
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["h1", "h2"], belief=belief)
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["h1", "h2"], observer=observer)
     settings: dict[str, Any] = {"duration": 60 * problem.period, "measure_from": 0.0, "sensing": sensing}
     return replace(problem, **(settings | changes))
 
 
-def servo(belief: Belief, **changes: Any) -> fp.Problem:
+def servo(observer: StateObserver, **changes: Any) -> fp.Problem:
     """A load on a flexible shaft: the motor's angle is measured, late by two cycles."""
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["motor"], belief=belief)
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["motor"], observer=observer)
     late = fp.DeadTime(inputs={"V": 0.025}, measurement=0.02)
     settings: dict[str, Any] = {"duration": 1.0, "measure_from": 0.0, "sensing": sensing, "dead_time": late}
     return replace(abroad.load("flexible_servo").problem, **(settings | changes))
 
 
-def swing(belief: Belief, believed: float = 1.0, **changes: Any) -> fp.Problem:
+def swing(observer: StateObserver, believed: float = 1.0, **changes: Any) -> fp.Problem:
     """A pendulum whose angle is measured."""
     plant = pendulum(1.0, believed)
     settings: dict[str, Any] = {
@@ -62,7 +62,7 @@ def swing(belief: Belief, believed: float = 1.0, **changes: Any) -> fp.Problem:
         "period": 0.01,
         "duration": 3.0,
         "sensing": fp.Sensing(
-            {"angle": fp.Sensor(noise=fp.Noise(2e-3))}, fp.PositionDifference(), measured=["angle"], belief=belief
+            {"angle": fp.Sensor(noise=fp.Noise(2e-3))}, fp.PositionDifference(), measured=["angle"], observer=observer
         ),
     }
     return fp.Problem(**(settings | changes))
@@ -123,7 +123,7 @@ def room(**changes: Any) -> fp.Problem:
         period=0.25,
         duration=20.0,
         signals={"ambient": weather},
-        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["air"], belief=fp.ModelStates()),
+        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["air"], observer=fp.ModelStates()),
     )
     return replace(problem, **changes)
 
@@ -137,11 +137,11 @@ def test_a_right_model_in_known_weather_believes_what_is(late):
     np.testing.assert_allclose(result["state"][late:], true[: len(true) - late], atol=1e-10)
 
 
-@pytest.mark.parametrize("belief", [fp.ModelStates(), fp.ModelStates(corrected=False), KALMAN], ids=str)
-def test_samples_that_are_late_by_a_fraction_are_those_of_a_linear_model(belief):
+@pytest.mark.parametrize("observer", [fp.ModelStates(), fp.ModelStates(corrected=False), KALMAN], ids=str)
+def test_samples_that_are_late_by_a_fraction_are_those_of_a_linear_model(observer):
     """Commands 1.25 and samples 2.4 cycles late: every believed state is interpolated as the measured one is, to rounding."""
     dead_time = fp.DeadTime(inputs={"u": 1.25 / 6}, measurement=2.4 / 6, before={"u": 9.0})
-    result = run(infusion(belief, dead_time=dead_time, duration=15.0), fp.ExactModel(CTC))
+    result = run(infusion(observer, dead_time=dead_time, duration=15.0), fp.ExactModel(CTC))
     true = result["plant_state"]
     expected = 0.6 * true[1:-2] + 0.4 * true[:-3]
     np.testing.assert_allclose(result["state"][3:], expected, atol=1e-11)
@@ -151,11 +151,13 @@ def test_samples_that_are_late_by_a_fraction_are_those_of_a_linear_model(belief)
 
 def test_on_a_curved_motion_a_fraction_costs_an_error_of_second_order():
     """The pendulum by itself, 1.5 cycles late: half the period, a quarter of the difference to the interpolated angle."""
-    belief, errors = fp.ModelStates(corrected=False), []
-    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["angle'"], belief=belief)
+    observer, errors = fp.ModelStates(corrected=False), []
+    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["angle'"], observer=observer)
     for period in (0.02, 0.01):
         late = fp.DeadTime(measurement=1.5 * period)
-        result = run(swing(belief, period=period, dead_time=late, sensing=sensing, duration=1.0), fp.ExactModel(TRACK))
+        result = run(
+            swing(observer, period=period, dead_time=late, sensing=sensing, duration=1.0), fp.ExactModel(TRACK)
+        )
         true = result["plant_state.angle"]
         errors.append(np.abs(result["state.angle"][2:] - (true[1:-1] + true[:-2]) / 2).max())
     assert errors[1] == pytest.approx(errors[0] / 4, rel=0.2)
@@ -180,7 +182,7 @@ def test_a_model_that_runs_by_itself_drifts_without_bound():
         start={"y": 0.0},
         period=0.01,
         duration=4.0,
-        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y'"], belief=fp.ModelStates(corrected=False)),
+        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y'"], observer=fp.ModelStates(corrected=False)),
     )
     result = run(problem, TRACK)
     command, period = result["command"][:-1, 0], problem.period
@@ -228,7 +230,7 @@ def recursion(problem: fp.Problem, result: fp.Run, filter: fp.KalmanFilter) -> t
         p = p - gain @ c @ p
         states.append(x)
     assert m == problem.plant.parameters["m"].exact
-    assert filter is problem.sensing.belief
+    assert filter is problem.sensing.observer
     return np.array(states), p
 
 
@@ -242,7 +244,7 @@ def test_it_is_the_extended_filter_of_the_books():
     memory = stepper.start()
     for k in range(result.cycles):
         _, memory = stepper.step_measured(float(result.time[k]), raw_measurements(result)[k], memory)
-    own = memory[stepper.memory.slice("belief_covariance")].reshape(2, 2)
+    own = memory[stepper.memory.slice("observer_covariance")].reshape(2, 2)
     np.testing.assert_allclose(own, covariance, rtol=1e-10)
     assert np.linalg.eigvalsh(own).min() > 0
 
@@ -256,7 +258,7 @@ def test_on_a_linear_plant_it_becomes_the_stationary_filter():
         start={"y": 0.0},
         period=0.01,
         duration=6.0,
-        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["y"], belief=filter),
+        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["y"], observer=filter),
     )
     result, stepper = run(problem, TRACK), fp.Stepper(problem, TRACK, compiled=False)
     memory, h = stepper.start(), problem.period
@@ -265,7 +267,7 @@ def test_on_a_linear_plant_it_becomes_the_stationary_filter():
     a, b, c = np.array([[1, h], [0, 1]]), np.array([[h**2 / 2], [h]]), np.array([[1.0, 0.0]])
     prior = scipy.linalg.solve_discrete_are(a.T, c.T, 0.25 * b @ b.T, np.array([[1e-6]]))
     gain = prior @ c.T / (c @ prior @ c.T + 1e-6)
-    own = memory[stepper.memory.slice("belief_covariance")].reshape(2, 2)
+    own = memory[stepper.memory.slice("observer_covariance")].reshape(2, 2)
     np.testing.assert_allclose(own, prior - gain @ c @ prior, rtol=1e-8)
 
 
@@ -275,7 +277,7 @@ def test_its_covariance_is_that_of_its_errors():
     Errors of neighbouring cycles belong together, so 60 runs count with one cycle each. The disturbance is the filter's noise.
     """
     problem = swing(ANGLE, duration=0.6, disturbances={"angle": fp.Noise(0.5)})
-    other = replace(problem, sensing=replace(problem.sensing, belief=replace(ANGLE, start={})))
+    other = replace(problem, sensing=replace(problem.sensing, observer=replace(ANGLE, start={})))
     stepper = fp.Stepper(other, TRACK, compiled=False)
     simulator = fp.simulator(other, TRACK, compiled=False)
     squares = []
@@ -284,7 +286,7 @@ def test_its_covariance_is_that_of_its_errors():
         measured = raw_measurements(result)
         for k in range(result.cycles):
             _, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
-        covariance = memory[stepper.memory.slice("belief_covariance")].reshape(2, 2)
+        covariance = memory[stepper.memory.slice("observer_covariance")].reshape(2, 2)
         error = result["state"][-1] - result["plant_state"][-1]
         squares.append(error @ np.linalg.solve(covariance, error))
     assert np.mean(squares) == pytest.approx(2.0, abs=4 * 2 / np.sqrt(60))
@@ -302,23 +304,23 @@ def test_it_knows_the_angle_and_its_speed_better_than_differences_do():
 
 
 def test_an_accelerometer_may_correct_it():
-    """A measured response has the model's Jacobian; the belief of the speed is then better than from the angle alone."""
+    """A measured response has the model's Jacobian; the observer of the speed is then better than from the angle alone."""
     sensors = {"angle": fp.Sensor(noise=fp.Noise(2e-3)), "angle''": fp.Sensor(noise=fp.Noise(0.05))}
     with_it = replace(ANGLE, measured={"angle": 2e-3, "angle''": 0.05}, noise={"angle": 0.05})
     errors = []
     for filter in (with_it, replace(ANGLE, noise={"angle": 0.05})):
-        sensing = fp.Sensing(sensors, fp.Measured(), measured=["angle", "angle''"], belief=filter)
+        sensing = fp.Sensing(sensors, fp.Measured(), measured=["angle", "angle''"], observer=filter)
         result = run(swing(filter, believed=1.0, sensing=sensing), TRACK)
         errors.append(np.sqrt(np.mean((result["state"] - result["plant_state"])[50:, 1] ** 2)))
     assert errors[0] < errors[1]
 
 
-@pytest.mark.parametrize("belief", [fp.ModelStates(), KALMAN], ids=lambda b: type(b).__name__)
-def test_adaptation_works_on_believed_states(belief):
+@pytest.mark.parametrize("observer", [fp.ModelStates(), KALMAN], ids=lambda b: type(b).__name__)
+def test_adaptation_works_on_believed_states(observer):
     """The patient is another one than the model's: with FPI the plasma errs a tenth, though three compartments are believed."""
     errors = {}
     for name, controller in (("without", CTC), ("with", FPI)):
-        problem = infusion(belief, duration=60.0, measure_from=20.0)
+        problem = infusion(observer, duration=60.0, measure_from=20.0)
         errors[name] = fp.measure(problem, run(problem, controller)).rms_error["C1"]
     assert errors["with"] < 0.1 * errors["without"]
 
@@ -326,7 +328,7 @@ def test_adaptation_works_on_believed_states(belief):
 # One step with the controller
 
 
-BELIEFS: dict[str, tuple[Callable[..., fp.Problem], Belief]] = {
+BELIEFS: dict[str, tuple[Callable[..., fp.Problem], StateObserver]] = {
     "model": (infusion, fp.ModelStates()),
     "Kalman": (infusion, KALMAN),
     "late servo": (servo, fp.KalmanFilter(measured={"motor": 1e-3}, noise={"load": 1.0, "motor": 1.0})),
@@ -335,9 +337,9 @@ BELIEFS: dict[str, tuple[Callable[..., fp.Problem], Belief]] = {
 
 
 def case(name: str) -> tuple[fp.Problem, Controller]:
-    make, belief = BELIEFS[name]
+    make, observer = BELIEFS[name]
     controllers = {"tanks": abroad.load("quadruple_tank").controllers["RHC"], "late servo": CTC}
-    return make(belief), controllers.get(name, FPI)
+    return make(observer), controllers.get(name, FPI)
 
 
 @pytest.mark.parametrize("name", BELIEFS)
@@ -352,7 +354,7 @@ def test_a_stepper_believes_as_the_loop_does(name):
         if k == 10:
             held, after = stepper.step_measured(float(result.time[k]), measured[k] * np.nan, memory)
             assert Status(int(stepper.trace()["status"][0])) == Status.BAD_SAMPLE
-            assert all(n.startswith(("belief_", "estimate_")) for n in gone_on(stepper, memory, after))
+            assert all(n.startswith(("observer_", "estimate_")) for n in gone_on(stepper, memory, after))
             assert np.array_equal(held, result["command"][k - 1])
         command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
         assert np.array_equal(command, result["command"][k])
@@ -414,8 +416,8 @@ def test_errors_that_decay_are_allowed_and_known():
 
 def test_a_state_that_cannot_be_observed_is_named_before_the_run():
     """From the load's speed nobody knows the angles: a turn of the whole servo shows nowhere and stays."""
-    belief = fp.KalmanFilter(measured={"load'": 0.1}, noise={"motor": 1.0})
-    problem = servo(belief, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["load'"], belief=belief))
+    observer = fp.KalmanFilter(measured={"load'": 0.1}, noise={"motor": 1.0})
+    problem = servo(observer, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["load'"], observer=observer))
     with pytest.raises(
         NotSupported,
         match=r"KalmanFilter: load and motor cannot be observed along the reference from load'.*measure load",
@@ -436,22 +438,24 @@ def test_a_review_says_whether_believed_states_become_right():
 
 BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
     "unknown quantity": (
-        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["c1"], belief=KALMAN)),
+        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["c1"], observer=KALMAN)),
         InvalidProblem,
         "measured: quantity 'c1'.*Did you mean 'C1'",
     ),
     "nothing measured": (
-        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=[], belief=fp.ModelStates())),
+        lambda: infusion(
+            KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=[], observer=fp.ModelStates())
+        ),
         InvalidProblem,
         "name at least one quantity",
     ),
-    "no belief": (
+    "no observer": (
         lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["C1"])),
         InvalidProblem,
         "VelocityDifference also needs C2, C3, Ce; measure it, or state how it is believed",
     ),
-    "belief without need": (
-        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.PositionDifference(), belief=fp.ModelStates())),
+    "observer without need": (
+        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.PositionDifference(), observer=fp.ModelStates())),
         InvalidProblem,
         r"everything that PositionDifference needs is measured; name what sensors show: Sensing\(measured=\['C1'",
     ),
@@ -469,7 +473,7 @@ BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         lambda: infusion(
             KALMAN,
             sensing=fp.Sensing(
-                {"C2": fp.Sensor(quantum=0.1)}, fp.VelocityDifference(), measured=["C1"], belief=fp.ModelStates()
+                {"C2": fp.Sensor(quantum=0.1)}, fp.VelocityDifference(), measured=["C1"], observer=fp.ModelStates()
             ),
         ),
         InvalidProblem,
@@ -478,7 +482,9 @@ BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
     "no noise": (lambda: fp.KalmanFilter(measured={"C1": 0.1}, noise={}), InvalidValue, "name at least one"),
     "response of the model": (
         lambda: run(
-            infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["Ce"], belief=fp.ModelStates())),
+            infusion(
+                KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["Ce"], observer=fp.ModelStates())
+            ),
             FPI,
         ),
         NotSupported,
@@ -501,6 +507,6 @@ def test_mistakes_are_named(what):
 
 def test_a_controller_that_does_not_adapt_may_believe_its_response():
     """Control of the plasma from the effect site alone: the response is the model's, and nobody learns from it."""
-    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["Ce"], belief=fp.ModelStates())
+    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["Ce"], observer=fp.ModelStates())
     result = run(infusion(KALMAN, sensing=sensing), fp.ExactModel(CTC))
     np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-11)

@@ -1,4 +1,4 @@
-"""Beliefs of other kinds of plants - maps, algebraic states, outputs that the command moves at once - and their live settings."""
+"""Observers of other kinds of plants - maps, algebraic states, outputs that the command moves at once - and their live settings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.conformance.live import check_live
 from fpirhc.errors import NotSupported
-from fpirhc.sensing.belief import Belief
+from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=0.2))
@@ -34,9 +34,9 @@ def run(problem: fp.Problem, controller: Any = TRACK, seed: int = 0) -> fp.Run:
 # Maps
 
 
-def fishery(belief: Belief, birth: float = 2.5, noise: float = 0.0, **changes: Any) -> fp.Problem:
+def fishery(observer: StateObserver, birth: float = 2.5, noise: float = 0.0, **changes: Any) -> fp.Problem:
     """Ricker's stock in two ages: the adults are counted, the young are not."""
-    plant = fp.Plant.of_map(
+    plant = fp.Plant.discrete(
         states={"young": "1", "adult": "1"},
         inputs={"catch": "1"},
         parameters={"birth": fp.Parameter(approximate=birth, exact=2.5, unit="1")},
@@ -48,16 +48,16 @@ def fishery(belief: Belief, birth: float = 2.5, noise: float = 0.0, **changes: A
         step=T,
     )
     sensors = {"adult": fp.Sensor(noise=fp.Noise(noise))} if noise else {}
-    settings: dict[str, Any] = {"sensing": fp.Sensing(sensors, fp.Measured(), measured=["adult"], belief=belief)}
+    settings: dict[str, Any] = {"sensing": fp.Sensing(sensors, fp.Measured(), measured=["adult"], observer=observer)}
     return fp.Problem(
         plant=plant, reference=fp.Trajectory(lambda t: {"adult": 0.8 + 0.1 * ca.sin(0.15 * t)}),
         start={"young": 0.9, "adult": 0.7}, period=T, duration=60.0, **(settings | changes),
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("belief", [fp.ModelStates(), FILTER, HORIZON], ids=lambda b: type(b).__name__)
-def test_the_right_map_believes_what_is(belief: Belief) -> None:
-    result = run(fishery(belief))
+@pytest.mark.parametrize("observer", [fp.ModelStates(), FILTER, HORIZON], ids=lambda b: type(b).__name__)
+def test_the_right_map_believes_what_is(observer: StateObserver) -> None:
+    result = run(fishery(observer))
     np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-12)
     assert np.ptp(result["plant_state"], axis=0).min() > 0.02
 
@@ -81,7 +81,7 @@ def test_a_filter_of_a_map_is_that_of_the_books() -> None:
 # Algebraic states
 
 
-def drained(algebraic: bool, belief: Belief) -> fp.Problem:
+def drained(algebraic: bool, observer: StateObserver) -> fp.Problem:
     """Two tanks in a row; the flow between them solves q |q| + q = h1 - h2, by Newton's method or by hand."""
 
     def by_hand(difference: Any) -> Any:
@@ -112,7 +112,7 @@ def drained(algebraic: bool, belief: Belief) -> fp.Problem:
         period=0.05,
         duration=4.0,
         sensing=fp.Sensing(
-            {"h1": fp.Sensor(noise=fp.Noise(1e-3))}, fp.VelocityDifference(), measured=["h1"], belief=belief
+            {"h1": fp.Sensor(noise=fp.Noise(1e-3))}, fp.VelocityDifference(), measured=["h1"], observer=observer
         ),
     )
 
@@ -121,14 +121,14 @@ LEVELS: dict[str, Any] = {"measured": {"h1": 1e-3}, "noise": {"h1": 0.02, "h2": 
 
 
 @pytest.mark.parametrize(
-    "belief",
+    "observer",
     [fp.ModelStates(), fp.KalmanFilter(**LEVELS), fp.MovingHorizonStates(**LEVELS, window=4)],
     ids=lambda b: type(b).__name__,
 )
-def test_algebraic_states_are_believed_as_those_that_are_solved_by_hand(belief: Belief) -> None:
+def test_algebraic_states_are_believed_as_those_that_are_solved_by_hand(observer: StateObserver) -> None:
     """Newton's flow and its derivatives are those of the root: the wrong pipe is corrected alike."""
     one, other = (
-        run(drained(algebraic, belief), fp.ComputedTorque(fp.Exponential(1.0))) for algebraic in (True, False)
+        run(drained(algebraic, observer), fp.ComputedTorque(fp.Exponential(1.0))) for algebraic in (True, False)
     )
     np.testing.assert_allclose(one["state"], other["state"], atol=1e-9)
     assert np.abs(one["state.h2"] - one["plant_state.h2"]).max() > 1e-3
@@ -151,7 +151,7 @@ def test_an_output_of_order_zero_shows_what_is_believed() -> None:
         outputs={"power": fp.Output("W", lambda x, u, p: u.u**2 / resistance(x))},
         inverse=lambda x, r, p: {"u": ca.sqrt(r.power * resistance(x))},
     )
-    belief = fp.KalmanFilter(measured={"power": 1.0}, noise={"theta": 0.1}, start={"theta": 20.0})
+    observer = fp.KalmanFilter(measured={"power": 1.0}, noise={"theta": 0.1}, start={"theta": 20.0})
     problem = fp.Problem(
         plant=plant,
         reality=fp.Reality(plant, start={"theta": 30.0}),
@@ -160,11 +160,13 @@ def test_an_output_of_order_zero_shows_what_is_believed() -> None:
         input_before={"u": 60.0},
         period=0.1,
         duration=10.0,
-        sensing=fp.Sensing({"power": fp.Sensor(noise=fp.Noise(1.0))}, fp.Measured(), measured=["power"], belief=belief),
+        sensing=fp.Sensing(
+            {"power": fp.Sensor(noise=fp.Noise(1.0))}, fp.Measured(), measured=["power"], observer=observer
+        ),
     )
     errors = {}
-    for name, one in (("filter", belief), ("model", fp.ModelStates())):
-        result = run(replace(problem, sensing=replace(problem.sensing, belief=one)), fp.FeedforwardOnly())
+    for name, one in (("filter", observer), ("model", fp.ModelStates())):
+        result = run(replace(problem, sensing=replace(problem.sensing, observer=one)), fp.FeedforwardOnly())
         errors[name] = np.abs(result["state.theta"] - result["plant_state.theta"])[50:].max()
     assert errors["filter"] < 1.5
     assert errors["model"] > 10
@@ -173,7 +175,7 @@ def test_an_output_of_order_zero_shows_what_is_believed() -> None:
 # Signals from outside
 
 
-def room(belief: Belief) -> fp.Problem:
+def room(observer: StateObserver) -> fp.Problem:
     """A heated room in known weather: its air is an output that is measured, late by two cycles; its walls are believed."""
     plant = fp.Plant.of_states(
         states={"air": "K", "walls": "K"},
@@ -194,7 +196,7 @@ def room(belief: Belief) -> fp.Problem:
         duration=10.0,
         signals={"ambient": fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))},
         dead_time=fp.DeadTime(measurement=0.5),
-        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["felt"], belief=belief),
+        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["felt"], observer=observer),
     )
 
 
@@ -202,13 +204,13 @@ ROOM: dict[str, Any] = {"measured": {"felt": 0.1}, "noise": {"air": 0.1, "walls"
 
 
 @pytest.mark.parametrize(
-    "belief",
+    "observer",
     [fp.ModelStates(), fp.KalmanFilter(**ROOM), fp.MovingHorizonStates(**ROOM, window=5)],
     ids=lambda b: type(b).__name__,
 )
-def test_states_behind_an_output_are_believed_in_known_weather(belief: Belief) -> None:
+def test_states_behind_an_output_are_believed_in_known_weather(observer: StateObserver) -> None:
     """The model moves in the weather of the time of the samples, in every cycle of a window too."""
-    result = run(room(belief), fp.ComputedTorque(fp.Exponential(rate=0.5)))
+    result = run(room(observer), fp.ComputedTorque(fp.Exponential(rate=0.5)))
     true = result["plant_state"]
     assert np.ptp(true[:, 1]) > 0.5
     np.testing.assert_allclose(result["state"][2:], true[:-2], atol=1e-9)
@@ -217,9 +219,9 @@ def test_states_behind_an_output_are_believed_in_known_weather(belief: Belief) -
 # Live settings
 
 
-def double(belief: Belief, **changes: Any) -> fp.Problem:
+def double(observer: StateObserver, **changes: Any) -> fp.Problem:
     sensing = fp.Sensing(
-        {"y": fp.Sensor(noise=fp.Noise(1e-3), quantum=1e-4)}, fp.PositionDifference(), measured=["y"], belief=belief
+        {"y": fp.Sensor(noise=fp.Noise(1e-3), quantum=1e-4)}, fp.PositionDifference(), measured=["y"], observer=observer
     )
     settings: dict[str, Any] = {"sensing": sensing, "period": 0.01, "duration": 0.2, "start": {"y": 0.0}}
     reference = fp.Trajectory(lambda t: {"y": 0.3 * ca.sin(t)})
@@ -231,9 +233,9 @@ HALF: dict[str, Any] = {"measured": {"y": 1e-3}, "noise": {"y": 0.5}, "start": {
 
 def test_noises_of_a_filter_are_live_bit_by_bit() -> None:
     paths = [
-        "sensing.belief.measured.y",
-        "sensing.belief.noise.y",
-        "sensing.belief.start.y",
+        "sensing.observer.measured.y",
+        "sensing.observer.noise.y",
+        "sensing.observer.start.y",
         "sensing.sensors.y.quantum",
     ]
     problem = double(fp.KalmanFilter(**HALF))
@@ -246,12 +248,12 @@ NOT_LIVE = ("measured.y", "noise.y", "start.y", "bounds.y.0", "window", "iterati
 
 @pytest.mark.parametrize("name", NOT_LIVE)
 def test_settings_of_a_moving_horizon_are_not_live(name: str) -> None:
-    belief = fp.MovingHorizonStates(**HALF, window=3, bounds={"y": (-1.0, 1.0)})
-    with pytest.raises(NotSupported, match=f"'sensing.belief.{name}'.* cannot be live"):
-        fp.simulator(double(belief), TRACK, compiled=False, live=[f"sensing.belief.{name.removesuffix('.0')}"])
+    observer = fp.MovingHorizonStates(**HALF, window=3, bounds={"y": (-1.0, 1.0)})
+    with pytest.raises(NotSupported, match=f"'sensing.observer.{name}'.* cannot be live"):
+        fp.simulator(double(observer), TRACK, compiled=False, live=[f"sensing.observer.{name.removesuffix('.0')}"])
 
 
-def test_a_late_measurement_is_not_live_beside_a_belief() -> None:
+def test_a_late_measurement_is_not_live_beside_a_observer() -> None:
     late = fp.DeadTime(inputs={"u": 0.02}, measurement=0.01, longest={"u": 0.04, "measurement": 0.02})
     problem = double(fp.KalmanFilter(**HALF), dead_time=late)
     with pytest.raises(NotSupported, match=r"'dead_time.measurement' cannot be live here"):

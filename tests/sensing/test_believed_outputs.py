@@ -20,7 +20,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed import free_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
-from fpirhc.sensing.belief import Belief
+from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
 from fpirhc.studies.comparison.timing import measure_cycle
@@ -49,7 +49,7 @@ def drug(believed: float = 4.0) -> fp.Plant:
     )
 
 
-def sedated(belief: Belief | None, believed: float = 4.0, **changes: Any) -> fp.Problem:
+def sedated(observer: StateObserver | None, believed: float = 4.0, **changes: Any) -> fp.Problem:
     """The depth from 74 to 50 and on to 40; it alone is measured."""
     plant, first = drug(believed), curve(1.5, 4.0)
 
@@ -57,7 +57,7 @@ def sedated(belief: Belief | None, believed: float = 4.0, **changes: Any) -> fp.
         return {"depth": 50 + (first - 50) * (1 + t / 2) * ca.exp(-t / 2) - 10 / (1 + ca.exp(10 - t))}
 
     settings: dict[str, Any] = {
-        "sensing": fp.Sensing({}, fp.PositionDifference(), measured=["depth"], belief=belief),
+        "sensing": fp.Sensing({}, fp.PositionDifference(), measured=["depth"], observer=observer),
         "limits": fp.Limits(inputs={"u": (0.0, 40.0)}),
         "start": {"C": 1.5, "R": 1.5, "E": 1.5},
         "period": 1 / 12,
@@ -75,10 +75,10 @@ def run(problem: fp.Problem, controller: Controller, seed: int = 0) -> fp.Run:
 
 
 @pytest.mark.parametrize("late", [0.0, 2 / 12], ids=["at once", "two cycles late"])
-@pytest.mark.parametrize("belief", [fp.ModelStates(), fp.ModelStates(corrected=False), FILTER], ids=str)
-def test_a_right_model_believes_what_is(belief: Belief, late: float) -> None:
+@pytest.mark.parametrize("observer", [fp.ModelStates(), fp.ModelStates(corrected=False), FILTER], ids=str)
+def test_a_right_model_believes_what_is(observer: StateObserver, late: float) -> None:
     """With exact parameters the states are the plant's, as late as the measurement is; the outputs are estimated."""
-    problem = sedated(belief, dead_time=fp.DeadTime(inputs={"u": 1.5 / 12}, measurement=late), duration=6.0)
+    problem = sedated(observer, dead_time=fp.DeadTime(inputs={"u": 1.5 / 12}, measurement=late), duration=6.0)
     result, cycles = run(problem, PLAIN), round(late * 12)
     believed, true = result["state"], result["plant_state"]
     assert np.ptp(true, axis=0).min() > 0.5
@@ -90,7 +90,7 @@ def test_a_right_model_believes_what_is(belief: Belief, late: float) -> None:
 def test_a_filter_of_an_output_is_that_of_the_books() -> None:
     """Against a recursion in numpy with a wrong curve: rates by hand, Jacobians by the complex step, to 1e-10."""
     sensors = {"depth": fp.Sensor(noise=fp.Noise(0.3))}
-    sensing = fp.Sensing(sensors, fp.PositionDifference(), measured=["depth"], belief=FILTER)
+    sensing = fp.Sensing(sensors, fp.PositionDifference(), measured=["depth"], observer=FILTER)
     problem = sedated(FILTER, believed=5.0, sensing=sensing, duration=8.0)
     result, h = run(problem, PLAIN), 1 / 12
 
@@ -124,7 +124,7 @@ def test_a_filter_of_an_output_is_that_of_the_books() -> None:
 
 def test_a_measured_state_beside_the_output_corrects_what_is_believed() -> None:
     """A blood sample in every cycle: the plasma is known, and the wrong curve moves the other states less."""
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"], belief=fp.ModelStates())
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"], observer=fp.ModelStates())
     problem = sedated(None, believed=5.0, sensing=sensing, disturbances={"u": fp.Step(at=2.0, size=0.5)})
     result = run(problem, PLAIN)
     alone = run(replace(problem, sensing=replace(sensing, measured=["depth"])), PLAIN)
@@ -135,8 +135,8 @@ def test_a_measured_state_beside_the_output_corrects_what_is_believed() -> None:
 
 
 def test_a_late_measured_state_begins_where_the_reality_does() -> None:
-    """A blood sample that is late by three cycles shows the real start until it shows the motion; the belief began elsewhere."""
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"], belief=fp.ModelStates())
+    """A blood sample that is late by three cycles shows the real start until it shows the motion; the observer began elsewhere."""
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"], observer=fp.ModelStates())
     real, late = fp.Reality(drug(), start={"C": 2.5, "R": 0.5, "E": 2.5}), fp.DeadTime(measurement=3 / 12)
     result = run(sedated(None, sensing=sensing, reality=real, dead_time=late, duration=4.0), PLAIN)
     assert np.array_equal(result["state.C"][:4], np.full(4, 2.5))
@@ -149,13 +149,13 @@ TWO_MASS = fp.load_problem("two_mass")
 
 @pytest.mark.parametrize("name", ["CTC", "CTC+FPI (eq 6)"])
 def test_outputs_that_are_coordinates_and_known_change_no_signal(name: str) -> None:
-    """All states follow from the measured positions: the belief has nothing to add, bit by bit."""
+    """All states follow from the measured positions: the observer has nothing to add, bit by bit."""
     problem = replace(
         TWO_MASS.problem, duration=0.2, measure_from=0.1, horizon=None, cost=None,
         sensing=fp.Sensing({"q1": fp.Sensor(noise=fp.Noise(1e-6))}, fp.PositionDifference()),
     )  # fmt: skip
     same = {"q1": fp.Output("m", lambda q, v, p: q.q1), "q2": fp.Output("m", lambda q, v, p: q.q2)}
-    believed = replace(problem.sensing, measured=["q1", "q2"], belief=fp.ModelStates())
+    believed = replace(problem.sensing, measured=["q1", "q2"], observer=fp.ModelStates())
     outputs = replace(problem, plant=replace(problem.plant, outputs=same), sensing=believed)
     law = fp.ComputedTorque(fp.Exponential(6.0), fp.Affine(-0.05) if "FPI" in name else fp.Identity())
     plain, other = (run(p, law, seed=1) for p in (problem, outputs))
@@ -164,14 +164,14 @@ def test_outputs_that_are_coordinates_and_known_change_no_signal(name: str) -> N
         assert np.array_equal(plain[signal], other[signal]), signal
 
 
-def test_a_reality_shows_its_output_and_starts_elsewhere_than_the_belief() -> None:
+def test_a_reality_shows_its_output_and_starts_elsewhere_than_the_observer() -> None:
     """The real patient starts with other levels; the filter finds them from the depth, the model alone does not."""
     first = {"C": 2.5, "R": 0.5, "E": 2.5}
     real = fp.Reality(drug(), start=first)
     start = replace(FILTER, start={"C": 1.0, "R": 1.0, "E": 1.0})
     errors = []
-    for belief in (start, fp.ModelStates()):
-        result = run(sedated(belief, reality=real, duration=12.0), PLAIN)
+    for observer in (start, fp.ModelStates()):
+        result = run(sedated(observer, reality=real, duration=12.0), PLAIN)
         assert tuple(result["plant_state"][0]) == tuple(first.values())
         assert result["state.E"][0] != first["E"]
         errors.append(np.abs(result["state"] - result["plant_state"])[-1].max())
@@ -199,9 +199,9 @@ NAMES = ("CTC", "CTC+FPI", "RHC", "RHC+FPI")
 def bis_errors() -> dict[tuple[str, str], float]:
     """Rms error of the depth by what is known of the compartments, and controller; the bis alone is measured."""
     errors = {}
-    for known, belief in BELIEFS.items():
-        measured = None if belief is None else ["bis"]
-        sensing = fp.Sensing({}, fp.PositionDifference(), measured=measured, belief=belief)
+    for known, observer in BELIEFS.items():
+        measured = None if observer is None else ["bis"]
+        sensing = fp.Sensing({}, fp.PositionDifference(), measured=measured, observer=observer)
         problem = replace(ANAESTHESIA.problem, sensing=sensing)
         for name in NAMES:
             result = run(problem, ANAESTHESIA.controllers[name])
@@ -218,7 +218,7 @@ def test_adaptation_works_with_believed_compartments(bis_errors: dict[tuple[str,
 
 def test_an_exact_model_referenced_form_changes_nothing() -> None:
     """Where the response is measured, the model's response is that at the believed state, and with an exact model the same."""
-    sensing = fp.Sensing({}, fp.Measured(), belief=fp.ModelStates())
+    sensing = fp.Sensing({}, fp.Measured(), observer=fp.ModelStates())
     problem, form = sedated(None, sensing=sensing, duration=5.0), fp.ModelReferenced(fp.Affine(-0.5))
     plain, referenced = (run(problem, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
     np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
@@ -294,20 +294,20 @@ RAW: dict[str, Callable[[], fp.Problem]] = {
 
 @pytest.mark.parametrize("name", RAW)
 def test_raw_measurements_of_a_run_give_its_commands(name: str) -> None:
-    """Bit by bit; in a cycle with a bad sample nothing but estimators and beliefs goes on."""
+    """Bit by bit; in a cycle with a bad sample nothing but estimators and observers goes on."""
     problem = RAW[name]()
     controller = fp.ComputedTorque(LAW, fp.Affine(-0.2))
     result = run(problem, controller, seed=2)
     anything = dict.fromkeys(problem.sensing.measures(problem.plant), (-np.inf, np.inf))
     stepper = fp.Stepper(problem, controller, compiled=False, plausible=anything)
     memory, measured = stepper.start(), raw_measurements(result)
-    states = () if problem.sensing.belief else problem.plant.state.elements
+    states = () if problem.sensing.observer else problem.plant.state.elements
     assert stepper.measures == (*states, *problem.sensing.measures(problem.plant))
     for k in range(result.cycles):
         if k == 10:
             held, after = stepper.step_measured(float(result.time[k]), measured[k] * np.nan, memory)
             assert Status(int(stepper.trace()["status"][0])) == Status.BAD_SAMPLE
-            assert all(n.startswith(("belief_", "estimate_", "filter_")) for n in gone_on(stepper, memory, after))
+            assert all(n.startswith(("observer_", "estimate_", "filter_")) for n in gone_on(stepper, memory, after))
             assert np.array_equal(held, result["command"][k - 1])
         command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
         assert np.array_equal(command, result["command"][k]), k
@@ -332,7 +332,7 @@ def test_a_review_says_what_cannot_be_observed() -> None:
     assert of_model.verdict == "yes"
     slowest = np.linalg.eigvals([[-1.5, 0.5], [0.1, -0.1]]).max()
     assert of_model.numbers["pole"] == pytest.approx(slowest, rel=1e-9)
-    stays = answer(replace(integrating("y"), sensing=replace(integrating("y").sensing, belief=fp.ModelStates())))
+    stays = answer(replace(integrating("y"), sensing=replace(integrating("y").sensing, observer=fp.ModelStates())))
     assert stays.verdict == "no"
     assert stays.change == "Measure z, or a quantity that depends on it."
 
@@ -346,31 +346,31 @@ def integrating(measured: str) -> fp.Problem:
         rates=lambda x, u, p: {"y": u.u, "z": x.y},
         outputs={"y": fp.Output("m", lambda x, p: x.y)},
     )
-    belief = fp.KalmanFilter(measured={measured: 0.1}, noise={"y": 1.0})
+    observer = fp.KalmanFilter(measured={measured: 0.1}, noise={"y": 1.0})
     return fp.Problem(
         plant=plant, reference=fp.Trajectory(lambda t: {"y": ca.sin(t)}), start={"y": 0.0, "z": 0.0}, period=0.1, duration=2.0,
-        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["y"], belief=belief),
+        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["y"], observer=observer),
     )  # fmt: skip
 
 
 WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
     "output that nobody measures": (
-        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["C"], belief=fp.ModelStates())),
+        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["C"], observer=fp.ModelStates())),
         InvalidProblem,
         "PositionDifference needs depth, and outputs that are controlled are measured or estimated, never believed",
     ),
     "derivative that nobody measures": (
-        lambda: sedated(None, sensing=fp.Sensing({}, fp.Measured(), measured=["depth"], belief=fp.ModelStates())),
+        lambda: sedated(None, sensing=fp.Sensing({}, fp.Measured(), measured=["depth"], observer=fp.ModelStates())),
         InvalidProblem,
         r"Measured needs depth', depth'', and outputs .* such as PositionDifference\(\)",
     ),
-    "state without a belief": (
+    "state without an observer": (
         lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"])),
         InvalidProblem,
-        "C is given as it is to controllers of a plant with outputs, unless a belief is stated",
+        "C is given as it is to controllers of a plant with outputs, unless an observer is stated",
     ),
     "unknown quantity": (
-        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["dept"], belief=fp.ModelStates())),
+        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["dept"], observer=fp.ModelStates())),
         InvalidProblem,
         "measured: quantity 'dept' is unknown. Did you mean 'depth'",
     ),

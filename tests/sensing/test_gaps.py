@@ -17,7 +17,7 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.learning.estimators.uncertain import Uncertain
 from fpirhc.members import examples
 from fpirhc.sensing.base import DerivativeEstimator
-from fpirhc.sensing.belief import Belief
+from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.clock import missed_cycles
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, bridged
@@ -27,7 +27,7 @@ from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.native import find_compiler
 
 ESTIMATORS: tuple[DerivativeEstimator, ...] = examples("derivative estimators")
-BELIEFS: tuple[Belief, ...] = examples("beliefs")
+BELIEFS: tuple[StateObserver, ...] = examples("observers")
 GAPS = (1, 5, 20, 50)
 TRACK = fp.Exponential(rate=6.0)
 GENTLE = fp.Affine(gain=-0.05)
@@ -167,7 +167,7 @@ LOOPS: dict[str, tuple[fp.Problem, Controller]] = {
 
 
 def believed(number: int) -> fp.Problem:
-    sensing = fp.Sensing(estimator=fp.Measured(), measured=["a", "b"], belief=BELIEFS[number])
+    sensing = fp.Sensing(estimator=fp.Measured(), measured=["a", "b"], observer=BELIEFS[number])
     return replace(two_masses(), sensing=sensing)
 
 

@@ -19,7 +19,7 @@ from plants import linear, pendulum
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
-from fpirhc.sensing.belief import Belief
+from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.symbolic.native import find_compiler
 
@@ -28,19 +28,19 @@ HALF: dict[str, Any] = {"measured": {"y": 1e-3}, "noise": {"y": 0.5}, "start": {
 ANGLE: dict[str, Any] = {"measured": {"angle": 2e-3}, "noise": {"angle": 0.5}, "start": {"angle": 0.05, "angle'": 0.1}}
 
 
-def sensed(name: str, deviation: float, belief: Belief) -> fp.Sensing:
+def sensed(name: str, deviation: float, observer: StateObserver) -> fp.Sensing:
     sensors = {name: fp.Sensor(noise=fp.Noise(deviation))}
-    return fp.Sensing(sensors, fp.PositionDifference(), measured=[name], belief=belief)
+    return fp.Sensing(sensors, fp.PositionDifference(), measured=[name], observer=observer)
 
 
-def double(belief: Belief, **changes: Any) -> fp.Problem:
+def double(observer: StateObserver, **changes: Any) -> fp.Problem:
     """Y'' = u with y measured."""
-    settings: dict[str, Any] = {"sensing": sensed("y", 1e-3, belief), "period": 0.01, "duration": 0.6}
+    settings: dict[str, Any] = {"sensing": sensed("y", 1e-3, observer), "period": 0.01, "duration": 0.6}
     reference = fp.Trajectory(lambda t: {"y": 0.3 * ca.sin(t)})
     return fp.Problem(plant=linear(1.0, 1.0), reference=reference, start={"y": 0.0}, **(settings | changes))
 
 
-def swing(belief: Belief, **changes: Any) -> fp.Problem:
+def swing(observer: StateObserver, **changes: Any) -> fp.Problem:
     """A pendulum with a wrong mass whose angle is measured."""
     plant = pendulum(1.0, 1.3)
     settings: dict[str, Any] = {
@@ -49,7 +49,7 @@ def swing(belief: Belief, **changes: Any) -> fp.Problem:
         "start": {"angle": 0.1, "angle'": 1.6},
         "period": 0.02,
         "duration": 0.6,
-        "sensing": sensed("angle", 2e-3, belief),
+        "sensing": sensed("angle", 2e-3, observer),
     }
     return fp.Problem(**(settings | changes))
 
@@ -68,8 +68,8 @@ def test_for_a_linear_model_it_is_the_kalman_filter(window: int, late: float) ->
     dead_time = fp.DeadTime(measurement=late)
     for start in (HALF["start"], {"y'": 0.5}):
         settings = {**HALF, "start": start}
-        beliefs = fp.KalmanFilter(**settings), fp.MovingHorizonStates(**settings, window=window)
-        one, other = (run(double(belief, dead_time=dead_time)) for belief in beliefs)
+        observers = fp.KalmanFilter(**settings), fp.MovingHorizonStates(**settings, window=window)
+        one, other = (run(double(observer, dead_time=dead_time)) for observer in observers)
         np.testing.assert_allclose(other["state"], one["state"], atol=1e-9)
         assert np.ptp(one["state"], axis=0).min() > 0.1
 
@@ -84,7 +84,7 @@ def test_its_arrival_cost_is_the_filter_s() -> None:
     for _ in range(cycles - window - 1):
         gain = p @ c.T / (c @ p @ c.T + 1e-6)
         p = a @ (p - gain @ c @ p) @ a.T + 0.25 * b @ b.T
-    own = memory[stepper.memory.slice("belief_covariance")].reshape(2, 2)
+    own = memory[stepper.memory.slice("observer_covariance")].reshape(2, 2)
     np.testing.assert_allclose(own, p, rtol=1e-9)
 
 
@@ -103,15 +103,15 @@ def replayed(problem: fp.Problem, cycles: int) -> tuple[np.ndarray, fp.Stepper]:
 class Window:
     """The least-squares problem of one window of the pendulum, in numpy: unknowns are its first state and its noises."""
 
-    def __init__(self, belief: fp.MovingHorizonStates, memory: np.ndarray, stepper: fp.Stepper) -> None:
+    def __init__(self, observer: fp.MovingHorizonStates, memory: np.ndarray, stepper: fp.Stepper) -> None:
         def part(name: str) -> np.ndarray:
             return memory[stepper.memory.slice(name)]
 
-        self.belief, count = belief, belief.window + 1
-        self.states = part("belief_states").reshape(count, 2)
-        self.noises = part("belief_noises")
-        self.mean, self.covariance = part("belief_arrival"), part("belief_covariance").reshape(2, 2)
-        rows = part("belief_samples").reshape(count, 4)
+        self.observer, count = observer, observer.window + 1
+        self.states = part("observer_states").reshape(count, 2)
+        self.noises = part("observer_noises")
+        self.mean, self.covariance = part("observer_arrival"), part("observer_covariance").reshape(2, 2)
+        rows = part("observer_samples").reshape(count, 4)
         assert (rows[:, :2] == 1).all()
         self.measured, self.commands = rows[:, 2], rows[:, 3]
         self.root = np.linalg.inv(np.linalg.cholesky(self.covariance))
@@ -150,8 +150,8 @@ class Window:
 
 def test_its_window_is_solved_as_by_scipy() -> None:
     """States and noises of a full window agree with `scipy.optimize.least_squares` from another guess, to 1e-8."""
-    belief = fp.MovingHorizonStates(**ANGLE, window=8, iterations=8)
-    window = Window(belief, *replayed(swing(belief), 25))
+    observer = fp.MovingHorizonStates(**ANGLE, window=8, iterations=8)
+    window = Window(observer, *replayed(swing(observer), 25))
     guess = np.concatenate([window.mean, np.zeros(8)])
     best = scipy.optimize.least_squares(
         window.residuals, guess, xtol=1e-15, ftol=1e-15, gtol=1e-15, jac="3-point", x_scale="jac"
@@ -163,8 +163,8 @@ def test_its_window_is_solved_as_by_scipy() -> None:
 
 def test_a_bound_is_the_logarithm_that_it_says() -> None:
     """An angle that is believed to stay below .5 swings to .8: at the estimate the gradient of the whole cost vanishes."""
-    belief = fp.MovingHorizonStates(**ANGLE, window=6, iterations=30, bounds={"angle": (-2.0, 0.5)}, barrier=0.5)
-    window = Window(belief, *replayed(swing(belief, start={"angle": 0.45, "angle'": 0.0}), 22))
+    observer = fp.MovingHorizonStates(**ANGLE, window=6, iterations=30, bounds={"angle": (-2.0, 0.5)}, barrier=0.5)
+    window = Window(observer, *replayed(swing(observer, start={"angle": 0.45, "angle'": 0.0}), 22))
 
     def cost(unknown: np.ndarray) -> Any:
         angles = np.array([x[0] for x in window.motion(unknown)])
@@ -180,9 +180,9 @@ def test_a_bound_is_the_logarithm_that_it_says() -> None:
 
 def test_a_right_model_believes_what_is() -> None:
     """With the exact model, a known start and no noise the estimate is the plant's state, one Gauss-Newton step per sample."""
-    belief = fp.MovingHorizonStates(measured={"angle": 2e-3}, noise={"angle": 0.5}, window=5)
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["angle"], belief=belief)
-    result = run(swing(belief, sensing=sensing), fp.ExactModel(TRACK))
+    observer = fp.MovingHorizonStates(measured={"angle": 2e-3}, noise={"angle": 0.5}, window=5)
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["angle"], observer=observer)
+    result = run(swing(observer, sensing=sensing), fp.ExactModel(TRACK))
     np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-11)
 
 
@@ -205,7 +205,7 @@ INSIDE = {"A": (0.0, np.inf), "B": (0.0, np.inf)}
 PRESSURE = fp.ComputedTorque(fp.Exponential(rate=1.0))
 
 
-def batch(belief: Belief) -> fp.Problem:
+def batch(observer: StateObserver) -> fp.Problem:
     """The batch of the paper: it starts at 3 and 1 bar and is believed at 0.1 and 4.5; the valve of the feed is shut."""
     return fp.Problem(
         plant=reactor(),
@@ -215,12 +215,12 @@ def batch(belief: Belief) -> fp.Problem:
         period=0.1,
         duration=10.0,
         limits=fp.Limits(inputs={"feed": (0.0, 1e-9)}),
-        sensing=sensed("P", 0.1, belief),
+        sensing=sensed("P", 0.1, observer),
     )
 
 
-def pressures(belief: Belief) -> list[fp.Run]:
-    simulator = fp.simulator(batch(belief), PRESSURE, compiled=False)
+def pressures(observer: StateObserver) -> list[fp.Run]:
+    simulator = fp.simulator(batch(observer), PRESSURE, compiled=False)
     return [simulator.run(seed=seed) for seed in range(6)]
 
 
@@ -264,7 +264,7 @@ class Batch:
 def test_a_foreign_reactor_is_believed_alike() -> None:
     """The same batch as an object outside, of which nothing is known but its pressure: the same estimates, to its integrator."""
     problem = batch(fp.MovingHorizonStates(**KNOWN, window=5, bounds=INSIDE))
-    foreign = replace(problem, reality=fp.Foreign(Batch(), measures={"P": "bar"}))
+    foreign = replace(problem, reality=fp.ExternalPlant(Batch(), measures={"P": "bar"}))
     one, other = run(problem, PRESSURE, seed=3), run(foreign, PRESSURE, seed=3)
     np.testing.assert_allclose(other["state"], one["state"], atol=1e-5)
     assert abs(other["state.A"][-1] - 3 / (1 + 6 * 0.16 * 9.9)) < 0.02
@@ -300,7 +300,7 @@ def test_compiled_loops_believe_alike() -> None:
 # What is refused
 
 
-def turning(**changes: Any) -> Belief:
+def turning(**changes: Any) -> StateObserver:
     return fp.MovingHorizonStates(**{**ANGLE, "window": 5, **changes})
 
 
@@ -318,7 +318,7 @@ WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         "'angle' starts at 0.1, and its bounds are 0.1 and 2; start inside",
     ),
     "not observed": (
-        lambda: run(double(SPEED, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y'"], belief=SPEED))),
+        lambda: run(double(SPEED, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y'"], observer=SPEED))),
         NotSupported,
         "MovingHorizonStates: y cannot be observed along the reference from y'",
     ),

@@ -12,6 +12,7 @@ import pytest
 from plants import chain, linear
 
 import fpirhc as fp
+from fpirhc.contraction.delayed import delayed_limit
 from fpirhc.controllers import contract
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive
 from fpirhc.simulation.loop import close_loop
@@ -305,7 +306,7 @@ def test_second_difference_of_position(gain):
 def test_filtered_error(pole, share):
     """z^2 - (1 + p - a (1 - p)) z + p, stable up to a = 2 (1 + p)/(1 - p)."""
     limit = 2 * (1 + pole) / (1 - pole)
-    assert fp.delayed_limit(np.ones(1), pole=pole) == pytest.approx(limit, rel=1e-4)
+    assert delayed_limit(np.ones(1), pole=pole) == pytest.approx(limit, rel=1e-4)
     gain = share * limit
     problem = resting(linear(1.0, 1.0), period=1e-4, duration=1e-2)
     controller = fp.ComputedTorque(
@@ -325,7 +326,7 @@ def test_limit_is_that_of_the_loop(estimator, paired, monkeypatch):
     problem = resting(linear(1.0, 0.8), period=1e-3, duration=1e-2, sensing=fp.Sensing(estimator=estimator))
     cycles = problem.response_delay if paired else 0.0
     weights = estimator.weights(2, problem.period)
-    limit = fp.delayed_limit(weights, pairing=cycles, eigenvalue=1 / 0.8)
+    limit = delayed_limit(weights, pairing=cycles, eigenvalue=1 / 0.8)
     assert limit > 0
     for share in (0.97, 1.03):
         pair = fp.Paired(fp.Affine(gain=-2 * share * limit), cycles=cycles)
@@ -337,13 +338,13 @@ def test_limit_is_that_of_the_loop(estimator, paired, monkeypatch):
 def test_limit_of_pure_delay(cycles):
     """2 sin(pi / (2 (2 d + 1))) unpaired, 2 paired."""
     weights = np.append(np.zeros(cycles), 1.0)
-    assert fp.delayed_limit(weights) == pytest.approx(2 * math.sin(math.pi / (2 * (2 * cycles + 1))), rel=1e-4)
-    assert fp.delayed_limit(weights, pairing=cycles) == pytest.approx(2.0, rel=1e-6)
+    assert delayed_limit(weights) == pytest.approx(2 * math.sin(math.pi / (2 * (2 * cycles + 1))), rel=1e-4)
+    assert delayed_limit(weights, pairing=cycles) == pytest.approx(2.0, rel=1e-6)
 
 
 def test_pairing_that_damps_nothing_has_no_limit():
     """The mean of two requests does not see a request that alternates, which the pair of two cycles ago keeps."""
-    assert fp.delayed_limit(np.array([0.5, 0.5]), pairing=1.0) == 0.0
+    assert delayed_limit(np.array([0.5, 0.5]), pairing=1.0) == 0.0
 
 
 # --- what is refused ---
@@ -355,7 +356,7 @@ def test_delay_that_makes_the_loop_unstable_is_refused():
     """Before the run, with the limit, the gain and three remedies; each of them is accepted."""
     problem, tracking = swinging(sensing=WINDOW), fp.Exponential(rate=6.0)
     gain = 0.3  # lambda = 1 / 0.7; the limit of a lambda is 0.1207
-    limit = fp.delayed_limit(WINDOW.estimator.weights(2, 1e-3), eigenvalue=1 / 0.7)
+    limit = delayed_limit(WINDOW.estimator.weights(2, 1e-3), eigenvalue=1 / 0.7)
     with pytest.raises(NotContractive) as refused:
         run(problem, fp.ComputedTorque(tracking, fp.Affine(gain=-2 * gain)))
     text = str(refused.value)

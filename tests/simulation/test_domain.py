@@ -20,7 +20,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.step_outcome import FAILED, PATIENCE
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.wrappers.base import Wrapper, of_map
+from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.members import Example, examples
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.ranges import Dropped
@@ -318,7 +318,7 @@ class Rooted(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """The map's request, times the root of one."""
-        following, own = self.map.step(request, response, desired, of_map(self, memory, request.numel()))
+        following, own = self.map.step(request, response, desired, discrete(self, memory, request.numel()))
         return following * ca.sqrt(memory["rooted"]), {"rooted": memory["rooted"], **own}
 
 

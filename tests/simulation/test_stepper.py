@@ -422,7 +422,10 @@ def driven(gain_of_plant: float, deformation: Deformation, *, cycles: int, stuck
         limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
     )
     stepper = fp.Stepper(
-        problem, fp.ComputedTorque(TRACK, deformation), compiled=False, watch=fp.Watch(saturated_after=0.2, window=50)
+        problem,
+        fp.ComputedTorque(TRACK, deformation),
+        compiled=False,
+        monitor=fp.RunMonitor(saturated_after=0.2, window=50),
     )
     memory, x, u, statuses = stepper.start(), np.zeros(2), np.zeros(1), []
     for k in range(cycles):

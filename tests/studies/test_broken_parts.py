@@ -98,10 +98,10 @@ def answers(monkeypatch, *names):
 def test_a_question_that_breaks_is_unknown_by_name(monkeypatch):
     """All other questions keep their answers, bit by bit."""
     with monkeypatch.context() as context:
-        whole, of_map = answers(context)
+        whole, discrete = answers(context)
     with monkeypatch.context() as context:
         broken, of_broken = answers(context, "commands_inside", "gain_admissible")
-    for before, after, name in ((whole, broken, "Breaks?"), (of_map, of_broken, "Breaks?")):
+    for before, after, name in ((whole, broken, "Breaks?"), (discrete, of_broken, "Breaks?")):
         assert after[name].verdict == Verdict.UNKNOWN
         assert "LinAlgError: Array must not contain" in after[name].evidence
         assert len(after) == len(before)

@@ -97,13 +97,13 @@ def test_equal_controllers_share_one_line():
 
 def test_estimated_and_believed_states_are_said():
     """The position is measured late, the rest is estimated and believed."""
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["y"], belief=fp.ModelStates())
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["y"], observer=fp.ModelStates())
     lines = compared(["CTC"], sensing=sensing, dead_time=fp.DeadTime(measurement=0.02)).information
     assert lines[0] == (
         "all controllers are given y in every cycle of 0.01 s, 0.02 s late; PositionDifference estimates the response from them"
     )
     filter = fp.KalmanFilter(measured={"y": 1e-3}, noise={"y": 1.0})
-    believed = compared(["CTC"], sensing=replace(sensing, belief=filter)).information
+    believed = compared(["CTC"], sensing=replace(sensing, observer=filter)).information
     assert believed[0].endswith("; y, y' are believed (KalmanFilter)")
 
 

@@ -122,7 +122,7 @@ def test_a_plant_outside_is_not_run_for_a_sentence():
     """It may be a machine: it runs for the rows that a user asked for, and the verdict names what is missing."""
     problem = case(fp.Identity()).problem
     outside = replace(
-        problem, reality=fp.Foreign(_Still(), measures={"y": "m", "y'": "m/s", "y''": "m/s^2"}), disturbances={}
+        problem, reality=fp.ExternalPlant(_Still(), measures={"y": "m", "y'": "m/s", "y''": "m/s^2"}), disturbances={}
     )
     row: Any = SimpleNamespace(name="adaptive", adaptive=True, pair=None)
     found, missing = partners(outside, [row], {}, seed=0, compiled=False)

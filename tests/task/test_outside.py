@@ -151,7 +151,7 @@ def test_a_preview_lowers_the_cost_of_a_known_load():
 def test_stages_have_values_of_their_own():
     """Every stage of the data has the value of its middle; without preview all have that of the cycle."""
     from fpirhc.horizon.stage_data import data_layout, stage_data
-    from fpirhc.task.outside import previewed_values
+    from fpirhc.task.exogenous import previewed_values
 
     for preview in (True, False):
         problem = task(room(OUTSIDE), {"ambient": fp.Known(NIGHT, preview=preview)})

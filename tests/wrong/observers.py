@@ -10,13 +10,13 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.sensing.base import values_of
-from fpirhc.sensing.belief import Belief
 from fpirhc.sensing.observability import unobservable
+from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.symbolic.layout import Layout, Signal
 
 
 @dataclass(frozen=True)
-class ConstantGain(Belief):
+class ConstantGain(StateObserver):
     """x^ = x- + gain (y - h(x-)) for every state that is measured itself; an observer that keeps every law."""
 
     gain: float

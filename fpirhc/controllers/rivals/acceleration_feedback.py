@@ -26,7 +26,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block
 from fpirhc.controllers.face import on_face
-from fpirhc.controllers.tracked import bounded, desired_blocks
+from fpirhc.controllers.tracking_cycle import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue

@@ -24,9 +24,9 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like
 from fpirhc.controllers.contract import Deforms, PlantModel
-from fpirhc.controllers.demands import command_demand
 from fpirhc.controllers.face import on_face
-from fpirhc.controllers.tracked import bounded, desired_blocks
+from fpirhc.controllers.scale_selection import command_demand
+from fpirhc.controllers.tracking_cycle import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation, Mirror, automatic
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number

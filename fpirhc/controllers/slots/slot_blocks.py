@@ -19,7 +19,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import clip, error_signal, like
 from fpirhc.controllers.face import measured_signals
-from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, stages_of
+from fpirhc.controllers.online_reference import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.slot import Channel, First
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.status import Status

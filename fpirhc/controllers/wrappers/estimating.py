@@ -20,7 +20,7 @@ from fpirhc.controllers.contract import Planner, with_setting
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
-from fpirhc.learning.estimators.base import Estimator, Seen
+from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.maps import response_age
 from fpirhc.symbolic.block import Block, Delay
@@ -50,7 +50,7 @@ class Estimating(Controller):
     """
 
     controller: Controller
-    estimator: Estimator
+    estimator: ParameterEstimator
     dead_time: DeadTime | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     at_once: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
@@ -132,7 +132,7 @@ class Estimating(Controller):
 def _estimate_block(
     pairs: ResponsePairs,
     modelled: Problem,
-    estimator: Estimator,
+    estimator: ParameterEstimator,
     believed: Signal,
     acted: Signal,
     *,
@@ -188,7 +188,7 @@ def _estimate_block(
 
 
 def _waiting(
-    pairs: ResponsePairs, modelled: Problem, estimator: Estimator, believed: Signal, acted: Signal, own: Layout
+    pairs: ResponsePairs, modelled: Problem, estimator: ParameterEstimator, believed: Signal, acted: Signal, own: Layout
 ) -> Block:
     """Block of a cycle without a sample: (parameters, command of the last cycle) -> corrected parameters."""
     model, count = modelled.plant, len(pairs.problem.plant.parameters)

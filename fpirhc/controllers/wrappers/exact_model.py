@@ -9,7 +9,7 @@ from fpirhc.controllers.contract import PlantModel
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.task.outside import really_known, signals_of
+from fpirhc.task.exogenous import really_known, signals_of
 from fpirhc.task.problem import Problem
 
 

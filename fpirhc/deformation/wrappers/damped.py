@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.wrappers.base import Wrapper, forget, growing_in_a_row, of_map
+from fpirhc.deformation.wrappers.base import Wrapper, discrete, forget, growing_in_a_row
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _OSCILLATES = -0.9
@@ -59,7 +59,7 @@ class Damped(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return r + factor (G(r, f, d) - r), and G(r, f, d) itself where the factor is one."""
-        inner = of_map(self, memory, request.numel())
+        inner = discrete(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
         error, before = response - desired, memory["damper_error"]
         sign = forget(memory["damper_sign"], ca.sign(ca.dot(error, before)))

@@ -33,7 +33,7 @@ import casadi as ca
 from fpirhc.deformation.base import Deformation, Iteration, Pairing
 from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_longest, check_uncertainty, every, several
-from fpirhc.deformation.wrappers.base import Wrapper, of_map
+from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import nominal
@@ -87,7 +87,7 @@ class _Queued(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the next request from the pair that caused the response."""
-        inner, queue = of_map(self, memory, request.numel()), self._queue
+        inner, queue = discrete(self, memory, request.numel()), self._queue
         first = memory["queue_filled"] < 0.5
         # The first request of a run is the desired response itself.
         desired_then = ca.if_else(first, request, memory["queue_now"])

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from fpirhc.deformation.base import Deformation, Iteration
-from fpirhc.deformation.wrappers.base import Wrapper, of_map
+from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -55,7 +55,7 @@ class Filtered(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the map's next request for the filtered error."""
-        inner = of_map(self, memory, request.numel())
+        inner = discrete(self, memory, request.numel())
         error = self.pole * memory["filter_error"] + (1 - self.pole) * (response - desired)
         next_request, next_memory = self.map.step(request, desired + error, desired, inner)
         return next_request, {"filter_error": error, **next_memory}

@@ -23,7 +23,7 @@ from typing import ClassVar
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, smooth_norm
-from fpirhc.deformation.wrappers.base import Wrapper, forget, of_map, start_of_map
+from fpirhc.deformation.wrappers.base import Wrapper, discrete, forget, start_of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -73,7 +73,7 @@ class Guarded(Wrapper):
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the map's next request, or the desired response after a trip and in a pause."""
         own = {name.removeprefix("guard_"): v for name, v in memory.items() if name.startswith("guard_")}
-        inner = of_map(self, memory, request.numel())
+        inner = discrete(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
         # A model-referenced form begins at the desired response, not at the request that it is given.
         origin = request if self.map.mirror is None else desired

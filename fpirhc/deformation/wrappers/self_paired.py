@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Pairing
-from fpirhc.deformation.wrappers.base import Wrapper, of_map
+from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -70,7 +70,7 @@ class DelayWatched(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the next request of the map, unchanged."""
-        inner = of_map(self, memory, request.numel())
+        inner = discrete(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
         return next_request, {**_estimated(request, response, memory, self.most), **next_memory}
 
@@ -116,7 +116,7 @@ class SelfPaired(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the map's next request from the pair of the dead time in use."""
-        inner = of_map(self, memory, request.numel())
+        inner = discrete(self, memory, request.numel())
         estimate = _estimated(request, response, memory, self.most)
         stood, candidate, cycles = self._adopted(estimate, memory)
         size = request.numel()

@@ -31,7 +31,7 @@ from typing import Self
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.wrappers.base import Wrapper, growing_in_a_row, of_map, returning_in_a_row
+from fpirhc.deformation.wrappers.base import Wrapper, discrete, growing_in_a_row, returning_in_a_row
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -84,7 +84,7 @@ class Tuned(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return r + c (G(r, f, d) - r)."""
-        inner = of_map(self, memory, request.numel())
+        inner = discrete(self, memory, request.numel())
         next_request, of_inner = self.map.step(request, response, desired, inner)
         factor, error, before = memory["tuner_factor"], response - desired, memory["tuner_error"]
         growing = growing_in_a_row(memory["tuner_growing"], error, before)

@@ -45,7 +45,7 @@ Correct = Callable[[Seen, Mapping[str, Expression]], tuple[Expression, dict[str,
 Wait = Callable[[Expression, Expression, Mapping[str, Expression]], dict[str, Expression]]
 
 
-class Estimator(Checked, ABC):
+class ParameterEstimator(Checked, ABC):
     """Contract: a frozen value that becomes a step for a given problem."""
 
     def model(self, plant: Plant) -> Plant:

@@ -31,7 +31,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.kinds import Deviation
-from fpirhc.learning.estimators.base import Correct, Estimator, Seen, Wait
+from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import Differences, response_age
 from fpirhc.plant.motion import controlled_places
@@ -51,7 +51,7 @@ _SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as un
 
 
 @dataclass(frozen=True, eq=False)
-class DisturbanceKalman(Estimator):
+class DisturbanceKalman(ParameterEstimator):
     """Estimate constant or slowly drifting disturbances of responses.
 
     Only ratios of the deviations matter. Where the controller receives exact states, the measurement's deviations are a tuning: the

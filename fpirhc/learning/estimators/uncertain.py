@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Deviation
-from fpirhc.learning.estimators.base import Estimator
+from fpirhc.learning.estimators.base import ParameterEstimator
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.problem import Problem
@@ -47,7 +47,7 @@ class Uncertain(Checked):
 
 
 @dataclass(frozen=True, eq=False)
-class Learner(Estimator):
+class Learner(ParameterEstimator):
     """What learners of parameters share: the priors, and the noise of the responses.
 
     Args:

@@ -1,6 +1,6 @@
 """Do the errors of believed states decay? Where no measurement corrects them, they must do so by themselves.
 
-The linear loops of a review have every state measured. So this is the only answer that knows the belief.
+The linear loops of a review have every state measured. So this is the only answer that knows the observer.
 """
 
 from __future__ import annotations

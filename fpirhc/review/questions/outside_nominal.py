@@ -8,7 +8,7 @@ from fpirhc.plant.motion import outside_names
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.question import ProblemQuestion
-from fpirhc.task.outside import real_values, rows_of
+from fpirhc.task.exogenous import real_values, rows_of
 
 TEXT = "Do signals from outside stay where the review sees them?"
 _SAME = 1e-9  # relative distance that counts as none

@@ -60,7 +60,7 @@ def sentences(problem: Problem, known: Mapping[str, Information]) -> tuple[str, 
 def _given(problem: Problem) -> str:
     plant, sensing = problem.plant, problem.sensing
     names = sensing.measures(plant) if sensing.estimates else (*plant.face.state.elements, *response_names(plant.face))
-    if plant.outputs and sensing.belief is None:  # the state too
+    if plant.outputs and sensing.observer is None:  # the state too
         names = (*plant.state.elements, *(n for n in names if n not in plant.state.elements))
     names = tuple(dict.fromkeys(names))  # an output of order 0 is its own response
     text = f"all controllers are given {', '.join(names)} in every cycle of {problem.period:g} {problem.time_unit}"
@@ -69,7 +69,7 @@ def _given(problem: Problem) -> str:
     if sensing.estimates:
         text += f"; {type(sensing.estimator).__name__} estimates the response from them"
     believed = sensing.believed(plant)
-    return text + (f"; {', '.join(believed)} are believed ({type(sensing.belief).__name__})" if believed else "")
+    return text + (f"; {', '.join(believed)} are believed ({type(sensing.observer).__name__})" if believed else "")
 
 
 def _by_use(known: Mapping[str, Information]) -> dict[str, list[str]]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.own_reference import own_signals
+from fpirhc.controllers.online_reference import own_signals
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.horizon.problem import OptimalControl
@@ -21,7 +21,7 @@ from fpirhc.summary import written_out
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.native import native
-from fpirhc.task.outside import model_values, previewed_values, rows_of, signals_of
+from fpirhc.task.exogenous import model_values, previewed_values, rows_of, signals_of
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 SAMPLES = 25  # plans of a run that are solved again

@@ -1,9 +1,9 @@
-"""The contract of beliefs: states of the model that no sensor shows, from the own commands and from what is measured.
+"""The contract of observers: states of the model that no sensor shows, from the own commands and from what is measured.
 
     x-_k = F(x^_{k-1}, u_{k-1}, p)         the model over one cycle, with the command that acted
     x^_k = x-_k corrected by what is measured
 
-A belief lives in the time of the samples: with a measurement that is late by d cycles, x^_k is the state at t_{k-d}, as every
+An observer lives in the time of the samples: with a measurement that is late by d cycles, x^_k is the state at t_{k-d}, as every
 measured state is, and u is the command that acted then.
 
 The response is never believed. The model's response to a command is the request itself, from which a deformation learns nothing.
@@ -30,7 +30,7 @@ Remembered: TypeAlias = Mapping[str, Expression]
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a belief is built from.
+    """What an observer is built from.
 
     Args:
         plant: the model.
@@ -47,7 +47,7 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Data of a belief in one cycle.
+    """Data of an observer in one cycle.
 
     Args:
         measured: what the sensors show, by name of the quantity.
@@ -71,7 +71,7 @@ Predict: TypeAlias = Callable[[Evidence, Remembered], Expression]
 Correct: TypeAlias = Callable[[Evidence, Remembered, Expression], tuple[Expression, dict[str, Expression]]]
 
 
-class Belief(Checked, ABC):
+class StateObserver(Checked, ABC):
     """Contract: a frozen value that becomes a prediction and a correction of the model's state."""
 
     @abstractmethod
@@ -84,7 +84,7 @@ class Belief(Checked, ABC):
 
     @abstractmethod
     def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
-        """State elements that the controller is given from the belief.
+        """State elements that the controller is given from the observer.
 
         Args:
             plant: the model.
@@ -123,8 +123,8 @@ class Belief(Checked, ABC):
         """
 
     @property
-    def must_decay(self) -> bool:
-        """Whether errors that no measurement corrects must decay by themselves, or the belief is refused."""
+    def needs_detectability(self) -> bool:
+        """Whether errors that no measurement corrects must decay by themselves, or the observer is refused."""
         return False
 
 
@@ -143,10 +143,10 @@ def name_mistakes(
     noise: Mapping[str, float],
     start: Mapping[str, float],
 ) -> Mistakes:
-    """Return the mistakes in the names of a belief's noises.
+    """Return the mistakes in the names of an observer's noises.
 
     Args:
-        owner: the belief's class.
+        owner: the observer's class.
         plant: the model.
         shown: names of what sensors show.
         measured: quantities with the noise of their sensors.

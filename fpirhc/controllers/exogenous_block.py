@@ -18,7 +18,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.task.outside import External, model_values, rows_of, told_places
+from fpirhc.task.exogenous import Exogenous, known_places, model_values, rows_of
 
 ACTED = "_signals_acted"
 NOW = "_parameters_now"
@@ -26,7 +26,7 @@ _QUEUE = "mirror_signals"
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class KnownSignals:
     """What a model is told.
 
     Args:
@@ -36,13 +36,13 @@ class Told:
     """
 
     plant: Plant
-    signals: Mapping[str, External]
+    signals: Mapping[str, Exogenous]
     period: float
 
     @property
     def places(self) -> tuple[int, ...]:
         """Places among the parameters of the signals of which it is told something."""
-        return told_places(self.plant, self.signals)
+        return known_places(self.plant, self.signals)
 
     @property
     def reads(self) -> tuple[Signal, ...]:

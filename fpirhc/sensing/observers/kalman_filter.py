@@ -25,28 +25,28 @@ import numpy as np
 from fpirhc.fields.kinds import Deviation
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import values_of
-from fpirhc.sensing.belief import (
-    Belief,
+from fpirhc.sensing.observability import unobservable
+from fpirhc.sensing.state_observer import (
     Correct,
     Evidence,
     Model,
     Predict,
     Remembered,
+    StateObserver,
     covariance_entries,
     first_covariance,
     name_mistakes,
     require_named,
 )
-from fpirhc.sensing.observability import unobservable
 from fpirhc.symbolic.functions import overlaid
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
 
-_STATE, _COVARIANCE, _VARIANCES = "belief_state", "belief_covariance", "belief_variances"
+_STATE, _COVARIANCE, _VARIANCES = "observer_state", "observer_covariance", "observer_variances"
 
 
 @dataclass(frozen=True, eq=False)
-class KalmanFilter(Belief):
+class KalmanFilter(StateObserver):
     """The whole state from noisy measurements of a part of it.
 
     Args:
@@ -136,7 +136,7 @@ class KalmanFilter(Belief):
         return unobservable(slopes, shown)
 
     @property
-    def must_decay(self) -> bool:
+    def needs_detectability(self) -> bool:
         """True: the covariance of an error that neither decays nor is observed would stay or grow for ever."""
         return True
 

@@ -29,29 +29,29 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.belief import (
-    Belief,
+from fpirhc.sensing.observability import unobservable
+from fpirhc.sensing.smoother import Interior, Smoother
+from fpirhc.sensing.state_observer import (
     Correct,
     Evidence,
     Model,
     Predict,
     Remembered,
+    StateObserver,
     covariance_entries,
     first_covariance,
     name_mistakes,
     require_named,
 )
-from fpirhc.sensing.observability import unobservable
-from fpirhc.sensing.smoother import Interior, Smoother
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 MOST = 500  # samples of a window: the memory has a fixed size
-_STATES, _NOISES, _ROWS = "belief_states", "belief_noises", "belief_samples"
-_MEAN, _COVARIANCE = "belief_arrival", "belief_covariance"
+_STATES, _NOISES, _ROWS = "observer_states", "observer_noises", "observer_samples"
+_MEAN, _COVARIANCE = "observer_arrival", "observer_covariance"
 
 
 @dataclass(frozen=True, eq=False)
-class MovingHorizonStates(Belief):
+class MovingHorizonStates(StateObserver):
     """The whole state from a window of noisy measurements of a part of it.
 
     Args:
@@ -182,7 +182,7 @@ class MovingHorizonStates(Belief):
         return unobservable(slopes, shown)
 
     @property
-    def must_decay(self) -> bool:
+    def needs_detectability(self) -> bool:
         """True: the arrival cost of an error that neither decays nor is observed would stay or grow for ever."""
         return True
 

@@ -15,12 +15,12 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
+from fpirhc.sensing.state_observer import Correct, Evidence, Model, Predict, Remembered, StateObserver
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 
 @dataclass(frozen=True)
-class ModelStates(Belief):
+class ModelStates(StateObserver):
     """The model's own states in place of those that are not known.
 
     Args:
@@ -39,14 +39,14 @@ class ModelStates(Belief):
     def memory(self, model: Model) -> Layout:
         """The state from which the model goes on."""
         state = model.plant.state
-        return Layout((Signal("belief_state", state.elements, state.units, tuple(map(float, model.start))),))
+        return Layout((Signal("observer_state", state.elements, state.units, tuple(map(float, model.start))),))
 
     def predict(self, model: Model) -> Predict:
         """One cycle of the model."""
         calm = np.zeros(len(model.plant.names))
 
         def predicted(evidence: Evidence, memory: Remembered) -> Expression:
-            return model.move(memory["belief_state"], evidence.command, evidence.parameters, calm, evidence.moves)
+            return model.move(memory["observer_state"], evidence.command, evidence.parameters, calm, evidence.moves)
 
         return predicted
 
@@ -59,7 +59,7 @@ class ModelStates(Belief):
         ) -> tuple[Expression, dict[str, Expression]]:
             del memory
             state = ca.vertcat(*(evidence.known.get(e, predicted[k]) for k, e in enumerate(elements)))
-            return state, {"belief_state": state if self.corrected else predicted}
+            return state, {"observer_state": state if self.corrected else predicted}
 
         return corrected
 

@@ -1,4 +1,4 @@
-"""Laws that every belief keeps, tried in short closed loops."""
+"""Laws that every observer keeps, tried in short closed loops."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.conformance.belief_cycle import Cycle
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
 from fpirhc.conformance.loops import two_masses
+from fpirhc.conformance.observer_cycle import Cycle
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.wrappers.exact_model import ExactModel
-from fpirhc.sensing.belief import Belief
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.observability import unobservable
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.sensing.sensor import Sensor
+from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
@@ -42,13 +42,13 @@ _LONG, _WRONG = 400, 0.1  # samples, and first error beside the largest state
 _LEFT, _OVERSHOOT = 0.25, 3.0  # shares of that error: later, and at any time
 
 
-def check_belief(
-    belief: Belief, *, seed: int, problem: Problem | None = None, controller: Controller | None = None
+def check_observer(
+    observer: StateObserver, *, seed: int, problem: Problem | None = None, controller: Controller | None = None
 ) -> None:
-    """Check every law on a belief.
+    """Check every law on an observer.
 
     Args:
-        belief: the belief.
+        observer: the observer.
         seed: of noise and of all draws.
         problem: whose states are believed, with `Sensing(measured=...)`; its response must be linear in states and inputs.
             None: two masses whose positions a and b are measured.
@@ -56,20 +56,20 @@ def check_belief(
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
-        FpirhcError: the belief cannot serve the problem.
+        FpirhcError: the observer cannot serve the problem.
     """
     task = two_masses() if problem is None else problem
     sensing = Sensing({}, Measured(), measured=["a", "b"]) if problem is None else task.sensing
-    believed = Sensing(sensing.sensors, sensing.estimator, measured=sensing.measured, belief=belief)
+    believed = Sensing(sensing.sensors, sensing.estimator, measured=sensing.measured, observer=observer)
     short = replace(task, duration=_CYCLES * task.period, measure_from=0.0, sensing=believed)
-    keep(belief, _Trial(belief, short, controller or ComputedTorque(Exponential(rate=4.0)), seed), LAWS, seed)
+    keep(observer, _Trial(observer, short, controller or ComputedTorque(Exponential(rate=4.0)), seed), LAWS, seed)
 
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A belief in short runs of a problem."""
+    """An observer in short runs of a problem."""
 
-    belief: Belief
+    observer: StateObserver
     problem: Problem
     controller: Controller
     seed: int
@@ -92,20 +92,20 @@ class _Trial:
 
 
 def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """A belief is a frozen value that can be hashed, copied and described."""
-    is_a_frozen_value(trial.belief)
+    """An observer is a frozen value that can be hashed, copied and described."""
+    is_a_frozen_value(trial.observer)
 
 
 def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:
     """It believes states of the plant, uses what is measured, and its free errors are directions of the state."""
     plant, sensing = trial.problem.plant, trial.problem.sensing
     measured, size = sensing.measures(plant), plant.state.size
-    foreign = [n for n in trial.belief.believes(plant, sensing.known(plant)) if n not in plant.state.elements]
+    foreign = [n for n in trial.observer.believes(plant, sensing.known(plant)) if n not in plant.state.elements]
     hold(not foreign, f"it believes {foreign}, which are no states of the plant")
-    unseen = [n for n in trial.belief.uses(measured) if n not in measured]
+    unseen = [n for n in trial.observer.uses(measured) if n not in measured]
     hold(not unseen, f"it uses {unseen}, which no sensor shows")
     slopes, shown = [generator.normal(size=(size, size))], [generator.normal(size=(1, size))]
-    basis = np.asarray(trial.belief.free(slopes, shown, [0]))
+    basis = np.asarray(trial.observer.free(slopes, shown, [0]))
     hold(basis.ndim == 2 and len(basis) == size, f"free() has the shape {basis.shape}, expected ({size}, number)")
 
 
@@ -155,7 +155,7 @@ def exact_parameters_are_unknown(trial: _Trial, generator: np.random.Generator) 
     """Prediction and correction do not depend on the exact parameters, which nobody knows of a real plant."""
     plant = trial.problem.plant
     other = replace(trial.problem, plant=plant.with_exact(_OTHER * plant.exact))
-    one, two = Cycle(trial.belief, trial.problem), Cycle(trial.belief, other)
+    one, two = Cycle(trial.observer, trial.problem), Cycle(trial.observer, other)
     sample = one.sample(generator)
     same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one(sample), two(sample), strict=True))
     hold(
@@ -166,7 +166,7 @@ def exact_parameters_are_unknown(trial: _Trial, generator: np.random.Generator) 
 
 def old_samples_do_nothing(trial: _Trial, generator: np.random.Generator) -> None:
     """A sample from before the run, which a dead time shows again, corrects (`counts` = 0) and moves (`moves` = 0) nothing."""
-    cycle = Cycle(trial.belief, trial.problem)
+    cycle = Cycle(trial.observer, trial.problem)
     sample = replace(cycle.sample(generator), counts=0.0)
     change = float(np.abs(cycle(sample)[0] - cycle(replace(sample, measured=sample.measured + 1.0))[0]).max())
     hold(
@@ -185,7 +185,7 @@ def unseen_errors_are_free(trial: _Trial, generator: np.random.Generator) -> Non
     """An error that no measurement shows is one of those that `free` names; a review judges whether they decay."""
     size = trial.problem.plant.state.size
     slopes, shown = [np.zeros((size, size))], [generator.normal(size=(1, size))]
-    basis = np.asarray(trial.belief.free(slopes, shown, [0]))
+    basis = np.asarray(trial.observer.free(slopes, shown, [0]))
     unseen = unobservable(slopes, [np.vstack([shown[0], np.eye(size)[:1]])])
     rest = unseen - basis @ (np.linalg.pinv(basis) @ unseen) if basis.size else unseen
     missed = float(np.linalg.norm(rest, axis=0).max(initial=0.0))
@@ -198,15 +198,15 @@ def unseen_errors_are_free(trial: _Trial, generator: np.random.Generator) -> Non
 
 def wrong_start_is_corrected(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """Started wrong in what is measured, with the exact model and no noise, it comes to believe what is measured."""
-    plant, used = trial.problem.plant, trial.belief.uses(trial.problem.sensing.measures(trial.problem.plant))
+    plant, used = trial.problem.plant, trial.observer.uses(trial.problem.sensing.measures(trial.problem.plant))
     places = [plant.state.elements.index(n) for n in used if n in plant.state.elements]
     every = np.eye(plant.state.size)
-    free = np.asarray(trial.belief.free([every], [every[places]], places)) if places else np.zeros((0, 0))
+    free = np.asarray(trial.observer.free([every], [every[places]], places)) if places else np.zeros((0, 0))
     seen = [k for k in places if not free.size or np.abs(free[k]).max() < _UNSEEN]
     if not seen:
         return  # it corrects nothing that is measured, and says so
     size = _WRONG * (1 + float(np.abs(trial.problem.start_state).max()))
-    errors = Cycle(trial.belief, trial.problem).errors(seen, size, _LONG)
+    errors = Cycle(trial.observer, trial.problem).errors(seen, size, _LONG)
     most, late = float(errors.max()), float(errors[_LONG // 2 :].max())
     hold(
         within(most, _OVERSHOOT * size) and within(late, _LEFT * size),

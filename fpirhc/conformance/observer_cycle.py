@@ -1,4 +1,4 @@
-"""One cycle of a belief as numbers, without sensors and controller around it."""
+"""One cycle of an observer as numbers, without sensors and controller around it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.controllers.believing import believed_integrator, moving
+from fpirhc.controllers.observed_state import believed_integrator, moving
 from fpirhc.sensing.base import values_of
-from fpirhc.sensing.belief import Belief, Evidence, Model
+from fpirhc.sensing.state_observer import Evidence, Model, StateObserver
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
@@ -26,7 +26,7 @@ class Sample:
 
     Args:
         measured: what the sensors show, in the order of the model's names.
-        state: true state, of which the belief is given what it calls known.
+        state: true state, of which the observer is given what it calls known.
         command: that acted.
         moves: 1, or 0 where the sample still shows the start.
         counts: 1, or 0 for a sample from before the run.
@@ -41,19 +41,19 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Cycle:
-    """A belief for a problem: (memory, sample) -> (believed state, memory).
+    """An observer for a problem: (memory, sample) -> (believed state, memory).
 
     Args:
-        belief: the belief.
-        problem: whose plant is the model; its start is where the belief begins.
+        observer: the observer.
+        problem: whose plant is the model; its start is where the observer begins.
     """
 
-    belief: Belief
+    observer: StateObserver
     problem: Problem
 
     @cached_property
     def model(self) -> Model:
-        """What the belief is built from."""
+        """What the observer is built from."""
         problem = self.problem
         move = moving(problem.plant, believed_integrator(problem), problem.period, fraction=False)
         return Model(problem.plant, move, problem.start_state, problem.sensing.measures(problem.plant))
@@ -95,7 +95,7 @@ class Cycle:
 
     @cached_property
     def _layout(self) -> Layout:
-        return self.belief.memory(self.model)
+        return self.observer.memory(self.model)
 
     @cached_property
     def _shown_function(self) -> ca.Function:
@@ -106,7 +106,7 @@ class Cycle:
     @cached_property
     def _evaluator(self) -> Evaluator:
         plant = self.problem.plant
-        kind: Any = ca.MX if self.belief.opaque else ca.SX
+        kind: Any = ca.MX if self.observer.opaque else ca.SX
         sizes = (len(self.model.measured), plant.state.size, plant.input.size, plant.approximate.size, 1, 1)
         symbols = [kind.sym(f"s{k}", size) for k, size in enumerate((*sizes, self._layout.size))]
         measured, state, command, parameters, moves, counts, memory = symbols
@@ -114,8 +114,8 @@ class Cycle:
         true: dict[str, Any] = dict(zip(plant.state.elements, ca.vertsplit(state), strict=True))
         evidence = Evidence(shown, {}, command, parameters, moves, counts)
         remembered = self._layout.split(memory)
-        predicted = self.belief.predict(self.model)(evidence, remembered)
+        predicted = self.observer.predict(self.model)(evidence, remembered)
         known = {e: true[e] for e in self.problem.sensing.known(plant)}
-        believed, after = self.belief.correct(self.model)(replace(evidence, known=known), remembered, predicted)
+        believed, after = self.observer.correct(self.model)(replace(evidence, known=known), remembered, predicted)
         results = [ca.densify(believed), ca.densify(self._layout.join(after))]
         return Evaluator(ca.Function("believed", symbols, results))

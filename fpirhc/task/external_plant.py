@@ -3,8 +3,8 @@
     measurements = body.reset(seed)                    at the start
     measurements = body.step(time, command)            in every cycle: apply the command for one period, then measure
 
-The measurements are quantities of the model, in the order that `Foreign(measures=...)` says. A bad answer - an exception, another
-shape, a number that is not finite, an answer after the deadline - is held or ends the run. Nothing before it is lost.
+The measurements are quantities of the model, in the order that `ExternalPlant(measures=...)` says. A bad answer - an exception,
+another shape, a number that is not finite, an answer after the deadline - is held or ends the run. Nothing before it is lost.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class Reading:
 
 
 @dataclass(frozen=True, eq=False)
-class Foreign(Checked):
-    """A reality outside: `Problem(reality=Foreign(body, measures=...))`.
+class ExternalPlant(Checked):
+    """A reality outside: `Problem(reality=ExternalPlant(body, measures=...))`.
 
     Args:
         body: object with `reset(seed)` and `step(time, command)`, see `Body`.
@@ -79,22 +79,22 @@ class Foreign(Checked):
         for name in ("reset", "step"):
             if not callable(getattr(self.body, name, None)):
                 raise InvalidValue(
-                    f"Foreign: its body {type(self.body).__name__} has no method {name}(...); it needs reset and step"
+                    f"ExternalPlant: its body {type(self.body).__name__} has no method {name}(...); it needs reset and step"
                 )
 
     @property
     def remedy(self) -> str:
         """What bridges bad answers."""
         if not self.holds:
-            return "; Foreign(holds=1) bridges a bad answer with the last good one"
-        return f", after {self.holds} in a row that were held; Foreign(holds={self.holds + 1}) bridges one more"
+            return "; ExternalPlant(holds=1) bridges a bad answer with the last good one"
+        return f", after {self.holds} in a row that were held; ExternalPlant(holds={self.holds + 1}) bridges one more"
 
     @property
     def symbolic(self) -> None:
         """No plant: nothing is known of it but its answers."""
 
     @property
-    def foreign(self) -> Foreign:
+    def foreign(self) -> ExternalPlant:
         """Itself."""
         return self
 

@@ -1,9 +1,9 @@
 """The block of believed states: from raw measurements and the own commands to 'state' and 'realised'.
 
-    model predicts -> what no sensor shows is taken from the prediction -> estimator -> belief corrects
+    model predicts -> what no sensor shows is taken from the prediction -> estimator -> observer corrects
 
 The response is the estimator's, from what is measured; controllers that learn from it are refused where it would be the model's.
-The state has each entry from where it is known best: believed entries from the belief, the others from the estimator. Outputs of
+The state has each entry from where it is known best: believed entries from the observer, the others from the estimator. Outputs of
 a plant are measured or estimated, as 'output' beside 'state'.
 """
 
@@ -18,13 +18,13 @@ from typing import cast
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.exogenous_block import KnownSignals
 from fpirhc.controllers.face import measured_signals
-from fpirhc.controllers.outside_block import Told
 from fpirhc.deformation.queue import Queue
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import values_of
-from fpirhc.sensing.belief import Belief, Evidence, Model
+from fpirhc.sensing.state_observer import Evidence, Model, StateObserver
 from fpirhc.symbolic.block import Block, Delay, bridged, call
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.gap import GAP
@@ -37,7 +37,7 @@ class Believing:
     """The block that believes, and what it remembers.
 
     Args:
-        problem: whose sensing has a belief.
+        problem: whose sensing has an observer.
         raw: signal of the raw measurements.
         shown: first state, or outputs, that the sensors see; the estimator begins there.
         lost: whether samples may be lost.
@@ -54,8 +54,8 @@ class Believing:
         plant = self.problem.plant
         reads = Layout((self.raw, *self._time.reads, *((GAP,) if self.lost else ())))
         writes = Layout((*measured_signals(plant), plant.response_signal("realised")))
-        own = Layout((*self._time.memory, *self.belief.memory(self.model).signals)) + self._estimator.memory
-        opaque, lossy = self.belief.opaque, None if self.lost else lambda: replace(self, lost=True).block
+        own = Layout((*self._time.memory, *self.observer.memory(self.model).signals)) + self._estimator.memory
+        opaque, lossy = self.observer.opaque, None if self.lost else lambda: replace(self, lost=True).block
         waits = Block("believe_waits", Layout((*self._time.reads, GAP)), Layout(), self._wait, own, opaque=opaque)
         return Block(
             "believe", reads, writes, self._step, own, opaque, waits=waits if self.lost else None, bridged=lossy
@@ -67,15 +67,15 @@ class Believing:
         return Delay(self._time.commanded, self.problem.plant.input.name)
 
     @property
-    def belief(self) -> Belief:
+    def observer(self) -> StateObserver:
         """How states that no sensor shows are believed."""
-        belief = self.problem.sensing.belief
-        assert belief is not None
-        return belief
+        observer = self.problem.sensing.observer
+        assert observer is not None
+        return observer
 
     @cached_property
     def model(self) -> Model:
-        """What the belief is built from."""
+        """What the observer is built from."""
         problem = self.problem
         move = moving(problem.plant, believed_integrator(problem), problem.period, fraction=bool(self._time.fraction))
         return Model(problem.plant, move, problem.start_state, problem.sensing.measures(problem.plant))
@@ -95,12 +95,12 @@ class Believing:
         plant, sensing, elements = self.problem.plant, self.problem.sensing, self.problem.plant.state.elements
         shown_now = dict(zip(self.raw.elements, ca.vertsplit(getattr(s, self.raw.name)), strict=True))
         evidence, results = self._evidence(s, shown_now)
-        memory = {m: getattr(s, m) for m in self.belief.memory(self.model).names}
-        predicted = self.belief.predict(self.model)(evidence, memory)
+        memory = {m: getattr(s, m) for m in self.observer.memory(self.model).names}
+        predicted = self.observer.predict(self.model)(evidence, memory)
         expected = values_of(plant, predicted, evidence.command, evidence.parameters)
         motion, realised, *remembered = self._estimates(s, {**expected, **evidence.measured})
         shown = self._shown(motion, evidence.measured)
-        correct = self.belief.correct(self.model)
+        correct = self.observer.correct(self.model)
         known = {e: shown[e] for e in sensing.known(plant)}
         state, next_memory = correct(replace(evidence, known=known), memory, predicted)
         names = sensing.believed(plant)
@@ -120,9 +120,9 @@ class Believing:
     def _wait(self, s: Signals) -> dict[str, Expression]:
         """Memory after a cycle without a sample: the prediction with nothing to correct it."""
         evidence, results = self._evidence(s, dict.fromkeys(self.raw.elements, expression(0.0)))
-        memory = {m: getattr(s, m) for m in self.belief.memory(self.model).names}
-        predicted = self.belief.predict(self.model)(evidence, memory)
-        _, next_memory = self.belief.correct(self.model)(replace(evidence, counts=expression(0.0)), memory, predicted)
+        memory = {m: getattr(s, m) for m in self.observer.memory(self.model).names}
+        predicted = self.observer.predict(self.model)(evidence, memory)
+        _, next_memory = self.observer.correct(self.model)(replace(evidence, counts=expression(0.0)), memory, predicted)
         results |= {f"{m}_next": v for m, v in next_memory.items()}
         remembered = {m: getattr(s, m) for m in self._estimator.memory.names}
         waits = self._estimator.waits
@@ -131,7 +131,7 @@ class Believing:
         return results | {f"{m}_next": v for m, v in remembered.items()}
 
     def _evidence(self, s: Signals, shown: Mapping[str, Expression]) -> tuple[Evidence, dict[str, Expression]]:
-        """What the belief is told, with no state known yet, and what is remembered for the next cycle."""
+        """What the observer is told, with no state known yet, and what is remembered for the next cycle."""
         (command, commands), (parameters, signals) = self._time.command(s), self._time.parameters(s)
         evidence = Evidence(shown, {}, command, parameters, self._time.moves(s), self._time.counts(s))
         return evidence, {**commands, **signals}
@@ -166,13 +166,13 @@ def believed_integrator(problem: Problem) -> Integrator:
 
 
 COMMANDED = "_commanded"  # the last command
-_COUNT, _QUEUE, _SIGNALS = "belief_cycles", "belief_commands", "belief_signals"
+_COUNT, _QUEUE, _SIGNALS = "observer_cycles", "observer_commands", "observer_signals"
 _WHOLE = 1e-6  # a fraction of a cycle below this counts as zero
 
 
 @dataclass(frozen=True, eq=False)
 class SampleTime:
-    """What acted until a sample was taken: a belief lives in the time of the samples.
+    """What acted until a sample was taken: an observer lives in the time of the samples.
 
     Behind a measurement that is late by d + phi cycles, 0 <= phi < 1, a sample is interpolated,
 
@@ -208,7 +208,7 @@ class SampleTime:
     @property
     def reads(self) -> tuple[Signal, ...]:
         """The last command, the parameters, and the signals of the last cycle."""
-        return (self.problem.plant.parameter, self.commanded, *self._told.reads)
+        return (self.problem.plant.parameter, self.commanded, *self._known.reads)
 
     @property
     def memory(self) -> tuple[Signal, ...]:
@@ -216,7 +216,7 @@ class SampleTime:
         elements, length = self.commanded.elements, self._length
         names = tuple(f"{e}@{k}" for k in range(1, length) for e in elements)
         queued = (Signal(_QUEUE, names, start=self.commanded.start * (length - 1)),) if length > 1 else ()
-        return (scalar(_COUNT), *queued, *self._told.memory(self.late, _SIGNALS))
+        return (scalar(_COUNT), *queued, *self._known.memory(self.late, _SIGNALS))
 
     def command(self, s: Signals) -> tuple[Expression, dict[str, Expression]]:
         """Return the command that acted, and what is remembered."""
@@ -234,7 +234,7 @@ class SampleTime:
 
     def parameters(self, s: Signals) -> tuple[Expression, dict[str, Expression]]:
         """Return the model's parameters with the signals from outside that acted, and what is remembered."""
-        return self._told.acted(s, self.late, _SIGNALS)
+        return self._known.acted(s, self.late, _SIGNALS)
 
     def moves(self, s: Signals) -> Expression:
         """Return the share of a cycle by which the sample is later than the last one."""
@@ -253,8 +253,8 @@ class SampleTime:
         return self.problem.dead_time.measurement / self.problem.period
 
     @property
-    def _told(self) -> Told:
-        return Told(self.problem.plant, self.problem.signals, self.problem.period)
+    def _known(self) -> KnownSignals:
+        return KnownSignals(self.problem.plant, self.problem.signals, self.problem.period)
 
     def _queue(self, more: int) -> Queue:
         """Queue of the commands: the newest one is that of the last cycle, and acts on the sample's cycle after all dead times."""

@@ -34,7 +34,7 @@ _LATEST: Latest[ca.Function | None] = Latest(8)
 _HOLDS = ("zero", "linear")
 
 
-class External(Checked, ABC):
+class Exogenous(Checked, ABC):
     """Contract: what a signal really is, and what the model is told of it.
 
     Attributes:
@@ -47,12 +47,12 @@ class External(Checked, ABC):
 
     @property
     @abstractmethod
-    def told(self) -> Course | None:
+    def known(self) -> Course | None:
         """Values that the model has; None: the nominal one."""
 
 
 @dataclass(frozen=True, eq=False)
-class Known(External):
+class Known(Exogenous):
     """A signal that the model has as it is.
 
     Args:
@@ -65,13 +65,13 @@ class Known(External):
     preview: bool = True
 
     @property
-    def told(self) -> Course:
+    def known(self) -> Course:
         """The values."""
         return self.values
 
 
 @dataclass(frozen=True, eq=False)
-class Unknown(External):
+class Unknown(Exogenous):
     """A signal that the plant gets and the model does not: the model has the nominal value.
 
     Args:
@@ -81,12 +81,12 @@ class Unknown(External):
     values: Course
 
     @property
-    def told(self) -> None:
+    def known(self) -> None:
         """Nothing."""
 
 
 @dataclass(frozen=True, eq=False)
-class Believed(External):
+class Believed(Exogenous):
     """A signal of which the model is told something else, such as a wrong forecast.
 
     Args:
@@ -100,57 +100,57 @@ class Believed(External):
     preview: bool = True
 
     @property
-    def told(self) -> Course:
+    def known(self) -> Course:
         """What the model is told."""
         return self.model
 
 
-def real_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
+def real_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with the real values of the signals; None where the plant has none."""
     return _filled(plant, {n: signals[n].values for n in outside_names(plant) if n in signals})
 
 
-def model_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
+def model_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with what the model is told at this time; None where it is told nothing."""
-    courses = {n: signals[n].told for n in outside_names(plant) if n in signals}
+    courses = {n: signals[n].known for n in outside_names(plant) if n in signals}
     return _filled(plant, {n: course for n, course in courses.items() if course is not None})
 
 
-def previewed_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
+def previewed_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with what the model is told of a later time; None where it is told nothing."""
     ahead = {n: one for n, one in signals.items() if one.preview}
     return _LATEST.of((plant, *ahead.values()), tuple(ahead), lambda: model_values(plant, ahead))
 
 
-def told_places(plant: Plant, signals: Mapping[str, External]) -> tuple[int, ...]:
+def known_places(plant: Plant, signals: Mapping[str, Exogenous]) -> tuple[int, ...]:
     """Places of the signals among the parameters of which the model is told something."""
-    names = [n for n in outside_names(plant) if n in signals and signals[n].told is not None]
+    names = [n for n in outside_names(plant) if n in signals and signals[n].known is not None]
     return tuple(plant.parameter.elements.index(n) for n in names)
 
 
-def signals_of(plant: Plant, signals: Mapping[str, External]) -> dict[str, External]:
+def signals_of(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exogenous]:
     """Return the signals that a plant has."""
     return {name: one for name, one in signals.items() if name in outside_names(plant)}
 
 
-def really_known(signals: Mapping[str, External]) -> Mapping[str, External]:
+def really_known(signals: Mapping[str, Exogenous]) -> Mapping[str, Exogenous]:
     """Return the same signals, told to the model as they are: what an exact model knows."""
     return {name: Known(one.values) for name, one in signals.items()}
 
 
-def as_told(plant: Plant, signals: Mapping[str, External]) -> dict[str, External]:
+def as_known(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exogenous]:
     """Return signals that are what the model believes: the world of a null test."""
     nominal = {name: plant.parameters[name].approximate for name in outside_names(plant)}
-    made: dict[str, External] = {}
+    made: dict[str, Exogenous] = {}
     for name, one in signals_of(plant, signals).items():
-        course = one.told
+        course = one.known
         made[name] = Known(nominal[name] if course is None else course, preview=one.preview or course is None)
     return made
 
 
-def not_held(signals: Mapping[str, External], names: Sequence[str]) -> tuple[str, ...]:
+def not_held(signals: Mapping[str, Exogenous], names: Sequence[str]) -> tuple[str, ...]:
     """Return those of some signals that change between jumps, really or as the model is told."""
-    courses = {name: (signals[name].values, signals[name].told) for name in names if name in signals}
+    courses = {name: (signals[name].values, signals[name].known) for name in names if name in signals}
     return tuple(n for n, both in courses.items() if not all(c is None or _is_held(c) for c in both))
 
 
@@ -163,7 +163,7 @@ def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndar
 
 
 def check_signals(
-    plants: Sequence[Plant], signals: Mapping[str, External], times: np.ndarray, mistakes: Mistakes
+    plants: Sequence[Plant], signals: Mapping[str, Exogenous], times: np.ndarray, mistakes: Mistakes
 ) -> None:
     """Add every mistake of the signals to `mistakes`.
 
@@ -190,7 +190,7 @@ def check_signals(
         mistakes.add(f"signals: '{name}' is a parameter; declare it as outside(nominal=..., unit=...) in the plant")
     mistakes.unknown("signals: name", signals.keys() - ordinary, units)
     for name, one in signals.items():
-        for what, course in (("values", one.values), ("values of the model", one.told)):
+        for what, course in (("values", one.values), ("values of the model", one.known)):
             if course is not None and (what == "values" or course is not one.values):
                 _check_course(f"signals: {what} of '{name}'", course, times, mistakes)
 

@@ -11,7 +11,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.task.outside import model_values, real_values
+from fpirhc.task.exogenous import model_values, real_values
 from fpirhc.task.problem import Problem
 
 _HELD, _NOW = "_exact", "_exact_now"

@@ -17,12 +17,12 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
-from fpirhc.controllers.believing import Believing
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.controllers.observed import check_believed
-from fpirhc.controllers.own_reference import with_reference
+from fpirhc.controllers.observed_state import Believing
+from fpirhc.controllers.online_reference import with_reference
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block, Composite, bridged
@@ -66,7 +66,7 @@ def _composed(problem: Problem, controller: Controller) -> Composite:
 
 def given_states(problem: Problem) -> tuple[Signal, ...]:
     """Return the signal of the state where it is given beside raw measurements: these are of outputs, and nothing is believed."""
-    estimated = problem.sensing.estimates and problem.sensing.belief is None
+    estimated = problem.sensing.estimates and problem.sensing.observer is None
     return measured_signals(problem.plant)[:-1] if estimated else ()
 
 
@@ -127,7 +127,7 @@ def _first_values(problem: Problem, quantities: Sequence[str]) -> np.ndarray:
 
 def _believing(problem: Problem) -> Believing | None:
     raw = raw_signal(problem)
-    if raw is None or problem.sensing.belief is None:
+    if raw is None or problem.sensing.observer is None:
         return None
     return Believing(problem, raw, first_estimates(problem)[0])
 

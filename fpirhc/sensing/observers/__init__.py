@@ -1,0 +1,1 @@
+"""Observers: one file per way to know states that no sensor shows."""
