@@ -233,14 +233,18 @@ class AskedLoop:
 
     def _period(self, memory: np.ndarray) -> list[np.ndarray]:
         """The memories of as many cycles as pass until the phases of plans are the same again."""
-        memories = [memory]
+        memories, passed = [memory], {memory[self._phases].tobytes()}
         while True:
             memory_next, _ = self._step(memories[-1])
             if np.array_equal(memory_next[self._phases], memory[self._phases]):
                 return memories
             if not np.isfinite(memory_next).all():
                 raise NotSupported("the loop's run does not stay finite from one plan to the next")
+            phases = memory_next[self._phases].tobytes()
+            if phases in passed:  # a cycle that is skipped for ever
+                raise NotSupported("the loop's run does not come to its next plan")
             memories.append(memory_next)
+            passed.add(phases)
 
     @cached_property
     def _free(self) -> np.ndarray:
