@@ -140,17 +140,6 @@ def notes_are_sentences(trial: Trial, generator: np.random.Generator) -> None:  
     hold(texts, f"its notes are {notes!r}")
 
 
-def own_response_fits(trial: Trial, generator: np.random.Generator) -> None:
-    """A `response` of its own is the signal 'realised', and its Function gives finite numbers for every entry."""
-    own, plant = checked(trial.problem, trial.controller).response(trial.problem), trial.problem.plant
-    if own is None:
-        return
-    state, command = trial.problem.start_state, generator.normal(size=plant.input.size)
-    numbers = np.asarray(own.function(state, command, plant.exact, np.zeros(len(plant.names))).full()).ravel()
-    fits = own.signal.name == "realised" and numbers.size == own.signal.size and bool(np.isfinite(numbers).all())
-    hold(fits, f"its response is '{own.signal.name}' with {own.signal.size} entries, at the start {numbers}")
-
-
 def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """Near the reference it feeds the error back with the gains of its `tracking` law, from which reviews read its speed."""
     ready, plant = checked(trial.problem, trial.controller), trial.problem.plant
@@ -241,7 +230,6 @@ FACTS = (
     model_is_of_the_plant,
     law_is_what_it_does,
     notes_are_sentences,
-    own_response_fits,
     outputs_are_controlled,
     maps_are_controlled,
 )

@@ -70,7 +70,6 @@ PROBLEM = '''
 from dataclasses import replace
 
 import fpirhc as fp
-from fpirhc.conformance import check_deformation, check_optimiser, check_tracking
 from abroad.clipped import Clipped
 from abroad.gradient import Gradient
 from abroad.named import Named
@@ -125,6 +124,7 @@ def test_members_from_abroad_are_found_and_keep_the_laws(abroad: Path) -> None:
     script = (
         "import json; import fpirhc as fp; from fpirhc.studies.comparison.optimiser_choices import optimiser_choices\n"
         "from fpirhc.members import FAMILIES, examples, member_classes\n"
+        "from fpirhc.conformance import check_deformation, check_optimiser, check_tracking\n"
         "mine = lambda f: [e for e in examples(f) if type(e).__module__.startswith('abroad')]\n"
         "[check_deformation(m, seed=1) for m in mine('deformations')]\n"
         "[check_tracking(m, seed=1, period=2e-3, duration=6.0) for m in mine('tracking laws')]\n"

@@ -1,4 +1,4 @@
-"""Twelve controllers that break the contract, each in one thing, and the right one that they are made from."""
+"""Controllers that break the contract, each in one thing, and the right one that they are made from."""
 
 from __future__ import annotations
 
@@ -165,3 +165,12 @@ class SaysItControlsMaps(Gentle):
 
     def check(self, problem):
         """Wrong."""
+
+
+class NotesAreOneText(Gentle):
+    """Its notes are a text, which a report would write letter by letter."""
+
+    def notes(self, problem):
+        """Return no tuple."""
+        del problem
+        return "It feeds back a saturated error."

@@ -16,6 +16,7 @@ CONTROLLERS = {
     controllers.TakesTheStateForTheOutput: ("outputs are controlled", "read plant.output and not plant.state"),
     controllers.IgnoresItsDeformation: ("deformation acts", "half of the effective gain 0.198"),
     controllers.NamesAnotherLaw: ("law is what it does", "fed back with 36, its law Exponential says 3600"),
+    controllers.NotesAreOneText: ("notes are sentences", "its notes are 'It feeds"),
     controllers.SaysItControlsMaps: ("maps are controlled", "it says that it can control a map, but cannot be built"),
 }
 MAPS = {
@@ -61,7 +62,7 @@ CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
     "notes": "notes are sentences",
     "plant_model": "model is of the plant",
     "planner": "facts hold",
-    "response": "own response fits",
+    "response": "writes a command and a status",
     "with_defaults": "facts hold",
     "with_deformation": "deformation acts",
 }

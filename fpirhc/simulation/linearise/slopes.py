@@ -57,6 +57,8 @@ class Step:
             self._slopes = Evaluator(_derivative(self.loop.function))
         size, nu = memory.size, self._evaluator.arguments[1].size
         slopes = self._slopes(memory, np.zeros(nu))
+        if not all(np.isfinite(m).all() for m in slopes):
+            raise NotSupported("the loop has no finite slope at a point of its run")
         by_memory, by_input = (m.reshape(columns, -1).T for m, columns in zip(slopes, (size, nu), strict=True))
 
         def move(deviation: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
