@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,9 +47,15 @@ def test_the_reactor_drifts_within_a_cycle():
     assert about(asked(task.problem, adaptive.with_deformation(referenced)), "right model alone").verdict == "yes"
 
 
-@pytest.mark.parametrize(("name", "verdict"), [("unpaired", "no"), ("RHC+FPI", "no"), ("RHC+FPI, increment", "yes")])
+@pytest.mark.parametrize(
+    ("name", "verdict"), [("unpaired", "unknown"), ("RHC+FPI", "no"), ("RHC+FPI, increment", "yes")]
+)
 def test_a_map_of_one_s_own_behind_a_dead_time(name, verdict):
-    """Unpaired its gain is beyond 2 sin(pi / 18); paired, the plain form is too slow for the plan; the increment converges."""
+    """Unpaired its gain is beyond 2 sin(pi / 18); paired, the plain form is too slow for the plan; the increment converges.
+
+    The loop of the unpaired map is asked where the map is saturated, so its poles decide nothing; the question about the gain
+    does. The increment does not bear a dead time that is wrong by a cycle, because plans are made every four: a run says so.
+    """
     task = load("own_map")
     unpaired = importlib.import_module("abroad.own_map").unpaired
     controller = task.controllers.get(name, unpaired)
@@ -62,7 +69,10 @@ def test_a_map_of_one_s_own_behind_a_dead_time(name, verdict):
     if name == "RHC+FPI":
         assert about(answers, "keep up").verdict == "no"
     if verdict == "yes":
-        assert about(answers, "wrong by a cycle").numbers["borne"] == 1
+        assert about(answers, "wrong by a cycle").numbers["borne"] == 0
+        later = fp.DeadTime(inputs={"F": task.problem.dead_time.inputs["F"] + task.problem.period})
+        late = fp.simulate(replace(task.problem, dead_time=later), controller, seed=0, compiled=False)
+        assert np.abs(late["realised"] - late["desired"])[-400:].max() > 20  # m/s^2; .53 with the dead time as it is
     run = fp.simulate(task.problem, controller, seed=0, compiled=False)
     sizes = np.abs(run["realised"] - run["desired"])[:, 0]
     assert (run.stop is None and sizes[-400:].max() < 0.5 * sizes[:400].max()) == (verdict == "yes")

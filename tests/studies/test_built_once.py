@@ -10,7 +10,7 @@ from fpirhc.optimisers.plain import plain_graph
 
 
 def test_a_comparison_composes_every_controller_once(monkeypatch):
-    """Loop, step by hand, timing and price have the same composition; the prediction adds that of its own model.
+    """Loop, step by hand, timing and price have the same composition; the prediction adds those of the loops that it asks.
 
     The Functions of plans are built once too: one that a cycle calls, one for the first plan, and one for sampled plans.
     """
@@ -35,5 +35,5 @@ def test_a_comparison_composes_every_controller_once(monkeypatch):
     result = fp.compare(task, seed=0, controllers=names, compiled=False)
     assert [e.name for e in result.entries] == names
     assert all(e.price or not e.adaptive for e in result.entries)
-    assert sorted(composed.values()) == [1, 1, 2], "two of the model, one of the exact model, one of the prediction"
+    assert sorted(composed.values()) == [1, 1, 5], "the controllers, and three loops that are asked"
     assert set(planned.values()) == {1}
