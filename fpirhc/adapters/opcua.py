@@ -89,7 +89,11 @@ class _Body:
         del seed
         if self._client is not None:
             self._client.disconnect()
-        self._client = package("asyncua.sync").Client(self._address)
+        sync = package("asyncua.sync")
+        loop = sync.ThreadLoop()
+        loop.daemon = True  # a session that nobody ends must not keep the process alive
+        loop.start()
+        self._client = sync.Client(self._address, tloop=loop)
         self._client.connect()
         self._sent, self._read = ([self._client.get_node(name) for name in names] for names in self._names)
         self._types = [node.read_data_type_as_variant_type() for node in self._sent]
