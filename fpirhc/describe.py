@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,6 +31,41 @@ def describe(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return getattr(value, "__name__", type(value).__name__)
+
+
+def identity(value: Any) -> tuple[str, tuple[object, ...]]:
+    """Return a key that two values share only if they are the same: what `describe` says, and the objects that it only names.
+
+    These are classes, functions and values of other kinds, such as the formula of a cost. They are held by the key.
+    """
+    return repr(describe(value)), tuple(_Same(one) for one in _named(value))
+
+
+@dataclass(frozen=True, eq=False)
+class _Same:
+    """An object that equals itself alone."""
+
+    value: object
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+
+def _named(value: Any) -> Iterator[object]:
+    """What `describe` has only the name of."""
+    if is_dataclass(value) and not isinstance(value, type):
+        yield type(value)
+        value = [getattr(value, f.name) for f in fields(value)]
+    elif isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for content in value:
+            yield from _named(content)
+    elif value is not None and not isinstance(value, bool | int | float | str | np.generic | np.ndarray):
+        yield value
 
 
 def _is_setting(one: Field[Any], content: object) -> bool:

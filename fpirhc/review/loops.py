@@ -6,7 +6,6 @@ what the controller remembers has found its place, also in a loop that does not 
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,20 +15,20 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.describe import describe
+from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.late import is_late, scaled
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.linearise.linear_map import near_fixed_point
+from fpirhc.symbolic.latest import Latest
 from fpirhc.task.problem import Problem
 
 T = TypeVar("T")
 
 _POINTS, _POINTS_OF_PLANS = 7, 3
 _DRAWN, _DRAWN_OF_PLANS = 16, 5  # draws of the parameters, of all points together
-_MOST_KEPT = 8
 _CYCLES = 400  # of the run to a point that laws and plans in every cycle take at most
 _PERIODS = 30  # of plans that the run to a point takes at least
 _SMALL = 1e-3  # feedback of a point at a limit, as a share of the others'
@@ -165,16 +164,11 @@ class Points:
 
 def points_of(grid: ReviewGrid, controller: Controller) -> Points:
     """Return the closed loop at the grid's points; the last ones are kept, because several questions ask the same loop."""
-    key = (id(grid.problem), id(grid.states), repr((type(controller), describe(near_fixed_point(controller)))))
-    if key not in _KEPT:
-        while len(_KEPT) >= _MOST_KEPT:
-            _KEPT.popitem(last=False)
-        _KEPT[key] = Points(grid, controller)
-    _KEPT.move_to_end(key)
-    return _KEPT[key]
+    same, equal = (grid.problem, grid.states), (identity(near_fixed_point(controller)),)
+    return _LATEST.of(same, equal, lambda: Points(grid, controller))
 
 
-_KEPT: OrderedDict[tuple[int, int, str], Points] = OrderedDict()
+_LATEST: Latest[Points] = Latest(8)
 
 
 def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) -> list[LinearLoop]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from typing import TypeVar, cast
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
-from fpirhc.describe import describe
+from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError
 from fpirhc.review.prediction import NominalRun, nominal_run
 from fpirhc.simulation.model_as_plant import shortened
@@ -28,8 +28,8 @@ class NominalRuns:
     """
 
     problem: Problem
-    _known: dict[str, NominalRun | str] = field(default_factory=dict, init=False)
-    _others: dict[str, object] = field(default_factory=dict, init=False)
+    _known: dict[Hashable, NominalRun | str] = field(default_factory=dict, init=False)
+    _others: dict[Hashable, object] = field(default_factory=dict, init=False)
 
     def of(self, controller: Controller) -> NominalRun | str:
         """Return the nominal run with the controller's deformation, or the reason why there is none."""
@@ -37,13 +37,13 @@ class NominalRuns:
             bare = without_deformation(resolved(self.problem, controller))
         except FpirhcError as error:
             return str(error)
-        name = repr((type(controller), describe(bare)))
+        name = identity(bare)
         if name not in self._known:
             self._known[name] = self._run(controller)
         run = self._known[name]
         return run if isinstance(run, str) else replace(run, controller=controller)
 
-    def once(self, name: str, make: Callable[[], Kept]) -> Kept:
+    def once(self, name: Hashable, make: Callable[[], Kept]) -> Kept:
         """Return what `make` returns, made when this name is first asked for."""
         if name not in self._others:
             self._others[name] = make()

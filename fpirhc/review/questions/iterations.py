@@ -11,7 +11,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import with_optimiser, without_deformation
-from fpirhc.describe import as_written, describe
+from fpirhc.describe import as_written, identity
 from fpirhc.errors import FpirhcError
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.review.answer import Answer, Verdict
@@ -37,7 +37,7 @@ def iterations_suffice(case: Case) -> Answer | None:
     try:
         bare = without_deformation(case.controller)
         model = shortened(null_problem(case.problem, bare), _PLANS * cycles_per_stage(horizon, case.problem.period))
-        share, later = case.runs.once(repr((TEXT, type(bare), describe(bare))), lambda: unsolved(model, bare))
+        share, later = case.runs.once((TEXT, identity(bare)), lambda: unsolved(model, bare))
     except FpirhcError as error:
         return Answer(TEXT, Verdict.UNKNOWN, f"no run of the model: {error}")
     text = f"on its own model {in_percent(share)} of the first {model.cycles} cycles have a plan that did not converge"
