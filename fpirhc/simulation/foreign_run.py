@@ -51,7 +51,7 @@ def run_foreign(
         for argument, table in zip(random, tables, strict=True):
             argument[:] = table[k]
         _patch(memory, k, patches)
-        failure = _failure(evaluator)
+        failure = evaluator.failure()
         if failure:
             return log[:k], stopped(problem, k, f"a solver failed ({failure})")
         memory_next, row, sent = evaluator.results
@@ -79,15 +79,6 @@ def _patch(memory: np.ndarray, cycle: int, patches: Sequence[Patch]) -> None:
     for at, places, values in patches:
         if at == cycle:
             memory[places] = values
-
-
-def _failure(evaluator: Evaluator) -> str:
-    """Evaluate; return why that failed, empty where it did not."""
-    try:
-        evaluator.evaluate()
-    except RuntimeError as error:  # CasADi's own, of a solver in the loop
-        return (str(error).strip().splitlines() or ["no reason"])[-1]
-    return "compiled code failed" if evaluator.failed else ""
 
 
 def stopped(problem: Problem, cycle: int, what: str) -> str:

@@ -27,7 +27,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
 from fpirhc.simulation.set_points import Setpoints, set_point_record, set_point_table
 from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.evaluate import Evaluator, unwrapped
+from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
 from fpirhc.task.output_disturbance import disturbance_values
@@ -273,7 +273,7 @@ def _run_chunks(
         for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
             argument.reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
         evaluator.redirect(1, log[at : at + CHUNK])
-        why = _evaluated(evaluator)
+        why = evaluator.failure()
         if why:
             return log[:at].copy(), _failed(at, problem, why)
         rows = log[at:end]
@@ -313,27 +313,13 @@ def _run_foreign(
     setpoints: Setpoints | None = None,
 ) -> tuple[np.ndarray, str | None]:
     tables = _tables(problem, seed, problem.cycles, disturbed, setpoints)
-    try:
-        return run_foreign(problem, start, loop, evaluator, seed, tables, progress, patches)
-    except SystemError as error:
-        raise unwrapped(error) from None
+    return run_foreign(problem, start, loop, evaluator, seed, tables, progress, patches)
 
 
 def _tables(problem: Problem, seed: int, cycles: int, disturbed: bool, setpoints: Setpoints | None) -> list[np.ndarray]:
     """Disturbances, the sensors' random series, and set-points of every cycle, where there are any."""
     random = float(disturbed) * disturbance_table(problem, seed, cycles), sensing_table(problem, seed, cycles)
     return [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
-
-
-def _evaluated(evaluator: Evaluator) -> str:
-    """Evaluate; return why that failed, empty where it did not."""
-    try:
-        evaluator.evaluate()
-    except SystemError as error:
-        raise unwrapped(error) from None
-    except RuntimeError as error:  # CasADi's own, of a solver in the loop
-        return (str(error).strip().splitlines() or ["no reason"])[-1]
-    return "compiled code failed" if evaluator.failed else ""
 
 
 def _failed(at: int, problem: Problem, why: str) -> str:

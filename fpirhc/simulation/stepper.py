@@ -26,6 +26,7 @@ from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
 from fpirhc.simulation.set_points import SetpointsNow
 from fpirhc.simulation.step_arguments import NOT_WRITTEN, NOTHING, NumbersNow, StepArguments
+from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
 from fpirhc.task.limits import Interval
@@ -346,7 +347,10 @@ class Stepper(Checked):
             if self._may_fail:
                 self._command[0] = NOT_WRITTEN
             self._evaluate()
-        except RuntimeError as error:
+        except (RuntimeError, SystemError) as error:
+            cause = unwrapped(error)
+            if not isinstance(cause, RuntimeError):
+                raise cause from None
             return str(error) or "a solver raised"
         return _NOT_SOLVED if self._may_fail and isnan(self._command[0]) else ""
 

@@ -67,6 +67,21 @@ class Evaluator:
         """
         return bool(self._buffer.ret() != 0)
 
+    def failure(self) -> str:
+        """Evaluate; return why that failed, empty where it did not.
+
+        Raises:
+            KeyboardInterrupt: from the keyboard, wherever it reached the Function.
+        """
+        try:
+            self.evaluate()
+        except (RuntimeError, SystemError) as error:
+            cause = unwrapped(error)
+            if not isinstance(cause, RuntimeError):
+                raise cause from None
+            return (str(error).strip().splitlines() or ["no reason"])[-1]  # CasADi's own, of a solver in the loop
+        return "compiled code failed" if self.failed else ""
+
     def __call__(self, *values: npt.ArrayLike) -> tuple[np.ndarray, ...]:
         """Evaluate with these arguments and return copies of the results.
 
@@ -83,7 +98,7 @@ class Evaluator:
             array[...] = value
         try:
             self.evaluate()
-        except SystemError as error:
+        except (RuntimeError, SystemError) as error:
             raise unwrapped(error) from None
         if self.failed:
             raise InvalidValue(f"'{self.function.name()}' fails for these arguments: {values}")
@@ -117,12 +132,15 @@ class Evaluator:
         return entries.reshape(array.shape)
 
 
-def unwrapped(error: SystemError) -> BaseException:
+def unwrapped(error: RuntimeError | SystemError) -> BaseException:
     """Return the interruption from the keyboard that CasADi wrapped, or else the error itself.
 
-    A solver that Ctrl-C reaches returns with the interruption set, which Python reports as a SystemError.
+    A solver that Ctrl-C reaches returns with the interruption set, which Python reports as a SystemError; where CasADi itself looks
+    for Ctrl-C between two operations, it raises a RuntimeError that ends in the name of the interruption.
     """
     cause = error.__cause__ or error.__context__
+    if isinstance(error, RuntimeError) and str(error).strip().endswith(KeyboardInterrupt.__name__):
+        return KeyboardInterrupt()
     return cause if isinstance(cause, KeyboardInterrupt) else error
 
 

@@ -6,6 +6,7 @@ import re
 import threading
 from dataclasses import replace
 from typing import Any
+from unittest.mock import DEFAULT, Mock
 
 import numpy as np
 import pytest
@@ -390,28 +391,14 @@ def test_memory_that_changes_during_the_run():
     assert commands[1][50] == pytest.approx(0.5 * commands[0][50], rel=1e-12)
 
 
-class FailingStep:
-    """An evaluator whose solver fails in the tenth cycle, as CasADi's do: with a RuntimeError."""
-
-    failed = False
-
-    def __init__(self, evaluator):
-        self.evaluator, self.arguments, self.results, self.count = evaluator, evaluator.arguments, evaluator.results, 0
-
-    def evaluate(self):
-        """Evaluate, or fail."""
-        self.count += 1
-        if self.count > 10:
-            raise RuntimeError("Error in Function::call\nsolver has no solution")
-        self.evaluator.evaluate()
-
-
-def test_solver_that_fails_ends_the_run():
-    """The reason is the solver's last line; the cycles before are kept."""
+def test_solver_that_fails_ends_the_run(monkeypatch):
+    """As CasADi's do, with a RuntimeError: the reason is the solver's last line; the cycles before are kept."""
     problem = outside(task(duration=0.1))
     ready = simulator(problem, CONTROLLERS["computed torque"], compiled=False)
-    failing: Any = FailingStep(ready.evaluator)
+    failure = RuntimeError("Error in Function::call\nsolver has no solution")
+    evaluate = Mock(wraps=ready.evaluator.evaluate, side_effect=[*[DEFAULT] * 10, failure])
+    monkeypatch.setattr(ready.evaluator, "evaluate", evaluate)
     start = start_memory(ready.loop, problem, ready.controller)
-    log, stop = run_foreign(problem, start, ready.loop, failing, 0, [], None)
+    log, stop = run_foreign(problem, start, ready.loop, ready.evaluator, 0, [], None)
     assert len(log) == 10
     assert "a solver failed (solver has no solution) at t = 0.01 s (cycle 10)" in str(stop)

@@ -5,18 +5,21 @@ from __future__ import annotations
 import json
 import resource
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
+import casadi as ca
+import numpy as np
 import pytest
 from test_scenarios import LINE
 
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
-from fpirhc.symbolic.evaluate import unwrapped
+from fpirhc.symbolic.evaluate import Evaluator
 
 COMMAND = [
     "compare",
@@ -58,14 +61,16 @@ def room(size: int) -> Iterator[None]:
 
 
 @contextmanager
-def interrupted_after(seconds: float) -> Iterator[None]:
-    """A signal that is answered as Ctrl-C is, wherever the program is then."""
+def interrupted_once(begun: Callable[[], object], *, every: float = 0.05) -> Iterator[None]:
+    """A signal that is answered as Ctrl-C is, wherever the program is at the first tick at which `begun` is true."""
 
     def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
+        if begun():
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGALRM, interrupt)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, every, every)
     try:
         yield
     finally:
@@ -113,31 +118,84 @@ def test_a_record_that_lacks_a_field_is_refused_by_name(change, message, folder,
     assert "Traceback" not in said
 
 
-def test_an_interruption_inside_a_solver_is_an_interruption(folder):
-    """CasADi reports it as a SystemError, which would be taken for a fault of the program."""
+class _Interrupts(ca.Callback):
+    """Ctrl-C in the middle of a Function."""
+
+    def __init__(self) -> None:
+        """Construct it as CasADi wants."""
+        ca.Callback.__init__(self)
+        self.construct("interrupts", {})
+
+    def eval(self, arguments):
+        """Raise the signal."""
+        signal.raise_signal(signal.SIGALRM)
+        return [arguments[0]]
+
+
+@pytest.mark.parametrize("asked", [lambda e: e.failure(), lambda e: e(1.0)], ids=["failure", "call"])
+def test_an_interruption_between_two_operations_is_an_interruption(asked):
+    """CasADi reports it as a RuntimeError, which looks like a solver that failed: a run would end early."""
+    x, interrupts = ca.MX.sym("x"), _Interrupts()
+    evaluator = Evaluator(ca.Function("f", [x], [interrupts(x)]))
+    with interrupted_once(lambda: True, every=3600.0), pytest.raises(KeyboardInterrupt):
+        asked(evaluator)
+
+
+@pytest.mark.parametrize("every", [0.003, 0.01, 0.05])
+def test_an_interruption_inside_a_solver_is_an_interruption(every, folder):
+    """IPOPT catches it and goes on, and CasADi reports it as a SystemError, which would be taken for a fault of the program.
+
+    The run is interrupted after its first report, and no machine solves the rest of its 100 000 plans before the next tick.
+    """
     (folder / "long.py").write_text(LONG)
     task = fp.load_problem("long.py")
     long = replace(task.problem, duration=500.0)
-    with interrupted_after(2.0), pytest.raises(KeyboardInterrupt):
-        fp.simulate(long, task.controllers["RHC"], seed=0, compiled=False)
+    reports: list[int] = []
+
+    def run() -> None:
+        ended = fp.simulate(
+            long, task.controllers["RHC"], seed=0, compiled=False, progress=lambda cycle, _: reports.append(cycle)
+        )
+        pytest.fail(f"the run ended after {ended.cycles} of {long.cycles} cycles and not as interrupted: {ended.stop}")
+
+    with interrupted_once(lambda: reports, every=every), pytest.raises(KeyboardInterrupt):
+        run()
 
 
-def test_what_is_no_interruption_stays_what_it_is():
-    fault = SystemError("a fault")
-    assert unwrapped(fault) is fault
-    fault.__cause__ = KeyboardInterrupt()
-    assert isinstance(unwrapped(fault), KeyboardInterrupt)
+def test_an_interruption_of_a_stepper_is_no_failed_solver(folder, monkeypatch):
+    """A failed solver holds the command; an interruption goes to the caller, whichever error CasADi makes of it."""
+    task = fp.load_problem("line.py")
+    wrapped = SystemError("a result with an exception set")
+    wrapped.__cause__ = KeyboardInterrupt()
+    for error, expected in [
+        (RuntimeError("KeyboardInterrupt"), KeyboardInterrupt),
+        (wrapped, KeyboardInterrupt),
+        (SystemError("a fault"), SystemError),
+    ]:
+        stepper = fp.Stepper(task.problem, task.controllers["CTC"], compiled=False)
+        raising = Mock(side_effect=error)
+        monkeypatch.setattr(stepper, "_evaluate", raising)
+        with pytest.raises(expected):
+            stepper.step(0.0, np.zeros(2), np.zeros(1), stepper.start())
+        assert raising.called
 
 
 def test_ctrl_c_in_scenarios_keeps_what_is_finished(folder, capfd):
     (folder / "long.py").write_text(LONG)
     words = ["compare", "long.py", "--scenarios", "1000", "--mismatch", "20", "--no-compile", "--out", "out"]
-    with interrupted_after(6.0):
+
+    def records() -> bool:
+        """Whether results are there to be kept, and a solver is at work."""
+        ledger = Path("out/scenarios.jsonl")
+        return ledger.exists() and ledger.read_bytes().count(b"\n") > 3
+
+    with interrupted_once(records):
         assert main([*words, "--controllers", "CTC", "RHC"]) == ExitCode.INTERRUPTED
     said = capfd.readouterr().err
     assert "finished results are kept in out/scenarios.jsonl" in said
     assert "Traceback" not in said
     finished = Path("out/scenarios.jsonl").read_text().splitlines()
+    assert 4 <= len(finished) < 2000
     assert all(json.loads(line)["controller"] in ("CTC", "RHC") for line in finished[1:])
     assert main([*words[:3], "1", *words[4:], "--controllers", "CTC"]) == ExitCode.FINISHED
     assert Path("out/scenarios.jsonl").read_text().splitlines()[: len(finished)] == finished
