@@ -7,6 +7,7 @@ from fpirhc.contraction.large_errors import least_product
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
+from fpirhc.deformation.base import Deformation
 from fpirhc.plant.motion import controlled_places
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.forms import INCREMENT, REFERENCED, forms_of
@@ -37,7 +38,38 @@ def fast_enough(case: Case, own: Spectrum) -> Answer | None:
     numbers = {"product": product, "ratio": ratio}
     if ratio >= _SPARE:
         return Answer(FAST, Verdict.YES, text, "", numbers)
-    return Answer(FAST, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, _remedy(case, _SPARE / ratio), numbers)
+    return Answer(
+        FAST,
+        Verdict.NO if ratio < 1 else Verdict.UNKNOWN,
+        text,
+        faster(case, _SPARE / ratio, "lower rate x period"),
+        numbers,
+    )
+
+
+def faster(case: Case, factor: float, otherwise: str) -> str:
+    """Return what to do: a form or a larger gain that runs on plant and model speak for, or else something that is not run.
+
+    Args:
+        case: of a controller that is too slow.
+        factor: by which the gain would grow.
+        otherwise: what helps without another form or gain.
+    """
+    deformation = case.controller.deformation
+    forms = forms_of(case.problem, deformation)
+    passing = [name for kind, name in _FORMS.items() if kind in forms and not case.harm(forms[kind])]
+    ways = [f"use a form that passes the desired response at once ({', '.join(passing)})"] if passing else []
+    if case.lowers(deformation.with_effective_gain(factor * deformation.effective_gain())):
+        ways.append(f"use {gain_times(deformation, factor)}")
+    text = ", or ".join([*ways, otherwise])
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def gain_times(deformation: Deformation, factor: float) -> str:
+    """Return the map's own gain times a factor as text, 'gain = -1.2'."""
+    larger = deformation.with_effective_gain(factor * deformation.effective_gain())
+    own = getattr(larger, larger.gain_name, None)
+    return f"effective gain = {larger.effective_gain():.3g}" if own is None else f"{larger.gain_name} = {own:.3g}"
 
 
 def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
@@ -67,18 +99,6 @@ def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None
     laws = [law.feedback(plant.orders[k]) for k in controlled_places(plant)] if law else []
     known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]
     return max(known, key=lambda pair: pair[1]) if known else None
-
-
-def _remedy(case: Case, factor: float) -> str:
-    """What to do: a form or a gain that runs on plant and model speak for, or a slower law."""
-    deformation = case.controller.deformation
-    forms = forms_of(case.problem, deformation)
-    passing = [name for kind, name in _FORMS.items() if kind in forms and not case.harm(forms[kind])]
-    ways = [f"use a form that passes the desired response at once ({', '.join(passing)})"] if passing else []
-    if case.lowers(deformation.with_effective_gain(factor * deformation.effective_gain())):
-        ways.append(f"multiply the gain by {factor:.2g}")
-    text = ", or ".join([*ways, "lower rate x period"])
-    return f"{text[0].upper()}{text[1:]}."
 
 
 def _products(controller: Controller, own: Spectrum) -> tuple[float, float]:

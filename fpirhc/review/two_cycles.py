@@ -9,7 +9,8 @@ from fpirhc.deformation.base import Deformation, innermost
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.question import Case
-from fpirhc.review.recommended_gain import secant_limit
+from fpirhc.review.recommended_gain import MARGIN, secant_limit
+from fpirhc.review.speed import gain_times
 
 QUESTION = "Is it free of bounded two-cycles?"
 
@@ -33,8 +34,18 @@ def free_of_two_cycles(case: Case) -> Answer | None:
     if sizes:
         text += f"; there |f - d| alternates with the size {sizes[-1]:.3g}"
         numbers["amplitude"] = sizes[-1]
-    change = f"Multiply the gain by less than {limit / secant:.3g}."
-    return Answer(QUESTION, Verdict.NO, text, change, numbers)
+    return Answer(QUESTION, Verdict.NO, text, _smaller(case, limit / secant), numbers)
+
+
+def _smaller(case: Case, factor: float) -> str:
+    """The gain at half of the limit, where runs on plant and model speak for it."""
+    deformation = case.controller.deformation
+    against = case.harm(deformation.with_effective_gain(factor / MARGIN * deformation.effective_gain()))
+    if against:
+        return (
+            f"The limit is {gain_times(deformation, factor)}, but no gain is proposed, because at half of it {against}."
+        )
+    return f"Use {gain_times(deformation, factor / MARGIN)}, half of the limit."
 
 
 def _amplitudes(map_: Deformation, limit: float) -> tuple[float, ...]:

@@ -53,7 +53,7 @@ def test_a_larger_gain_is_proposed_where_a_run_with_the_wrong_model_speaks_for_i
     slow = fp.Affine(gain=-2 * ratio * least_product(3, RATE, PERIOD) / eigenvalue)
     forms = "Use a form that passes the desired response at once (ModelReferenced, Increment), or "
     said = answer(problem, slow, "keep up with its tracking law").change
-    assert said == forms + "multiply the gain by 3.3, or " * larger + "lower rate x period."
+    assert said == forms + f"use gain = {3 * slow.gain / ratio:.3g}, or " * larger + "lower rate x period."
     law = fp.ComputedTorque(fp.Exponential(rate=RATE))
     faster = fp.Affine(gain=slow.gain * 3 / ratio)
     runs = (fp.simulate(problem, one, seed=0, compiled=False) for one in (law, law.with_deformation(faster)))
@@ -89,6 +89,24 @@ def test_two_cycle_that_is_said_to_exist_is_there():
             assert sizes.max() < 1e-6
         else:
             assert sizes.max() == pytest.approx(one_answer.numbers["amplitude"], rel=1e-6)
+
+
+@pytest.mark.parametrize(("period", "harmful"), [(PERIOD, False), (0.02, True)])
+def test_half_of_the_limit_of_two_cycles_is_proposed_after_a_run(period, harmful):
+    """A model that is 2 % wrong: in a long period the plain form at half of the limit loses what the tracking law holds."""
+    problem, sigmoid = replace(moving(1.02), period=period), fp.Sigmoid(gain=-1.0, scale=5.0)
+    limit = answer(problem, sigmoid, "two-cycles").numbers["limit"] / sigmoid.secant_gain() * sigmoid.gain
+    change = answer(problem, replace(sigmoid, gain=-1.01 * abs(limit)), "two-cycles").change
+    law = fp.ComputedTorque(fp.Exponential(rate=RATE))
+    run = fp.simulate(problem, law.with_deformation(replace(sigmoid, gain=-abs(limit) / 2)), seed=0, compiled=False)
+    lost = fp.measure(problem, run).rms_error["y"]
+    if harmful:
+        assert f"The limit is gain = {-abs(limit):.3g}, but no gain is proposed" in change
+        assert f"{lost:.3g} with it" in change
+        assert lost > 1.0
+    else:
+        assert change == f"Use gain = {-abs(limit) / 2:.3g}, half of the limit."
+        assert lost < 0.01
 
 
 def test_benefit_is_told_from_harm():

@@ -10,13 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from fpirhc.controllers.contract import tracking_law
-from fpirhc.deformation.base import Deformation
-from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.forms import forms_of
-from fpirhc.review.loops import loops_at
 from fpirhc.review.question import Case, ControllerQuestion
-from fpirhc.review.speed import FAST
+from fpirhc.review.speed import FAST, faster
 
 _SPARE = 1.5
 _SMALLEST, _LARGEST, _STEPS = 1e-3, 30.0, 80  # factors of the map's own gain that are searched
@@ -43,17 +39,10 @@ def plan_keeps_up(case: Case) -> Answer | None:
     if ratio >= _SPARE:
         return Answer(FAST, Verdict.YES, text, "", numbers)
     verdict = Verdict.NO if ratio < 1 and not case.controller.learns else Verdict.UNKNOWN
-    return Answer(FAST, verdict, text, _remedy(case, _SPARE * factor), numbers)
+    return Answer(FAST, verdict, text, faster(case, _SPARE * factor, "plan with a shorter period"), numbers)
 
 
 QUESTION = ControllerQuestion(plan_keeps_up, order=30)
-
-
-def gain_times(deformation: Deformation, factor: float) -> str:
-    """Return the map's own gain times a factor as text, 'gain = -1.2'."""
-    larger = deformation.with_effective_gain(factor * deformation.effective_gain())
-    own = getattr(larger, larger.gain_name, None)
-    return f"effective gain = {larger.effective_gain():.3g}" if own is None else f"{larger.gain_name} = {own:.3g}"
 
 
 def _least_factor(case: Case) -> float | None:
@@ -76,20 +65,3 @@ def _least_factor(case: Case) -> float | None:
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if stable(middle) else (middle, high)
     return high
-
-
-def _remedy(case: Case, factor: float) -> str:
-    """The gain that would do, and the forms that converge with the present one."""
-    deformation = case.controller.deformation
-    names = []
-    for name, form in forms_of(case.problem, deformation).items():
-        if form.iteration.slows_desired:
-            continue
-        try:
-            loops = loops_at(case.grid, case.controller.with_deformation(form), case.loops.places[:1])
-        except FpirhcError:
-            continue
-        if loops[0].radius < 1:
-            names.append(name)
-    forms = f", or the {' or '.join(names)} form, which converges with this gain" if names else ""
-    return f"Use {gain_times(deformation, factor)} or more{forms}."
