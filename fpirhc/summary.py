@@ -6,10 +6,12 @@ Names and reasons come from a user's files, so all of them are escaped for the p
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 _LEAST_SHARE = 1e-5
+_WITH_POWER = re.compile(r"(?P<before>= ?|(?<![\w.+-]))(?P<number>-?\d+(?:\.\d+)?e[+-]\d+)(?!\w)")
 _LONGEST = 1e6  # from which a number is written with a power of ten
 
 
@@ -126,6 +128,17 @@ def written_out(value: float, digits: int = 3) -> str:
         mantissa, e, power = text.partition("e")
         return f"{mantissa}e{int(power)}" if e else text
     return f"{float(text):,.15g}".replace(",", " ")
+
+
+def numbers_written_out(text: str) -> str:
+    """Return a sentence without numbers such as 1.69e+04: they are as `written_out` has them; after '=' thousands stay together."""
+    return _WITH_POWER.sub(_as_written, text)
+
+
+def _as_written(found: re.Match[str]) -> str:
+    value, digits = found["number"], sum(c.isdigit() for c in found["number"].partition("e")[0])
+    text = written_out(float(value), max(digits, 1))
+    return found["before"] + (text.replace(" ", "") if "=" in found["before"] else text)
 
 
 def _escaped(text: str) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from fpirhc.by_name import FoundByName
-from fpirhc.summary import line, table
+from fpirhc.summary import line, numbers_written_out, table
 
 
 class Verdict(StrEnum):
@@ -35,6 +35,10 @@ class Answer(FoundByName):
     evidence: str
     change: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "evidence", numbers_written_out(self.evidence))
+        object.__setattr__(self, "change", numbers_written_out(self.change))
 
     @property
     def advice(self) -> str:

@@ -10,8 +10,8 @@ from chains import chain, errors_after_request
 from test_review_laws import PERIOD, RATE, moving
 
 import fpirhc as fp
-from fpirhc.review.speed import gain_times
 from fpirhc.review.review import predict
+from fpirhc.review.speed import gain_times
 
 DAILY = fp.load_problem("problems/gallery/tumour_daily.py")
 PLANNED = "RHC+FPI, gentle"
@@ -45,12 +45,12 @@ def test_a_gentle_gain_is_worse_than_none_and_what_would_do():
         better = asked(DAILY.problem, gentle.with_deformation(mended))
         assert about(better, "Does the deformation converge").verdict == "yes"
     assert "(ModelReferenced, Increment), or use gain = " in slow.change
-    bare, mended = (
+    without, adapted = (
         fp.measure(DAILY.problem, fp.simulate(DAILY.problem, gentle.with_deformation(one), seed=0, compiled=False))
         for one in (fp.Identity(), larger)
     )
     [weighed] = DAILY.problem.judged_names
-    assert mended.rms_error[weighed] < bare.rms_error[weighed]
+    assert adapted.rms_error[weighed] < without.rms_error[weighed]
 
 
 def test_smallest_gain_of_a_plan_is_where_its_loop_is_stable():

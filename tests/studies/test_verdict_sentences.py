@@ -111,7 +111,7 @@ def test_only_what_the_cost_weighs_is_judged():
     plain = entry("RHC", errors={"y": 1.79e-6, "z": 9.0})
     adaptive = entry("FPI", "RHC", errors={"y": 0.438, "z": 1.0}, facts={"weighed": frozenset({"y"})})
     assert first(plain, adaptive) == Finding(
-        "FPI does not help: it raises the rms error of y from 1.79e-06 to 0.438 m (245 000 times more). The cost does not weigh, "
+        "FPI does not help: it raises the rms error of y from 1.79e-6 to 0.438 m (245 000 times more). The cost does not weigh, "
         "so the verdict leaves out: z from 9 to 1 rad.",
         Outcome.WORSE,
         ("RHC", "FPI"),
@@ -275,7 +275,7 @@ def test_a_far_better_row_is_named():
     """From a factor of two on, counted from the better of the pair; a row with the exact model is no rival."""
     pair = entry("RHC"), entry("FPI", "RHC", errors={"y": 2.0})
     assert said(*pair, entry("learner", errors={"y": 1 / 32001}))[1] == (
-        "learner is far better than this pair: its relative error is 3.12e-05 (RHC 1 and FPI 2), 32 000 times smaller than that of "
+        "learner is far better than this pair: its relative error is 3.12e-5 (RHC 1 and FPI 2), 32 000 times smaller than that of "
         "RHC."
     )
     assert len(said(*pair, entry("learner", errors={"y": 0.51}))) == 1

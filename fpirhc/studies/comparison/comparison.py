@@ -17,7 +17,7 @@ from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import gap
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.view import View, status_shares
-from fpirhc.summary import Column, Table, line, written_out
+from fpirhc.summary import Column, Table, line, numbers_written_out, written_out
 
 _SOLVES = "solve."  # metrics of plans, which have a table of their own
 
@@ -121,7 +121,14 @@ def _view(comparison: Comparison) -> View:
         sentences=comparison.sentences,
         conditions=f"Errors, effort and cost from t = {since} on; seed {comparison.seed}. Marked are the best of: {marked}.",
         tables=(_controllers(comparison), _plans(comparison)),
-        lists={"Ended early": ended, "What they measure, and how often": comparison.information, "Notes": notes},
+        lists={
+            head: [numbers_written_out(text) for text in texts]
+            for head, texts in (
+                ("Ended early", ended),
+                ("What they measure, and how often", comparison.information),
+                ("Notes", notes),
+            )
+        },
         skipped=comparison.skipped,
         settings={"problem": comparison.settings, **own},
         versions=comparison.versions,

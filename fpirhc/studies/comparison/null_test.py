@@ -31,7 +31,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
 from fpirhc.studies.comparison.outcome import Outcome
-from fpirhc.summary import in_percent
+from fpirhc.summary import in_percent, numbers_written_out
 from fpirhc.task.problem import Problem
 
 _MOSTLY = 0.5  # share of the cycles at a limit from which nothing is shown
@@ -61,6 +61,9 @@ class NullTest(FoundByName):
     text: str
     cycles: int
     elapsed: float = field(default=0.0, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text", numbers_written_out(self.text))
 
     @property
     def passed(self) -> bool:

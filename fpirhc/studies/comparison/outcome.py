@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from fpirhc.by_name import FoundByName
+from fpirhc.summary import numbers_written_out
 
 
 class Outcome(StrEnum):
@@ -35,3 +36,6 @@ class Finding(FoundByName):
     outcome: Outcome | None = None
     pair: tuple[str, str] | None = None
     ratios: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text", numbers_written_out(self.text))
