@@ -6,40 +6,36 @@ The environment is the closed loop of the problem around a controller that sends
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fpirhc.adapters.names import package
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotSupported
+from fpirhc.simulation.held_input import HELD_INPUT, HeldInput
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
-from fpirhc.simulation.simulate import disturbance_table, sensing_table
-from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.simulation.set_points import Setpoints
+from fpirhc.simulation.simulate import run_tables
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
-_ACTION, _JUDGED = "_action", "_action_status"
 Reward = Callable[[Mapping[str, np.ndarray]], float]
 
 
-def as_env(problem: Problem, *, reward: Reward | None = None) -> Any:
+def as_env(problem: Problem, *, reward: Reward | None = None, setpoints: Setpoints | None = None) -> Any:
     """Return a problem as a Gymnasium environment.
 
     An action is the command of one cycle, in the units and within the limits of the inputs. An observation has the measured state
     and the reference of the judged coordinates. An episode is truncated after the problem's duration, and terminated where a state
     leaves its physical range or the error is a million times the reference. `info` has every signal of the cycle, by name.
 
+    A step evaluates the loop twice: once to move with the action, and once for what is measured then, before the next action.
+
     Args:
         problem: the task; limits of its inputs are those of the actions.
         reward: function of the signals at the end of a step; None: minus the sum of the squared errors.
+        setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
 
     Raises:
         NotSupported: Gymnasium is not installed, or the plant is an object outside.
@@ -47,7 +43,7 @@ def as_env(problem: Problem, *, reward: Reward | None = None) -> Any:
     gymnasium = package("gymnasium")
     if problem.foreign is not None:
         raise NotSupported("as_env: the plant is an object outside; make the environment from that object itself")
-    play = _Play(problem, reward or _squared_error)
+    play = _Play(problem, reward or _squared_error, setpoints)
     low, high = (np.array(ends, dtype=float) for ends in problem.limits.input_ends(problem.plant))
 
     base: Any = gymnasium.Env
@@ -79,21 +75,21 @@ class _Play:
     Args:
         problem: the task.
         reward: of the signals.
+        setpoints: of the run.
     """
 
-    def __init__(self, problem: Problem, reward: Reward) -> None:
-        self._problem, self._reward = problem, reward
-        self._loop = close_loop(problem, _Sent())
+    def __init__(self, problem: Problem, reward: Reward, setpoints: Setpoints | None) -> None:
+        self._problem, self._reward, self._setpoints = problem, reward, setpoints
+        self._loop = close_loop(problem, HeldInput())
         self._step, self._ranges = Evaluator(self._loop.function), ranges_of(problem, self._loop.trace)
-        self._place = self._loop.memory.slice(_ACTION)
+        self._place = self._loop.memory.slice(HELD_INPUT)
         self.reset(0)
 
     def reset(self, seed: int) -> None:
         """Go to the start."""
-        self.cycle, cycles = 0, self._problem.cycles + 1
-        tables = disturbance_table(self._problem, seed, cycles), sensing_table(self._problem, seed, cycles)
-        self._tables = [table for table in tables if table.shape[1]]
-        self._memory = start_memory(self._loop, self._problem, _Sent())
+        self.cycle = 0
+        self._tables = run_tables(self._problem, seed, self._problem.cycles + 1, setpoints=self._setpoints)
+        self._memory = start_memory(self._loop, self._problem, HeldInput())
         self._measure()
 
     def step(self, action: np.ndarray) -> bool:
@@ -116,31 +112,3 @@ class _Play:
 
 def _squared_error(signals: Mapping[str, np.ndarray]) -> float:
     return -float(np.sum(signals["error"] ** 2))
-
-
-@dataclass(frozen=True)
-class _Sent(Controller):
-    """The command that stands in its memory."""
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): nothing is deformed."""
-        return Identity()
-
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, sent, limit, judge, running."""
-        plant, action = problem.plant, Signal(_ACTION, problem.plant.input.elements, problem.plant.input.units)
-        closing, delays = commanding_blocks(problem, [scalar(_JUDGED)])
-        responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
-
-        def step(s: Signals) -> dict[str, Expression]:
-            response = plant.controlled_response_function(s.state, s._action, s.parameters)
-            return {
-                **{r.name: response for r in responses},
-                "command_unclipped": s._action,
-                _JUDGED: Expression(int(Status.OK)),
-            }
-
-        writes = Layout((*responses, like(plant.input, "command_unclipped"), scalar(_JUDGED)))
-        sent = Block("sent", Layout((action, plant.state, plant.parameter)), writes, step)
-        return [reference_block(problem), sent, *closing], [*delays, Delay(action, _ACTION)]

@@ -18,7 +18,7 @@ from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.simulation import metrics as run_metrics
 from fpirhc.simulation.metrics import known_metrics, measure
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import disturbance_table, sensing_table, simulate
+from fpirhc.simulation.simulate import run_tables, simulate
 from fpirhc.studies.open_loop import solve_first
 from fpirhc.studies.scenarios.draws import with_exact
 from fpirhc.symbolic.native import find_compiler
@@ -252,7 +252,5 @@ def names_by_source(all_variants: Sequence[Variant]) -> dict[str, list[str]]:
 
 
 def _is_random(problem: Problem) -> bool:
-    tables = (disturbance_table, sensing_table)
-    return any(
-        not np.array_equal(draw(problem, 0, problem.cycles), draw(problem, 1, problem.cycles)) for draw in tables
-    )
+    tables = zip(*(run_tables(problem, seed, problem.cycles) for seed in (0, 1)), strict=True)
+    return not all(np.array_equal(one, other) for one, other in tables)

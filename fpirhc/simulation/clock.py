@@ -169,11 +169,6 @@ class Deadline:
 
         return timed_step
 
-    @property
-    def was_late(self) -> bool:
-        """Whether the last step was late."""
-        return self.last > self.limit
-
     def percentile(self, percent: float = _SHOWN) -> float:
         """Return a duration within which at least this share of the steps ended, s: the upper end of its class, at most `worst`.
 

@@ -240,14 +240,21 @@ def judged_run(
     return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in judged)), log=log, settings=facts)
 
 
-def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
-    """Return the disturbances of every cycle, shape (cycles, columns); see `disturbance_values`."""
-    return disturbance_values(problem, np.arange(cycles) * problem.period, seed)
+def run_tables(
+    problem: Problem, seed: int, cycles: int, *, disturbed: bool = True, setpoints: Setpoints | None = None
+) -> list[np.ndarray]:
+    """Return what the loop reads in every cycle: disturbances, the sensors' random series, set-points, where there are any.
 
-
-def sensing_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
-    """Return the sensors' random series of every cycle, shape (cycles, number of series); each has its own stream."""
-    return problem.sensing.table(np.arange(cycles) * problem.period, seed)
+    Args:
+        problem: the task.
+        seed: of the noise of disturbances and sensors; each has its own stream.
+        cycles: number of rows.
+        disturbed: whether disturbances act; the sensors' noise always does.
+        setpoints: by coordinate, in place of those of the reference.
+    """
+    times = np.arange(cycles) * problem.period
+    random = float(disturbed) * disturbance_values(problem, times, seed), problem.sensing.table(times, seed)
+    return [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
 
 
 def _run_chunks(
@@ -263,7 +270,7 @@ def _run_chunks(
 ) -> tuple[np.ndarray, str | None]:
     cycles, trace, dropped = problem.cycles, loop.trace, Dropped(loop)
     padded = (-(-cycles // CHUNK) + (1 if patches else 0)) * CHUNK
-    tables = _tables(problem, seed, padded, disturbed, setpoints)
+    tables = run_tables(problem, seed, padded, disturbed=disturbed, setpoints=setpoints)
     log, ranges = np.empty((padded, trace.size)), ranges_of(problem, trace)
     evaluator.arguments[0][:] = start
     for at, end in _pieces(cycles, [cycle for cycle, _, _ in patches]):
@@ -312,14 +319,8 @@ def _run_foreign(
     patches: Sequence[Patch] = (),
     setpoints: Setpoints | None = None,
 ) -> tuple[np.ndarray, str | None]:
-    tables = _tables(problem, seed, problem.cycles, disturbed, setpoints)
+    tables = run_tables(problem, seed, problem.cycles, disturbed=disturbed, setpoints=setpoints)
     return run_foreign(problem, start, loop, evaluator, seed, tables, progress, patches)
-
-
-def _tables(problem: Problem, seed: int, cycles: int, disturbed: bool, setpoints: Setpoints | None) -> list[np.ndarray]:
-    """Disturbances, the sensors' random series, and set-points of every cycle, where there are any."""
-    random = float(disturbed) * disturbance_table(problem, seed, cycles), sensing_table(problem, seed, cycles)
-    return [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
 
 
 def _failed(at: int, problem: Problem, why: str) -> str:

@@ -62,15 +62,6 @@ def paths_to(name: str, value: object, depth: int = 4) -> Iterator[str]:
             yield from (f"{one}.{rest}" for rest in paths_to(name, entry(value, one), depth - 1))
 
 
-def is_declared(owner: object, path: str, kinds: Sequence[object]) -> bool:
-    """Whether the field at a path is declared with one of some types, such as (int, 'int')."""
-    *parents, name = path.split(".")
-    value = owner
-    for parent in parents:
-        value = entry(value, parent)
-    return is_dataclass(value) and any(f.name == name and f.type in kinds for f in fields(value))
-
-
 def validated(value: object, changes: Mapping[str, object]) -> object:
     """Return a dataclass with other contents of some fields, checked as a new one is."""
     return replace(value, **changes)  # type: ignore[type-var]  # only dataclasses have fields

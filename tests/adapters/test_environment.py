@@ -58,3 +58,20 @@ def test_seeds_repeat_and_an_episode_ends_in_time():
     assert len(episodes[0]) == 31
     assert np.array_equal(episodes[0], episodes[1])
     assert not np.array_equal(episodes[0], episodes[2])
+
+
+def test_set_points_are_those_of_a_run():
+    """A set-point that changes within the episode, in the observation and in the motion, bit by bit."""
+    problem, controller = task("two_link_arm")
+    plant = problem.plant
+    reference = fp.Setpoint(dict.fromkeys(plant.names, 0.1), rate=0.2 / problem.period)
+    problem = replace(problem, reference=reference)
+    steps = {plant.names[0]: ((0.0, 0.1), (10.5 * problem.period, 0.4))}
+    controller = fp.ComputedTorque(fp.Exponential(rate=4.0))
+    run = fp.simulate(problem, controller, seed=5, compiled=False, setpoints=steps)
+    env = as_env(problem, setpoints=steps)
+    env.reset(seed=5)
+    for command, state, reference in zip(run["command"][:-1], run["state"][1:], run["reference"][1:], strict=True):
+        seen, *_ = env.step(command)
+        assert np.array_equal(seen, [*state, *reference])
+    assert np.ptp(run["reference"][:, 0]) > 0.1

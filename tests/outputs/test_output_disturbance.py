@@ -17,7 +17,7 @@ from test_outputs import OPTIMISER, SAME, SHORT, TWO_MASS, curve, hill, on_outpu
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
-from fpirhc.simulation.simulate import disturbance_table
+from fpirhc.simulation.simulate import run_tables
 
 LAW = fp.Exponential(rate=1.0)
 WAVE = fp.Sine(2.0, 0.1, 0.3)
@@ -142,7 +142,7 @@ def test_a_name_of_a_coordinate_is_the_coordinates() -> None:
 
 def test_columns_are_the_disturbances_then_the_derivatives() -> None:
     problem = sedated(hill(4.0), disturbances={"u": fp.Noise(1.0), "depth": WAVE, "E": Sawtooth()})
-    table, t = disturbance_table(problem, 3, 50), np.arange(50) * problem.period
+    (table, *_), t = run_tables(problem, 3, 50), np.arange(50) * problem.period
     omega = 0.2 * np.pi
     assert table.shape == (50, 5)
     assert np.allclose(table[:, 3], 2 * omega * np.cos(omega * t + 0.3))

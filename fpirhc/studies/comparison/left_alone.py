@@ -7,19 +7,11 @@ one run is shorter than a compilation.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
-import casadi as ca
-
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError
+from fpirhc.simulation.held_input import HeldInput
 from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.simulate import judged_run, simulator
-from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.layout import Expression, Layout
 from fpirhc.task.problem import Problem
 
 
@@ -35,35 +27,7 @@ def error_left_alone(problem: Problem, *, seed: int) -> Mapping[str, float]:
     if problem.foreign is not None:
         return {}
     try:
-        run = judged_run(simulator(problem, _HeldInput(), compiled=False), seed=seed)
+        run = judged_run(simulator(problem, HeldInput(), compiled=False), seed=seed)
     except FpirhcError:
         return {}
     return {} if run.stop is not None else rms_error(problem, run)
-
-
-@dataclass(frozen=True)
-class _HeldInput(Controller):
-    """The input before the run in every cycle."""
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
-
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, hold, limit, judge, running."""
-        plant, closing = problem.plant, commanding_blocks(problem)
-        response = plant.response_signal("_reference_response")
-        held = expression(ca.DM(problem.inputs_before))
-
-        def step(s: Signals) -> dict[str, Expression]:
-            return {"command_unclipped": held, "_deformed_unclipped": s._reference_response}
-
-        writes = Layout((like(plant.input, "command_unclipped"), plant.response_signal("_deformed_unclipped")))
-        named = [rename(name, response, plant.response_signal(name)) for name in ("nominal", "desired")]
-        return [
-            reference_block(problem),
-            *named,
-            Block("hold", Layout((response,)), writes, step),
-            *closing[0],
-        ], closing[1]
