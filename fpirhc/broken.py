@@ -7,6 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from fpirhc.symbolic.evaluate import unwrapped
+
 Result = TypeVar("Result")
 
 
@@ -31,5 +33,8 @@ def attempted(
         with np.errstate(all="ignore"):  # numbers that overflow show in the result
             return compute(*arguments, **named)
     except Exception as error:  # noqa: BLE001 -- whatever it is, what was computed before must not be lost
+        interruption = unwrapped(error)
+        if not isinstance(interruption, Exception):
+            raise interruption from None
         broken.append(f"{what} could not be computed ({words_of(error)}); the rest does not depend on it")
         return None

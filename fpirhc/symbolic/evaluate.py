@@ -132,7 +132,7 @@ class Evaluator:
         return entries.reshape(array.shape)
 
 
-def unwrapped(error: RuntimeError | SystemError) -> BaseException:
+def unwrapped(error: Exception) -> BaseException:
     """Return the interruption from the keyboard that CasADi wrapped, or else the error itself.
 
     A solver that Ctrl-C reaches returns with the interruption set, which Python reports as a SystemError; where CasADi itself looks

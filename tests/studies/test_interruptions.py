@@ -17,6 +17,7 @@ import pytest
 from test_scenarios import LINE
 
 import fpirhc as fp
+from fpirhc.broken import attempted
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
 from fpirhc.symbolic.evaluate import Evaluator
@@ -132,7 +133,11 @@ class _Interrupts(ca.Callback):
         return [arguments[0]]
 
 
-@pytest.mark.parametrize("asked", [lambda e: e.failure(), lambda e: e(1.0)], ids=["failure", "call"])
+@pytest.mark.parametrize(
+    "asked",
+    [lambda e: e.failure(), lambda e: e(1.0), lambda e: attempted("part", e.function, 1.0, broken=[])],
+    ids=["failure", "call", "part of a result"],
+)
 def test_an_interruption_between_two_operations_is_an_interruption(asked):
     """CasADi reports it as a RuntimeError, which looks like a solver that failed: a run would end early."""
     x, interrupts = ca.MX.sym("x"), _Interrupts()
