@@ -177,7 +177,7 @@ def of_spellings() -> Iterator[Bar]:
 def cells(problem: fp.Problem, by: dict[str, Outcome]) -> list[str]:
     """One line of the table: orders and states, then error, motion and what did not converge of every controller."""
     orders = ", ".join(
-        str(problem.plant.face.orders[problem.plant.face.names.index(n)]) for n in problem.plant.controlled_names
+        str(tuple(problem.plant.chains.values())[problem.plant.chains.index(n)]) for n in problem.plant.controlled_names
     )
     texts = []
     for outcome in by.values():

@@ -53,7 +53,7 @@ class _Trial:
     def invertible(self) -> bool:
         """Whether as many coordinates are controlled as there are inputs."""
         plant = self.plant
-        return plant.controlled is not None or len(plant.inputs) == len(plant.face.coordinates)
+        return plant.controlled is not None or len(plant.inputs) == len(plant.chains)
 
     def points(self, generator: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
         """States and inputs."""

@@ -8,7 +8,6 @@ import numpy as np
 from fpirhc.contraction.gains import predicted_factor
 from fpirhc.contraction.spectrum import Array
 from fpirhc.errors import InvalidShape
-from fpirhc.plant.motion import controlled_places
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
@@ -80,7 +79,7 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
     if model.step is not None:
         response = _differences(problem, advance, after, (later, exact, calm))
     else:
-        response = problem.truth.function(response_names(model.face), seen=True)(after, u, exact, calm)
+        response = problem.truth.function(response_names(model), seen=True)(after, u, exact, calm)
     gain = ca.Function("fpirhc_sampled_gain", [x, u, later, exact], [ca.densify(ca.jacobian(response, u))])
     command = model.inverse_function(state, r, assumed)
     jacobian = gain(x, command, command, exact) @ ca.jacobian(command, r)
@@ -98,14 +97,15 @@ def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tu
         after: its state one cycle after the command.
         held: commands of the cycles after it, parameters, no forcing.
     """
-    model, face = problem.plant, problem.plant.face
-    outputs_of = problem.truth.function(face.state.elements, seen=True)
+    model = problem.plant
+    outputs_of = problem.truth.function(model.output.elements, seen=True)
     states, entries = [after], []
-    for _ in range(1, max(face.orders)):
+    for _ in range(1, max(model.chains.values())):
         states.append(advance(states[-1], *held))
-    for name, k in zip(model.controlled_names, controlled_places(face), strict=True):
-        outputs = outputs_of(states[face.orders[k] - 1], *held)
-        entries.append(outputs[face.state.elements.index(name)] / model.sampling ** face.orders[k])
+    for name in model.controlled_names:
+        order = model.chains[name]
+        outputs = outputs_of(states[order - 1], *held)
+        entries.append(outputs[model.output.elements.index(name)] / model.sampling**order)
     return ca.vertcat(*entries)
 
 

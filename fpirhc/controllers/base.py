@@ -23,7 +23,6 @@ from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.exogenous_block import ACTED, NOW, KnownSignals
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.held_deformation import with_held_deformation
 from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measured_state
 from fpirhc.controllers.online_reference import given_signals, motion_of, own_signals, own_values, with_reference
@@ -31,7 +30,8 @@ from fpirhc.controllers.reference_states import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.given import described
-from fpirhc.plant.chain import nominal_responses
+from fpirhc.plant.chain import measured_signals, nominal_responses
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -195,7 +195,7 @@ def reference_block(problem: Problem) -> Block:
 
 def error_signal(problem: Problem, name: str) -> Signal:
     """Return a signal that holds an error of every judged coordinate."""
-    units = [problem.plant.face.coordinates[c] for c in problem.judged_names]
+    units = [followed_units(problem.plant)[c] for c in problem.judged_names]
     return vector(name, problem.judged_names, units)
 
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.form_check import check_form, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
 from fpirhc.controllers.scale_selection import plan_demand, reference_demand
@@ -27,6 +26,7 @@ from fpirhc.fields.checked import Checked, former_members, unnamed_inner
 from fpirhc.fields.given import described
 from fpirhc.horizon.cost import Cost
 from fpirhc.optimisers.base import Optimiser
+from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.latest import Latest

@@ -31,7 +31,7 @@ def check_outputs(problem: Problem, controller: _Controller) -> None:
     if plant.outputs and (late % 1 > NONE or (plant.step and late)):
         raise NotSupported(
             f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
-            f"({', '.join(plant.face.names)}): its twin moves from the state that is given with the samples, and these are late by "
+            f"({', '.join(plant.chains)}): its twin moves from the state that is given with the samples, and these are late by "
             f"{late:g} cycles; believe in whole cycles, and for a map in none"
         )
 

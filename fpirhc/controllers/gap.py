@@ -97,7 +97,7 @@ def gap_of(problem: Problem, bridged: int) -> Gap:
     """
     if not problem.sensing.estimates:
         return Gap(bridged, 0.0)
-    settling = problem.sensing.settling_cycles(problem.plant.face, problem.period)
+    settling = problem.sensing.settling_cycles(problem.plant, problem.period)
     return Gap(bridged, float(problem.longest_warm_up + settling))
 
 

@@ -25,7 +25,6 @@ from fpirhc.controllers.mirror_path import (
 from fpirhc.controllers.twin import BEFORE, twin_block, twin_of_outputs
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.queue import every
-from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, unseen
 from fpirhc.symbolic.expression import Signals
@@ -96,8 +95,8 @@ def map_mirror(path: Path, *, lost: bool = False) -> Block:
         path: of the commands to the model.
         lost: whether samples may be lost; the state of the last cycle is then on the line over the gap.
     """
-    plant, face = path.problem.plant, path.problem.plant.face
-    orders = [face.orders[k] for k in controlled_places(face)]
+    plant = path.problem.plant
+    orders = [plant.chains[name] for name in plant.controlled_names]
     start = tuple(map(float, path.problem.start_state))
     before = Signal(_BEFORE, plant.state.elements, plant.state.units, start)
     names = zip(plant.controlled_names, orders, strict=True)

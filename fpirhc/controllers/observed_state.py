@@ -19,8 +19,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.exogenous_block import KnownSignals
-from fpirhc.controllers.face import measured_signals
 from fpirhc.deformation.queue import Queue
+from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import values_of
@@ -86,9 +86,9 @@ class Believing:
 
     @cached_property
     def _estimator(self) -> Block:
-        face, sensing = self.problem.plant.face, self.problem.sensing
-        completed = Signal("_completed", sensing.estimator.measures(face))
-        block = sensing.estimator.block(face, self.problem.period, self.shown, completed)
+        plant, sensing = self.problem.plant, self.problem.sensing
+        completed = Signal("_completed", sensing.estimator.measures(plant))
+        block = sensing.estimator.block(plant, self.problem.period, self.shown, completed)
         return bridged(block) if self.lost else block
 
     def _step(self, s: Signals) -> dict[str, Expression]:
@@ -138,7 +138,7 @@ class Believing:
 
     def _estimates(self, s: Signals, seen: Mapping[str, Expression]) -> tuple[Expression, ...]:
         """State or outputs, response, and memory of the estimator."""
-        names = self.problem.sensing.estimator.measures(self.problem.plant.face)
+        names = self.problem.sensing.estimator.measures(self.problem.plant)
         completed = ca.vertcat(*(seen[n] for n in names))
         gap = [s.gap] if self.lost and GAP.name in self._estimator.reads else []
         results = self._estimator.function(completed, *gap, *(getattr(s, m) for m in self._estimator.memory.names))

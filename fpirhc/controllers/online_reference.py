@@ -1,6 +1,6 @@
 """A reference with signals of its own inside a controller's step: its block, and its motion in every cycle.
 
-It is given the face of the plant, whose coordinates are the outputs of a plant that has some.
+It is one of the outputs of a plant that has some, else of its coordinates.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ def stages_of(problem: Problem) -> int:
 
 def given_signals(problem: Problem) -> tuple[Signal, ...]:
     """Return what a controller reads from outside for the reference."""
-    return problem.reference.given(problem.plant.face, stages_of(problem))
+    return problem.reference.given(problem.plant, stages_of(problem))
 
 
 def own_signals(problem: Problem) -> tuple[Signal, ...]:
     """Return the reference's own signals, which its block writes."""
-    return problem.reference.own(problem.plant.face, stages_of(problem))
+    return problem.reference.own(problem.plant, stages_of(problem))
 
 
 def own_values(problem: Problem, s: Signals) -> list[Expression]:
@@ -37,19 +37,19 @@ def own_values(problem: Problem, s: Signals) -> list[Expression]:
 
 def motion_of(problem: Problem, ahead: float = 0.0) -> ca.Function:
     """Function (t, own signals) -> (state, response) of the reference, now or after some time."""
-    return problem.reference.motion_now(problem.plant.face, stages_of(problem), ahead)
+    return problem.reference.motion_now(problem.plant, stages_of(problem), ahead)
 
 
 def preview_of(problem: Problem) -> ca.Function | None:
     """Function (own signals) -> (states, responses) at the nodes of the horizon; None without own signals."""
     if problem.horizon is None:
         return None
-    return problem.reference.preview(problem.plant.face, problem.horizon.stages, problem.horizon.step)
+    return problem.reference.preview(problem.plant, problem.horizon.stages, problem.horizon.step)
 
 
 def with_reference(problem: Problem, blocks: Sequence[Block]) -> list[Block]:
     """Return the blocks of a controller after the reference's own block, where some of them read its signals."""
     names = {signal.name for signal in own_signals(problem)}
     read = {signal.name for block in blocks for signal in block.reads.signals}
-    own = problem.reference.block(problem.plant.face, stages_of(problem), problem.period) if names & read else None
+    own = problem.reference.block(problem.plant, stages_of(problem), problem.period) if names & read else None
     return [*([own] if own is not None else []), *blocks]

@@ -29,11 +29,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.reference_states import reference_states, response_scale
 from fpirhc.controllers.sensing_chain import given_states, raw_signal
 from fpirhc.errors import Mistakes
-from fpirhc.plant.motion import controlled_places
+from fpirhc.plant.chain import measured_signals
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.limits import Interval
@@ -66,10 +65,10 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
 @lru_cache(maxsize=8)  # every controller of a comparison has the same ones
 def _automatic(problem: Problem) -> Mapping[str, Interval]:
     """Intervals by the name of the measured quantity."""
-    plant, ranges = problem.plant.face, _behind_outputs(problem)
+    plant, ranges = problem.plant, _behind_outputs(problem)
     responses, values = _largest_responses(problem), _values(problem)
-    for k in controlled_places(plant):
-        name, order = plant.names[k], plant.orders[k]
+    for name in plant.controlled_names:
+        order = plant.chains[name]
         middle, reach = _about(values[name])
         limit = responses[plant.controlled_names.index(name)]
         for power in range(order + 1):
@@ -153,19 +152,17 @@ def _columns(problem: Problem) -> dict[str, str]:
     if raw is not None:
         return beside | dict(zip(raw.elements, raw.columns, strict=True))
     columns = beside | {e: f"{plant.output.name}.{e}" for e in plant.output.elements}
-    return columns | {
-        n: f"realised.{c}" for n, c in zip(response_names(plant.face), plant.controlled_names, strict=True)
-    }
+    return columns | {n: f"realised.{c}" for n, c in zip(response_names(plant), plant.controlled_names, strict=True)}
 
 
 def _values(problem: Problem) -> dict[str, np.ndarray]:
     """Values of every coordinate that the problem names: reference, start, and finite limits."""
-    plant, function = problem.plant.face, problem.reference.function(problem.plant)
+    plant, function = problem.plant, problem.reference.function(problem.plant)
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     reference = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full()).T
     values = {}
-    for name in plant.names:
-        at = plant.state.elements.index(name)
+    for name in plant.chains:
+        at = plant.output.elements.index(name)
         named = [*reference[:, at], problem.start_output[at], *problem.limits.states.get(name, ())]
         values[name] = np.array([v for v in named if np.isfinite(v)])
     return values

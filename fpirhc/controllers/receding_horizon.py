@@ -29,7 +29,6 @@ from fpirhc.controllers.beside_plan import (
     held_model,
 )
 from fpirhc.controllers.contract import Planner
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
 from fpirhc.controllers.online_reference import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
@@ -44,6 +43,7 @@ from fpirhc.horizon.stage_data import SCALE, STEEPEST, live_signals, offset_limi
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
+from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
@@ -137,7 +137,7 @@ def _check_states_of_plans(plant: Plant, replanning: Replanning, on_failure: OnF
     elif on_failure.uses_feedforward and not known_on_reference(plant):
         reason = f"{type(on_failure).__name__} needs references of states that no output gives; use HoldPlan"
     if reason:
-        what = ", ".join(plant.face.names)
+        what = ", ".join(plant.chains)
         raise NotSupported(
             f"RecedingHorizon does not cover outputs that are expressions of the state ({what}): {reason}"
         )
@@ -316,7 +316,7 @@ def _feedforward(problem: Problem) -> ca.Function:
     t, p = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     own = [ca.MX.sym(signal.name, signal.size) for signal in own_signals(problem)]
     state, response = motion_of(problem)(t, *own)
-    invertible = plant.controlled is not None or len(plant.inputs) == len(plant.face.names)
+    invertible = plant.controlled is not None or len(plant.inputs) == len(plant.chains)
     known = invertible and known_on_reference(plant)
     needed = feedforward(plant, state, response, p) if known else ca.MX.zeros(len(plant.inputs))
     return ca.Function("fpirhc_feedforward", [t, *own, p], [needed])

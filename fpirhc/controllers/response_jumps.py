@@ -116,8 +116,7 @@ def response_jumps(problem: Problem, reads: Layout) -> Jumps | None:
         problem: the task, with the numbers of the build.
         reads: of the step.
     """
-    raw, face = raw_signal(problem), problem.plant.face
-    names = response_names(face)
+    raw, names = raw_signal(problem), response_names(problem.plant)
     signal = reads["realised"] if raw is None and "realised" in reads else raw
     if signal is None or (raw is None and signal.size != len(names)):
         return None

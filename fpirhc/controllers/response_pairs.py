@@ -62,7 +62,7 @@ class ResponsePairs:
     def cycles(self) -> int:
         """Number of the first cycle whose pair belongs to this run: before it, samples show the start."""
         late = self.dead_time.measurement / self.problem.period
-        first = self.problem.sensing.warm_up_cycles(self.problem.plant.face, late)
+        first = self.problem.sensing.warm_up_cycles(self.problem.plant, late)
         return max(int(first), math.ceil(late - _NONE) + 1)
 
     @property
@@ -123,7 +123,7 @@ class ResponsePairs:
 
     @cached_property
     def _delay(self) -> float:
-        delay = self.problem.sensing.delay(self.problem.plant.face, self.problem.period)
+        delay = self.problem.sensing.delay(self.problem.plant, self.problem.period)
         return delay if delay > _NONE else 0.0
 
     @property

@@ -28,7 +28,7 @@ def reference_demand(problem: Problem, law: Tracking | None = None) -> Demand:
     """Return the change period max|d/dt r^N| of the nominal response r^N, or its largest jump, with the recovery for `law`."""
     t = ca.MX.sym("t")
     responses = nominal_motion(problem)(t)[1]
-    response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant.face)
+    response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant)
     smooth = problem.period * _slew(response_of, problem.duration)
     change = max(jump, _largest_change(response_of, problem)) if jump else smooth
     return Demand(change, sudden=False, recovery=_recovery(problem, law))

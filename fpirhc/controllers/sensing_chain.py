@@ -18,11 +18,11 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.controllers.observed import check_believed
 from fpirhc.controllers.observed_state import Believing
 from fpirhc.controllers.online_reference import with_reference
+from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block, Composite, bridged
@@ -92,22 +92,20 @@ def seeing_blocks(problem: Problem) -> list[Block]:
     if problem.sensing.measured is not None:
         return _estimating_part(problem, raw, start)
     plant = problem.plant
-    return with_steps_ahead(
-        plant, on_face(plant, problem.sensing.estimator.block(plant.face, problem.period, start, raw))
-    )
+    return with_steps_ahead(plant, problem.sensing.estimator.block(plant, problem.period, start, raw))
 
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return state, or outputs, and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
     plant = problem.plant
     motion = problem.start_output if plant.outputs else np.array(list(_first_states(problem).values()))
-    return motion, _first_values(problem, response_names(plant.face))
+    return motion, _first_values(problem, response_names(plant))
 
 
 def first_shown(problem: Problem) -> dict[str, float]:
     """Return what sensors without noise show at the start, by name of everything that a sensor may show."""
     plant, (motion, response) = problem.plant, first_estimates(problem)
-    names = (*plant.output.elements, *response_names(plant.face))
+    names = (*plant.output.elements, *response_names(plant))
     shown = dict(zip(names, map(float, np.concatenate([motion, response])), strict=True))
     return _first_states(problem) | shown
 
@@ -135,11 +133,11 @@ def _believing(problem: Problem) -> Believing | None:
 def _estimating_part(problem: Problem, raw: Signal, start: np.ndarray) -> list[Block]:
     """The estimator behind a block that leaves out what it does not need."""
     plant, estimator = problem.plant, problem.sensing.estimator
-    names = estimator.measures(plant.face)
+    names = estimator.measures(plant)
     places = [raw.elements.index(n) for n in names]
     needed = Signal("_needed", names)
     select = Block("select", Layout((raw,)), Layout((needed,)), lambda s: {needed.name: getattr(s, raw.name)[places]})
-    return [select, on_face(plant, estimator.block(plant.face, problem.period, start, needed))]
+    return [select, estimator.block(plant, problem.period, start, needed)]
 
 
 _MEASURED, _PAST, _COUNT = "_differences", "outputs_expected", "outputs_measured"
@@ -161,7 +159,7 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
         plant: a map, or any other plant, whose estimator then stays alone.
         estimate: writes the signal of the outputs.
     """
-    if plant.step is None or max(plant.face.orders) == 1:
+    if plant.step is None or max(plant.chains.values()) == 1:
         return [estimate]
     measured = replace(plant.output, name=_MEASURED)
 

@@ -6,7 +6,6 @@ q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the defor
 from __future__ import annotations
 
 from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
-from fpirhc.controllers.face import on_face
 from fpirhc.controllers.reference_states import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.symbolic.block import Block, Delay
@@ -26,7 +25,7 @@ def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
         reference_block(problem),
         rename("target", like(plant.output, "reference"), like(plant.output, "_target")),
         rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
-        on_face(plant, bounded(problem, tracking).law(plant.face, problem.period)),
+        bounded(problem, tracking).law(plant, problem.period),
     ]
 
 
@@ -34,5 +33,5 @@ def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformatio
     """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
     plant = problem.plant
     closing, delays = closing_blocks(problem, deformation)
-    update = on_face(plant, bounded(problem, tracking).update(plant.face, problem.period))
-    return [*desired_blocks(problem, tracking), *closing, update], [*delays, *tracking.delays(plant.face)]
+    update = bounded(problem, tracking).update(plant, problem.period)
+    return [*desired_blocks(problem, tracking), *closing, update], [*delays, *tracking.delays(plant)]

@@ -20,7 +20,6 @@ import numpy as np
 
 from fpirhc.controllers.mirror_path import MEASURED, MEASURED_OUTPUT, Path, measured_output
 from fpirhc.plant.motion import controlled_places
-from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names, values_of
 from fpirhc.symbolic.block import Block, unseen
 from fpirhc.symbolic.expression import Signals, expression, is_finite, total
@@ -125,7 +124,7 @@ class _Moves:
 
     def __init__(self, problem: Problem, names: Sequence[str], path: Path) -> None:
         plant, period = problem.plant, problem.period
-        self.state = ca.DM(drift(plant, path.fraction * period))
+        self.state = ca.DM(drift(plant.output, path.fraction * period))
         places = {e: k for k, e in enumerate(plant.state.elements)}
         rows = [np.asarray(self.state)[places[n]] if n in places else np.zeros(plant.state.size) for n in names]
         self.sample = ca.DM(np.array(rows))
@@ -141,21 +140,21 @@ def memory_moves(problem: Problem, names: Sequence[str]) -> list[ca.DM]:
         problem: with the estimator.
         names: of what it measures.
     """
-    face = problem.plant.face
-    ahead, size = drift(face, problem.period), face.state.size
+    motion = problem.plant.output
+    ahead, size = drift(motion, problem.period), motion.size
     columns = [_remembered(problem, names, unit) for unit in (np.zeros(size), *np.eye(size))]
     return [ca.DM(np.column_stack([c[k] - columns[0][k] for c in columns[1:]]) @ ahead) for k in range(len(columns[0]))]
 
 
 def _remembered(problem: Problem, names: Sequence[str], start: np.ndarray) -> list[np.ndarray]:
     """What the estimator remembers at a start, signal by signal."""
-    block = problem.sensing.estimator.block(problem.plant.face, problem.period, start, Signal("_seen", tuple(names)))
+    block = problem.sensing.estimator.block(problem.plant, problem.period, start, Signal("_seen", tuple(names)))
     return [m.start_vector() for m in block.memory.signals]
 
 
-def drift(plant: Plant, time: float) -> np.ndarray:
-    """Return the matrix by which a state moves in that time while all highest derivatives are zero: Taylor's formula."""
-    elements = plant.state.elements
+def drift(motion: Signal, time: float) -> np.ndarray:
+    """Return the matrix by which a motion goes on for that time while all highest derivatives are zero: Taylor's formula."""
+    elements = motion.elements
     drift = np.zeros((len(elements), len(elements)))
     for k, element in enumerate(elements):
         for j, other in enumerate(elements):
@@ -183,10 +182,10 @@ def twin_of_outputs(path: Path) -> Block:
         path: of the commands to the model, without a fraction of a cycle in the measurement.
     """
     problem, plant = path.problem, path.problem.plant
-    names = problem.sensing.estimator.measures(plant.face)
-    estimate = problem.sensing.estimator.block(plant.face, problem.period, problem.start_output, Signal("_seen", names))
+    names = problem.sensing.estimator.measures(plant)
+    estimate = problem.sensing.estimator.block(plant, problem.period, problem.start_output, Signal("_seen", names))
     own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
-    moves, ahead = memory_moves(problem, names), ca.DM(drift(plant.face, problem.period))
+    moves, ahead = memory_moves(problem, names), ca.DM(drift(plant.output, problem.period))
     advance, chain, shown = (
         problem.integrator.step(plant, problem.period),
         _chain(problem),

@@ -59,7 +59,7 @@ def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> 
     Args:
         plant: the model.
         outputs: see `reference_state`.
-        responses: nominal highest derivatives of the face.
+        responses: nominal highest derivatives of the outputs.
         p: parameters.
 
     Raises:
@@ -80,11 +80,11 @@ def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: f
         p: its parameters.
         rate: per unit of time.
     """
-    face, calm = plant.face, ca.DM.zeros(len(plant.names))
+    calm = ca.DM.zeros(len(plant.names))
     error = outputs - plant.output_function(x, ca.DM.zeros(plant.input.size), p, calm)
     sums = []
     for name, order in plant.response_orders.items():
-        places = [face.state.elements.index(name + "'" * k) for k in range(order)]
+        places = [plant.output.elements.index(name + "'" * k) for k in range(order)]
         sums.append(sum(math.comb(order, k) * rate ** (order - k) * error[place] for k, place in enumerate(places)))
     return ca.vertcat(*sums)
 
@@ -125,7 +125,7 @@ def nominal_motion(
 
 
 def _sizes(plant: Plant) -> dict[str, int]:
-    return {"x": plant.state.size, "outputs": plant.output.size, "r": len(plant.face.names)}
+    return {"x": plant.state.size, "outputs": plant.output.size, "r": len(plant.chains)}
 
 
 def followed_state(plant: Plant) -> ca.Function | None:

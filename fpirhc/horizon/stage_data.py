@@ -71,7 +71,7 @@ def stage_data(
     matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)
     t, of_cycle = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
     p = of_cycle if signals is None else signals(t + horizon.step / 2, of_cycle)
-    motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.face.names))] if previewed else []
+    motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.chains))] if previewed else []
     state, response = motion or reference.function(plant)(t)
     zero = matrix.zeros(plant.input.size)
     needed = feedforward(plant, state, response, p) if cost.uses_feedforward else zero

@@ -12,10 +12,11 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 
 from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression
-from fpirhc.plant.motion import controlled_places, outside_names
+from fpirhc.plant.motion import controlled_places, followed_units, outside_names
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.expression import Matrix
-from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.layout import Expression, Signal
 
 
 def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
@@ -67,6 +68,17 @@ def _chain(plant: Plant, name: str, count: int, symbols: Symbols, responses: Exp
     return chain
 
 
+def measured_signals(plant: Plant) -> tuple[Signal, ...]:
+    """Return the signals of what a controller is given of the motion: the state, and the outputs where there are any."""
+    return tuple(dict.fromkeys((plant.state, plant.output)))
+
+
+def response_units(plant: Plant) -> tuple[str, ...]:
+    """Return the units of the derivatives that end the chains of all outputs, or coordinates."""
+    units, time = followed_units(plant), plant.time_unit
+    return tuple(derivative_unit(units[name], order, time) for name, order in plant.chains.items())
+
+
 def nominal_responses(
     plant: Plant, outputs: Matrix, responses: Matrix, later: Callable[[], Matrix] | None = None
 ) -> Matrix:
@@ -75,15 +87,15 @@ def nominal_responses(
     Args:
         plant: the plant.
         outputs: nominal outputs and their derivatives, in the order of `Plant.output`; without outputs the state.
-        responses: nominal highest derivatives of the face.
+        responses: nominal highest derivatives of the outputs.
         later: gives the outputs at the end of the cycle, where one is of order 0; None: `outputs`.
     """
-    face, instant = plant.face, [name for name, order in plant.response_orders.items() if not order]
+    instant = [name for name, order in plant.response_orders.items() if not order]
     if not instant:
-        return responses[controlled_places(face)]
+        return responses[controlled_places(plant)]
     ahead = outputs if later is None else later()
     places = [plant.output.elements.index(name) if name in instant else -1 for name in plant.controlled_names]
-    entries = (responses[k] if at < 0 else ahead[at] for k, at in zip(controlled_places(face), places, strict=True))
+    entries = (responses[k] if at < 0 else ahead[at] for k, at in zip(controlled_places(plant), places, strict=True))
     return ca.vertcat(*entries)
 
 

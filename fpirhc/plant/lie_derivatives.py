@@ -5,9 +5,7 @@ The derivatives of an output are Lie derivatives along the plant's motion, with 
     y_0 = h(x, p),    y_{k+1} = dy_k/dx x'(x, u, p, w),
 
 and its relative order r is the first k for which y_k depends on an input, decided from the symbols; it is 0 where the output itself
-does. The *face* of a plant is a
-light plant whose coordinates are the outputs, y^(r) = u, with the state (y, y', ..., y^(r-1)). Reference, tracking law, judging and
-sensors take the face; inverse, response and horizon take the plant.
+does. Reference, tracking law, judging and sensors take (y, y', ..., y^(r-1)); inverse, response and horizon take the state.
 
 References:
     A. Isidori, Nonlinear Control Systems, 3rd ed., Springer 1995, ch. 4 and 5.
@@ -15,8 +13,6 @@ References:
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -29,7 +25,7 @@ from fpirhc.fields.given import described
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.maps import shifted
 from fpirhc.plant.motion import Motion, arguments_of, by_name, words
-from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.symbolic.layout import Expression
 
 _Motion = TypeVar("_Motion", bound=Motion)
 Symbols = tuple[ca.SX, ca.SX, ca.SX, ca.SX]
@@ -95,48 +91,6 @@ def output_order(plant: Motion, name: str) -> int | None:
         if ca.jacobian_sparsity(value, u).nnz():
             return order
     return None
-
-
-def light_plant(
-    plant: _Motion,
-    coordinates: Mapping[str, str],
-    order: Mapping[str, int],
-    controlled: Sequence[str],
-    inputs: Mapping[str, str] | None = None,
-) -> _Motion:
-    """Return the plant y^(r) = u of some quantities, each controlled one with an input of its own.
-
-    Args:
-        plant: of which they are.
-        coordinates: name -> unit.
-        order: name -> relative order.
-        controlled: as many names as there are inputs.
-        inputs: name -> unit of those that act; None: all inputs of the plant, in their order.
-    """
-    acting = dict(plant.inputs if inputs is None else inputs)
-    by_name = dict(zip(controlled, acting, strict=True))
-
-    def response(*arguments: Named) -> dict[str, Expression]:
-        u = arguments[-2]
-        return {name: u[by_name[name]] if name in by_name else ca.SX(0) for name in coordinates}
-
-    names = [f"d{k}" for k in range(max(order.values()))] + ["u", "p"]
-    kind = inspect.Parameter.POSITIONAL_ONLY
-    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
-    return replace(
-        plant,
-        coordinates=dict(coordinates),
-        inputs=acting,
-        parameters={},
-        response=response,
-        order=dict(order),
-        controlled=tuple(controlled),
-        inverse=None,
-        ranges={},
-        outputs={},
-        algebraic=None,
-        next=None,
-    )
 
 
 def check_outputs(plant: Motion, mistakes: Mistakes) -> None:

@@ -67,13 +67,13 @@ class Motion(Checked):
     @cached_property
     def state(self) -> Signal:
         """The state vector's signal: q, q', ... below the highest derivative."""
-        names, units = [], []
-        for k in range(max(self.orders, default=0)):
-            for c, r in zip(self.names, self.orders, strict=True):
-                if r > k:
-                    names.append(c + "'" * k)
-                    units.append(derivative_unit(self.coordinates[c], k, self.time_unit))
-        return vector("state", names, units)
+        return self._derivatives("state", self.coordinates, dict(zip(self.names, self.orders, strict=True)))
+
+    def _derivatives(self, name: str, units: Mapping[str, str], orders: Mapping[str, int]) -> Signal:
+        """Signal of some quantities and their derivatives below each order, derivative-major."""
+        entries = [(n, k) for k in range(max(orders.values(), default=0)) for n, order in orders.items() if order > k]
+        own = [derivative_unit(units[n], k, self.time_unit) for n, k in entries]
+        return vector(name, [n + "'" * k for n, k in entries], own)
 
     @cached_property
     def input(self) -> Signal:
@@ -230,14 +230,20 @@ def followed(motion: Motion) -> str:
     return "output" if motion.outputs else "coordinate"
 
 
+def followed_units(motion: Motion) -> dict[str, str]:
+    """Return name -> unit of what may follow a reference: the outputs, or without any the coordinates."""
+    return {name: one.unit for name, one in motion.outputs.items()} or dict(motion.coordinates)
+
+
 def outside_names(motion: Motion) -> tuple[str, ...]:
     """Return the names of the parameters that are signals from outside."""
     return tuple(name for name, one in motion.parameters.items() if one.outside)
 
 
 def controlled_places(motion: Motion) -> list[int]:
-    """Return the places of the controlled coordinates among all coordinates; of outputs those of the face."""
-    return [motion.names.index(c) for c in motion.controlled_names]
+    """Return the places of the controlled quantities among all outputs, or without any among all coordinates."""
+    names = list(followed_units(motion))
+    return [names.index(c) for c in motion.controlled_names]
 
 
 def places(motion: Motion, derivative: int) -> list[int]:

@@ -15,7 +15,7 @@ themselves are not converted anywhere.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -28,13 +28,12 @@ from fpirhc.plant.lie_derivatives import (
     believed_disturbance,
     check_outputs,
     lie_derivatives,
-    light_plant,
     output_expression,
     output_order,
     structural_order,
 )
 from fpirhc.plant.maps import Differences, check_map
-from fpirhc.plant.motion import Motion, controlled_places
+from fpirhc.plant.motion import Motion, controlled_places, followed_units
 from fpirhc.plant.output import Output
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
@@ -194,14 +193,9 @@ class Plant(Motion):
         return _plant_table(self)
 
     @cached_property
-    def face(self) -> Plant:
-        """The plant as reference, tracking law, judging and sensors take it: its coordinates are the outputs; else itself."""
-        if not self.outputs:
-            return self
-        units = {name: one.unit for name, one in self.outputs.items()}
-        face = light_plant(self, units, {n: max(r, 1) for n, r in self.output_orders.items()}, self.controlled_names)
-        vars(face)["output_orders"] = self.output_orders  # a light plant has no expressions to find them from
-        return face
+    def chains(self) -> dict[str, int]:
+        """Length of the chain y, y', ... of every output, or coordinate, in `output`: its relative order, at least one."""
+        return {name: max(order, 1) for name, order in self.output_orders.items()}
 
     @cached_property
     def output_orders(self) -> dict[str, int]:
@@ -221,17 +215,17 @@ class Plant(Motion):
 
     @cached_property
     def output(self) -> Signal:
-        """The signal of what is measured of the face: the state without outputs, else y, y', ... below each relative order."""
-        return replace(self.face.state, name="output") if self.outputs else self.state
+        """The signal of what follows a reference: the state without outputs, else y, y', ... below each relative order."""
+        return self._derivatives("output", followed_units(self), self.chains) if self.outputs else self.state
 
     @cached_property
     def output_function(self) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> y, y', ... of the face; without outputs the state."""
+        """Function (state, input, parameters, forcing) -> y, y', ... of the outputs; without outputs the state."""
         x, u, p = self.symbols()
         w = ca.SX.sym("w", len(self.names))
         chains = {
             name: lie_derivatives(self, output_expression(self, name, x, u, p), order, (x, u, p, w))
-            for name, order in zip(self.face.names, self.face.orders, strict=True)
+            for name, order in self.chains.items()
             if self.outputs
         }
         entries = [chains[e.rstrip("'")][e.count("'")] for e in self.output.elements] if self.outputs else [x]
@@ -255,8 +249,8 @@ class Plant(Motion):
 
     @cached_property
     def _controlled_units(self) -> tuple[str, ...]:
-        face, unit = self.face.coordinates, self.time_unit
-        return tuple([derivative_unit(face[n], order, unit) for n, order in self.response_orders.items()])
+        units, time = followed_units(self), self.time_unit
+        return tuple([derivative_unit(units[n], order, time) for n, order in self.response_orders.items()])
 
     @cached_property
     def controlled_response_function(self) -> ca.Function:

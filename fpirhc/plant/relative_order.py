@@ -17,6 +17,7 @@ import casadi as ca
 
 from fpirhc.errors import InvalidName, NotInvertible, NotSupported, nearest
 from fpirhc.plant.lie_derivatives import output_expression, structural_order
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.units import derivative_unit
 
@@ -64,7 +65,7 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
     if plant.step is not None:
         raise NotSupported(
             "output_chain differentiates with respect to time, which a map does not have; write an output, whose differences and "
-            "order are those of `Plant.face` and `Plant.output_function`"
+            "order are those of `Plant.output_orders` and `Plant.output_function`"
         )
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
@@ -94,7 +95,7 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
 
 
 def _input(plant: Plant, coordinate: str, name: str | None) -> str:
-    followed = plant.face.coordinates
+    followed = followed_units(plant)
     if coordinate not in followed:
         raise InvalidName(f"coordinate '{coordinate}' is unknown.{nearest(coordinate, followed)}")
     if name is None:
@@ -115,7 +116,7 @@ def _chain(
     symbols: tuple[ca.SX, ca.SX, ca.SX, ca.SX],
 ) -> OutputChain:
     x, u, p, w = symbols
-    place, unit = plant.input.elements.index(name), plant.face.coordinates[coordinate]
+    place, unit = plant.input.elements.index(name), followed_units(plant)[coordinate]
     # A model gives y ... y^(r-1) and the gain without disturbances.
     undisturbed = [ca.densify(ca.substitute(v, w, ca.SX.zeros(*w.shape))) for v in (ca.vertcat(*derivatives), response)]
     gain = ca.densify(ca.jacobian(undisturbed[1], u[place]))

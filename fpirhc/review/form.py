@@ -19,7 +19,7 @@ LATE = 1.0  # cycles of an estimator's delay, beyond which what the model is wro
 
 def recommended_form(problem: Problem) -> tuple[str, str]:
     """Return the form that the measurements of docs/which-form.md speak for, and why."""
-    delay = problem.sensing.delay(problem.plant.face, problem.period)
+    delay = problem.sensing.delay(problem.plant, problem.period)
     waits = bool(problem.dead_time.measurement or any(problem.dead_time.inputs.values()))
     if delay > LATE:
         why = f"the response is estimated {delay:.3g} cycles late"

@@ -96,8 +96,8 @@ def _deviations(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarr
 def _of_sensors(problem: Problem) -> dict[str, float]:
     """Deviation of the noise of the sensors that measure responses."""
     plant, sensing = problem.plant, problem.sensing
-    measured = dict(zip(response_names(plant.face), plant.controlled_names, strict=True))
-    if sensing.sensors and not set(measured) & set(sensing.measures(plant.face)):
+    measured = dict(zip(response_names(plant), plant.controlled_names, strict=True))
+    if sensing.sensors and not set(measured) & set(sensing.measures(plant)):
         raise NotSupported(
             f"suggest: the response is estimated by {type(sensing.estimator).__name__}, whose noise is not white; give "
             "noise={coordinate: standard deviation of the estimated response}"

@@ -88,7 +88,7 @@ def output_plan_gains(
         shifted_reference(plant, ocp.data, ocp.stages + 1),
     )
     sweep = (linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp), *_slopes_by_data(ocp))
-    reference, controlled = problem.reference.function(plant), controlled_places(plant.face)
+    reference, controlled = problem.reference.function(plant), controlled_places(plant)
     start_at = _starts(plant) if consistent else None
     gains = []
     for time, state in zip(times, states, strict=True):

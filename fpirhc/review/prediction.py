@@ -201,6 +201,6 @@ def _check(problem: Problem, controller: Controller) -> None:
     if problem.signals:
         raise NotSupported("no prediction with signals from outside, which change along the run; simulate it")
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-    if late or problem.sensing.delay(problem.plant.face, problem.period):
+    if late or problem.sensing.delay(problem.plant, problem.period):
         what = "dead time" if late else "an estimated response"
         raise NotSupported(f"no prediction with {what}: the response must belong to the last request")

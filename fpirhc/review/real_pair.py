@@ -107,7 +107,7 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     x, u, p = plant.symbols()
     calm = ca.SX.zeros(len(plant.names))
     rate = plant.derivative_function(x, u, p)
-    response = reality.function(response_names(model.face))(x, u, p, calm)
+    response = reality.function(response_names(model))(x, u, p, calm)
     slopes = [ca.densify(ca.jacobian(v, w)) for v in (rate, response) for w in (x, u)]
     values = ca.Function("fpirhc_modes", [x, u, p], slopes)(point.real, point.command, plant.exact)
     a, b, c, d = (np.asarray(m.full()) for m in values)
@@ -129,7 +129,7 @@ def _settling(problem: Problem, free: list[int]) -> Settling:
     x, u, p = plant.symbols()
     calm = ca.SX.zeros(len(plant.names))
     wanted = ca.SX.sym("wanted", len(model.controlled_names))
-    response = reality.function(response_names(model.face))(x, u, p, calm)
+    response = reality.function(response_names(model))(x, u, p, calm)
     rate = plant.derivative_function(x, u, p)
     # One by one: an empty selection of a column with one entry is that entry.
     residual = ca.vertcat(*(rate[k] for k in free), response - wanted)

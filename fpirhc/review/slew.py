@@ -62,7 +62,7 @@ def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
     states = grid.states_at(times).T
     responses = np.asarray(problem.reference.function(plant).map(_POINTS)(times[None, :])[1].full())
     exact, model = (np.repeat(p[:, None], _POINTS, axis=1) for p in (plant.exact, believed))
-    commands = plant.inverse_function.map(_POINTS)(states, responses[controlled_places(plant.face)], exact)
+    commands = plant.inverse_function.map(_POINTS)(states, responses[controlled_places(plant)], exact)
     requests = np.asarray(plant.controlled_response_function.map(_POINTS)(states, commands, model).full())
     speeds = np.linalg.norm(np.diff(requests, axis=1), axis=0) / (times[1] - times[0])
     return float(speeds[np.isfinite(speeds)].max(initial=0.0))
@@ -110,8 +110,8 @@ def effect(grid: ReviewGrid, name: str) -> float:
 
 def _effect_of_state(grid: ReviewGrid, name: str) -> float:
     """Change of the outputs' responses by one unit that adds to the rate of a state, at the start of the reference."""
-    plant, face = grid.problem.plant, grid.problem.plant.face
-    orders = dict(zip(face.names, face.orders, strict=True))
+    plant = grid.problem.plant
+    orders = plant.chains
     function = derivatives_function(plant, [(n, orders[n]) for n in plant.controlled_names])
     at = grid.states[0], np.nan_to_num(grid.commands[0, 0]), plant.exact
     unit = np.array([1.0 if n == name else 0.0 for n in plant.names])

@@ -8,7 +8,6 @@ from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation
-from fpirhc.plant.motion import controlled_places
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.forms import INCREMENT, REFERENCED, forms_of
 from fpirhc.review.grid import ReviewGrid
@@ -95,8 +94,8 @@ def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer
 
 def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
     """Return rate and number of poles of the tracking law for the most demanding coordinate; None where there is no such law."""
-    law, plant = tracking_law(controller), grid.problem.plant.face
-    laws = [law.feedback(plant.orders[k]) for k in controlled_places(plant)] if law else []
+    law, plant = tracking_law(controller), grid.problem.plant
+    laws = [law.feedback(plant.chains[n]) for n in plant.controlled_names] if law else []
     known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]
     return max(known, key=lambda pair: pair[1]) if known else None
 

@@ -51,7 +51,7 @@ class DerivativeEstimator(Checked, ABC):
 
     def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
         """State elements that follow from these measured quantities alone; by default those among them."""
-        return tuple(e for e in plant.state.elements if e in measured)
+        return tuple(e for e in plant.output.elements if e in measured)
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured quantities that the response follows from; by default all."""
@@ -99,7 +99,7 @@ class DerivativeEstimator(Checked, ABC):
 
 def known_by_positions(plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
     """State elements of the coordinates that are measured: their derivatives are estimated."""
-    return tuple(e for e in plant.state.elements if e.rstrip("'") in measured)
+    return tuple(e for e in plant.output.elements if e.rstrip("'") in measured)
 
 
 def response_names(plant: Plant) -> tuple[str, ...]:
@@ -109,7 +109,7 @@ def response_names(plant: Plant) -> tuple[str, ...]:
 
 def quantities(plant: Plant) -> tuple[str, ...]:
     """Names of all that a sensor may show: states, outputs and their derivatives, and the highest ones of controlled quantities."""
-    return tuple(dict.fromkeys((*plant.state.elements, *plant.face.state.elements, *response_names(plant.face))))
+    return tuple(dict.fromkeys((*plant.state.elements, *plant.output.elements, *response_names(plant))))
 
 
 def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:
@@ -118,7 +118,7 @@ def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:
     named = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
     outputs = ca.vertsplit(plant.output_function(x, u, p, np.zeros(len(plant.names))))
     named = {**dict(zip(plant.output.elements, outputs, strict=True)), **named}
-    return {**named, **dict(zip(response_names(plant.face), responses, strict=True))}
+    return {**named, **dict(zip(response_names(plant), responses, strict=True))}
 
 
 def names_of_responses(plant: Plant, signal: Signal) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ class Measured(DerivativeEstimator):
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """The whole state and every controlled coordinate's highest derivative; an output of order 0 is both, and measured once."""
-        return tuple(dict.fromkeys(plant.state.elements + response_names(plant)))
+        return tuple(dict.fromkeys(plant.output.elements + response_names(plant)))
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
         """The highest derivatives."""
@@ -38,9 +38,9 @@ class Measured(DerivativeEstimator):
 
         def step(s: Signals) -> dict[str, Expression]:
             both = getattr(s, seen.name)
-            return {"state": both[: plant.state.size], "realised": both[responses]}
+            return {plant.output.name: both[: plant.output.size], "realised": both[responses]}
 
-        return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step)
+        return Block("estimate", Layout((seen,)), Layout((plant.output, realised)), step)
 
     @property
     def shows_response(self) -> bool:

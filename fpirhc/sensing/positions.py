@@ -43,7 +43,7 @@ class _Finite(DerivativeEstimator):
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """The coordinates themselves."""
-        return plant.names
+        return tuple(plant.chains)
 
     def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
         """Measured coordinates and their derivatives."""
@@ -74,7 +74,7 @@ class _Finite(DerivativeEstimator):
         return self._block(plant, period, start, seen, lost=False)
 
     def _block(self, plant: Plant, period: float, start: Array, seen: Signal, *, lost: bool) -> Block:
-        rows = [self.coefficients(r) / period ** np.arange(r + 1)[:, None] for r in plant.orders]
+        rows = [self.coefficients(r) / period ** np.arange(r + 1)[:, None] for r in plant.chains.values()]
         queue = _queue(plant, period, start, [row.shape[1] - 1 for row in rows])
         realised = plant.response_signal("realised")
 
@@ -83,21 +83,21 @@ class _Finite(DerivativeEstimator):
             known: dict[str, Expression] = {}
             past_next: list[Expression] = []
             responses: list[Expression] = []
-            for k, (name, row) in enumerate(zip(plant.names, rows, strict=True)):
+            for k, ((name, order), row) in enumerate(zip(plant.chains.items(), rows, strict=True)):
                 count = row.shape[1] - 1
                 older = [past[at + i] for i in range(count)]
-                samples = [newest[k], *(_moved(older, newest[k], plant.orders[k], s.gap) if lost else older)]
+                samples = [newest[k], *(_moved(older, newest[k], order, s.gap) if lost else older)]
                 at += count
                 past_next += samples[:count]
-                known |= {name + "'" * d: combine(row[d], samples) for d in range(plant.orders[k])}
+                known |= {name + "'" * d: combine(row[d], samples) for d in range(order)}
                 responses.append(combine(row[-1], samples))
-            state = ca.vertcat(*(known[e] for e in plant.state.elements))
+            state = ca.vertcat(*(known[e] for e in plant.output.elements))
             realised = ca.vertcat(*(responses[k] for k in controlled_places(plant)))
-            return {"state": state, "realised": realised, "estimate_past_next": ca.vertcat(*past_next)}
+            return {plant.output.name: state, "realised": realised, "estimate_past_next": ca.vertcat(*past_next)}
 
         reads, writes, memory = (
             Layout((seen, GAP) if lost else (seen,)),
-            Layout((plant.state, realised)),
+            Layout((plant.output, realised)),
             Layout((queue,)),
         )
         if lost:
@@ -118,7 +118,7 @@ def _waiting(plant: Plant, rows: Sequence[Array], memory: Layout) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         past, at, past_next = s.estimate_past, 0, list[Expression]()
-        for row, order in zip(rows, plant.orders, strict=True):
+        for row, order in zip(rows, plant.chains.values(), strict=True):
             count = row.shape[1] - 1
             older = [past[at + i] for i in range(count)]
             at += count
@@ -131,8 +131,8 @@ def _waiting(plant: Plant, rows: Sequence[Array], memory: Layout) -> Block:
 def _queue(plant: Plant, period: float, start: Array, counts: list[int]) -> Signal:
     """Past positions of every coordinate, newest first, filled with y(-iT) = sum_s y^(s)(0) (-iT)^s / s!."""
     names, values = [], []
-    for name, order, count in zip(plant.names, plant.orders, counts, strict=True):
-        first = [start[plant.state.elements.index(name + "'" * s)] / math.factorial(s) for s in range(order)]
+    for (name, order), count in zip(plant.chains.items(), counts, strict=True):
+        first = [start[plant.output.elements.index(name + "'" * s)] / math.factorial(s) for s in range(order)]
         names += [f"{name}@{i}" for i in range(1, count + 1)]
         values += [float(sum(c * (-i * period) ** s for s, c in enumerate(first))) for i in range(1, count + 1)]
     return Signal("estimate_past", tuple(names), start=tuple(values))
@@ -236,7 +236,7 @@ class SavitzkyGolay(_Finite):
         Raises:
             InvalidValue: a degree below the plant's order.
         """
-        highest = max(plant.orders)
+        highest = max(plant.chains.values())
         if self.degree < highest:
             raise InvalidValue(
                 f"SavitzkyGolay(degree={self.degree}): the response is a derivative of order {highest}, which a polynomial of "

@@ -24,7 +24,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.motion import controlled_places
+from fpirhc.plant.chain import response_units
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, quantities, response_names
 from fpirhc.sensing.measured import Measured
@@ -58,7 +58,7 @@ def uncovered(
         measured: names of all measured quantities.
         observer: how other states are believed.
     """
-    missing = [n for n in estimator.measures(plant.face) if n not in measured]
+    missing = [n for n in estimator.measures(plant) if n not in measured]
     if named is not None and not measured:
         yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
     elif observer is not None and named is None and not plant.outputs:
@@ -125,13 +125,13 @@ class Sensing(Checked):
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured quantities: states, outputs, and highest derivatives of controlled ones."""
         if self.measured is None:
-            return self.estimator.measures(plant.face)
+            return self.estimator.measures(plant)
         return tuple(n for n in quantities(plant) if n in self.measured)
 
     def known(self, plant: Plant) -> tuple[str, ...]:
         """State elements that follow from what is measured; a measured output determines no state by itself."""
         measures, elements = self.measures(plant), plant.state.elements
-        shown = self.estimator.known(plant.face, measures)
+        shown = self.estimator.known(plant, measures)
         if not plant.outputs:
             return shown
         pairs = zip(elements, plant.known_by_outputs, strict=True)
@@ -144,7 +144,7 @@ class Sensing(Checked):
 
     def believed_response(self, plant: Plant) -> tuple[str, ...]:
         """Quantities that the response follows from and no sensor shows."""
-        return tuple(n for n in self.estimator.answers(plant.face) if n not in self.measures(plant))
+        return tuple(n for n in self.estimator.answers(plant) if n not in self.measures(plant))
 
     def check(self, plant: Plant) -> None:
         """Raise if a sensor's quantity is unknown or not measured, or the estimator cannot serve the plant.
@@ -163,10 +163,7 @@ class Sensing(Checked):
         mistakes.unknown("measured: quantity", self.measured or (), every)
         for mistake in uncovered(plant, self.estimator, self.measured, measures, self.observer):
             mistakes.add(mistake)
-        parts = (
-            lambda: self.estimator.check(plant.face),
-            lambda: self.observer and self.observer.check(plant, measures),
-        )
+        parts = (lambda: self.estimator.check(plant), lambda: self.observer and self.observer.check(plant, measures))
         for part in parts:
             try:
                 part()
@@ -176,17 +173,17 @@ class Sensing(Checked):
 
     def delay(self, plant: Plant, period: float) -> float:
         """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""
-        return max(self.estimator.delay(plant.orders[k], period) for k in controlled_places(plant))
+        return max(self.estimator.delay(plant.chains[name], period) for name in plant.controlled_names)
 
     def warm_up_cycles(self, plant: Plant, late: float) -> float:
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""
         if self.estimator.measures_all:
             return 1
-        return ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in controlled_places(plant))
+        return ceil(late) + max(self.estimator.fills(plant.chains[name]) for name in plant.controlled_names)
 
     def settling_cycles(self, plant: Plant, period: float) -> int:
         """Number of further cycles after a long gap until estimates are those of later samples alone."""
-        return max((self.estimator.settles(plant.orders[k], period) for k in controlled_places(plant)), default=0)
+        return max((self.estimator.settles(plant.chains[name], period) for name in plant.controlled_names), default=0)
 
     @property
     def drawn(self) -> tuple[Signal, ...]:
@@ -250,7 +247,7 @@ class Sensing(Checked):
 
     def _sensor_block(self, plant: Plant, true: Sequence[Signal], measured: Signal, first: Array) -> Block:
         """Block (true motion, true response, random series) -> measured quantities."""
-        every = [e for signal in true[:-1] for e in signal.elements] + list(response_names(plant.face))
+        every = [e for signal in true[:-1] for e in signal.elements] + list(response_names(plant))
         columns, drawn = self._columns(), self.drawn
         lossy = [n for n in measured.elements if f"{n} lost" in columns]
         starts = [float(first[measured.elements.index(n)]) for n in lossy]
@@ -276,5 +273,4 @@ def _unit(plant: Plant, name: str) -> str:
     for signal in (plant.state, plant.output):
         if name in signal.elements:
             return signal.entry_units[signal.elements.index(name)]
-    face = plant.face
-    return face.response_units[face.names.index(name.rstrip("'"))]
+    return dict(zip(plant.chains, response_units(plant), strict=True))[name.rstrip("'")]

@@ -58,7 +58,7 @@ class StateVariableFilter(DerivativeEstimator):
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """The coordinates themselves."""
-        return plant.names
+        return tuple(plant.chains)
 
     def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
         """Measured coordinates and their derivatives."""
@@ -114,12 +114,12 @@ class StateVariableFilter(DerivativeEstimator):
             chains = self._chains(plant, period, positions, *before)
             known: dict[str, Expression] = {}
             responses: list[Expression] = []
-            for name, order, chain in zip(plant.names, plant.orders, chains, strict=True):
+            for (name, order), chain in zip(plant.chains.items(), chains, strict=True):
                 known[name] = chain[0]
                 known |= {name + "'" * d: self._derivative(chain, order, d) for d in range(1, order)}
                 responses.append(self._derivative(chain, order, order))
             return {
-                "state": ca.vertcat(*(known[e] for e in plant.state.elements)),
+                plant.output.name: ca.vertcat(*(known[e] for e in plant.output.elements)),
                 "realised": ca.vertcat(*(responses[k] for k in controlled_places(plant))),
                 **_remembered(chains, memory),
                 **{f"{m.name}_next": expression(ca.DM.zeros(m.size)) for m in powers},
@@ -127,7 +127,7 @@ class StateVariableFilter(DerivativeEstimator):
 
         reads, writes = (
             Layout((seen, GAP) if lost else (seen,)),
-            Layout((plant.state, plant.response_signal("realised"))),
+            Layout((plant.output, plant.response_signal("realised"))),
         )
         own = Layout((*memory, *powers))
         if lost:
@@ -142,7 +142,7 @@ class StateVariableFilter(DerivativeEstimator):
         """Position and low-passes of every coordinate, one cycle later."""
         keep, new = self._coefficients(period)
         chains, at = [], 0
-        for position, order in zip(positions, plant.orders, strict=True):
+        for position, order in zip(positions, plant.chains.values(), strict=True):
             chain = [position]
             for j in range(order):
                 chain.append(keep * stages[at] + new * (chain[j] + inputs[at]))
@@ -156,7 +156,7 @@ class StateVariableFilter(DerivativeEstimator):
         Such a polynomial has the derivatives (1 + D / w)^n D_s = sum_j C(n, j) D_{s+j} / w^j, those beyond D_n being zero.
         """
         positions, at = [], 0
-        for order in plant.orders:
+        for order in plant.chains.values():
             chain = [inputs[at], *(stages[at + j] for j in range(order))]
             seen = [self._derivative(chain, order, d) for d in range(1, order + 1)]
             positions.append(chain[0])
@@ -177,8 +177,10 @@ class StateVariableFilter(DerivativeEstimator):
     ) -> list[Expression]:
         """Memory of the last cycle, had the positions gone on to now: what the filter answers to a power of the time is added."""
         expected = self._ahead(plant, period, *before)
-        away = ca.vertcat(*(y - h for y, h, n in zip(positions, expected, plant.orders, strict=True) for _ in range(n)))
-        now = ca.vertcat(*((gap + 1) ** n for n in plant.orders for _ in range(n)))
+        away = ca.vertcat(
+            *(y - h for y, h, n in zip(positions, expected, plant.chains.values(), strict=True) for _ in range(n))
+        )
+        now = ca.vertcat(*((gap + 1) ** n for n in plant.chains.values() for _ in range(n)))
         share = [ca.if_else(is_long(gap), 1, one / now) for one in powers]
         return [value + w * away for value, w in zip(before, share, strict=True)]
 
@@ -188,7 +190,7 @@ class StateVariableFilter(DerivativeEstimator):
         def step(s: Signals) -> dict[str, Expression]:
             filtered = s.filter_stages, s.filter_inputs
             later = _remembered(self._chains(plant, period, self._ahead(plant, period, *filtered), *filtered), memory)
-            power = [(s.gap + 1) ** n for n in plant.orders]
+            power = [(s.gap + 1) ** n for n in plant.chains.values()]
             rising = self._chains(plant, period, power, s.filter_stages_of_power, s.filter_inputs_of_power)
             later |= _remembered(rising, powers)
             return {k: ca.if_else(is_long(s.gap), getattr(s, k.removesuffix("_next")), v) for k, v in later.items()}
@@ -207,9 +209,9 @@ class StateVariableFilter(DerivativeEstimator):
     def _memory(self, plant: Plant, period: float, start: Array, kind: str) -> Signal:
         """The stages (or their inputs) one cycle before the first one; stage j is late by j / w."""
         names, values = [], []
-        for name, order in zip(plant.names, plant.orders, strict=True):
-            place = start[plant.state.elements.index(name)]
-            speed = start[plant.state.elements.index(name + "'")] if order > 1 else 0.0
+        for name, order in plant.chains.items():
+            place = start[plant.output.elements.index(name)]
+            speed = start[plant.output.elements.index(name + "'")] if order > 1 else 0.0
             late = 1 if kind == _STAGES else 0
             names += [f"{name}@{j + 1}" for j in range(order)]
             values += [float(place - speed * (period + (j + late) / self.bandwidth)) for j in range(order)]

@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator
 from fpirhc.symbolic.block import Block
@@ -33,7 +32,7 @@ class VelocityDifference(DerivativeEstimator):
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """The whole state."""
-        return plant.state.elements
+        return plant.output.elements
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
         """The highest derivatives of the controlled coordinates among the states."""
@@ -88,7 +87,7 @@ class LowPassDifference(DerivativeEstimator):
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """The whole state."""
-        return plant.state.elements
+        return plant.output.elements
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
         """The highest derivatives of the controlled coordinates among the states."""
@@ -117,14 +116,14 @@ class LowPassDifference(DerivativeEstimator):
 
 
 def _highest(plant: Plant) -> tuple[str, ...]:
-    return tuple(plant.names[k] + "'" * (plant.orders[k] - 1) for k in controlled_places(plant))
+    return tuple(name + "'" * (plant.chains[name] - 1) for name in plant.controlled_names)
 
 
 def _difference_block(
     plant: Plant, period: float, start: Array, seen: Signal, pole: float, *, lost: bool = False
 ) -> Block:
     """Block (state) -> (state, p f + (1 - p) difference over the period); over a gap the difference is the mean one."""
-    places = [plant.state.elements.index(e) for e in _highest(plant)]
+    places = [plant.output.elements.index(e) for e in _highest(plant)]
     before = Signal("estimate_before", tuple(seen.elements[p] for p in places), start=tuple(map(float, start[places])))
     realised, smooth = plant.response_signal("realised"), Signal("estimate_smooth", plant.controlled_names)
     memory = (before, smooth, scalar("estimate_cycles")) if pole else (before,)
@@ -135,7 +134,7 @@ def _difference_block(
         if lost:
             before = straightened(before, newest, s.gap)
         response = (newest - before) / period
-        results = {"state": state, "realised": response, "estimate_before_next": newest}
+        results = {plant.output.name: state, "realised": response, "estimate_before_next": newest}
         if not pole:
             return results
         smooth, cycles = s.estimate_smooth, s.estimate_cycles
@@ -147,7 +146,7 @@ def _difference_block(
         cycles_next = ca.fmin(cycles + 1, 2)
         return {**results, "realised": response, "estimate_smooth_next": response, "estimate_cycles_next": cycles_next}
 
-    writes, own = Layout((plant.state, realised)), Layout(memory)
+    writes, own = Layout((plant.output, realised)), Layout(memory)
     if lost:
         return Block("estimate", Layout((seen, GAP)), writes, step, own)
     return Block(

@@ -28,7 +28,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.fields.checked import checked_call
-from fpirhc.plant.motion import controlled_places
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.units import derivative_unit, with_space
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
@@ -108,29 +108,26 @@ def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> Lyapuno
 
 def _unit(problem: Problem) -> str:
     """Unit of S = (d/dt + rate)^n e_int, that of a derivative of order n - 1; empty where coordinates have several."""
-    plant, time = problem.plant.face, problem.time_unit
-    units = {
-        derivative_unit(plant.coordinates[n], plant.orders[plant.names.index(n)] - 1, time)
-        for n in plant.controlled_names
-    }
+    plant, time, own = problem.plant, problem.time_unit, followed_units(problem.plant)
+    units = {derivative_unit(own[n], plant.chains[n] - 1, time) for n in plant.controlled_names}
     return units.pop() if len(units) == 1 else ""
 
 
 def _feedbacks(problem: Problem, controller: Controller) -> list[Feedback]:
     """The law's feedback for every controlled coordinate; empty without a law, and for a law without constant gains."""
-    law, plant = tracking_law(controller), problem.plant.face
-    feedbacks = [law.feedback(plant.orders[k]) for k in controlled_places(plant)] if law is not None else []
+    law, plant = tracking_law(controller), problem.plant
+    feedbacks = [law.feedback(plant.chains[n]) for n in plant.controlled_names] if law is not None else []
     return [one for one in feedbacks if one is not None] if None not in feedbacks else []
 
 
 def _signals(problem: Problem, laws: Sequence[Feedback], rate: float, run: Run) -> tuple[np.ndarray, np.ndarray]:
     """S and h. The logged feedback is rate S plus the terms of S' below the highest derivative."""
-    plant, seen = problem.plant.face, problem.plant.output.name
+    plant, seen = problem.plant, problem.plant.output.name
     errors, feedback = run["reference"] - run[seen], run["desired"] - run["nominal"]
     surface = []
-    for k, (index, law) in enumerate(zip(controlled_places(plant), laws, strict=True)):
-        name, order, degree = plant.names[index], plant.orders[index], len(law.gains) - 1
-        chain = [errors[:, plant.state.elements.index(name + "'" * s)] for s in range(order)]
+    for k, (name, law) in enumerate(zip(plant.controlled_names, laws, strict=True)):
+        order, degree = plant.chains[name], len(law.gains) - 1
+        chain = [errors[:, plant.output.elements.index(name + "'" * s)] for s in range(order)]
         rising = chain if law.integral else chain[1:]
         drift = sum(math.comb(degree, s) * rate ** (degree - s) * e for s, e in enumerate(rising))
         surface.append((feedback[:, k] - drift) / rate)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, fed
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.gap import across_gaps, gap_of
 from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.live_settings import LiveSettings
@@ -23,6 +22,7 @@ from fpirhc.controllers.sensing_chain import compose_seeing, given_states, raw_s
 from fpirhc.controllers.step_outcome import was_skipped
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported
+from fpirhc.plant.chain import measured_signals
 from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
 from fpirhc.symbolic.block import Block, Composite, compose
@@ -138,7 +138,7 @@ def measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
         return (*(e for signal in given_states(problem) for e in signal.elements), *raw.elements)
     responses = plant.response_signal("realised") if own is None else own.signal
     motions = (e for signal in measured_signals(plant) for e in signal.elements)
-    return (*motions, *names_of_responses(plant.face, responses))
+    return (*motions, *names_of_responses(plant, responses))
 
 
 def refuse_unbounded(controller: Controller) -> None:

@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Response, error_signal, like, rename
-from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.online_reference import own_signals
 from fpirhc.controllers.sensing_chain import first_estimates, first_shown
+from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import backward_difference, combine, response_names
 from fpirhc.simulation.exogenous_blocks import real_name
@@ -75,7 +75,7 @@ def true_motion(problem: Problem) -> tuple[Signal, ...]:
 def true_response(problem: Problem) -> Response:
     """The response of what the controller controls, of the plant that moves."""
     plant = problem.plant
-    return Response(plant.response_signal("realised"), problem.truth.function(response_names(plant.face)))
+    return Response(plant.response_signal("realised"), problem.truth.function(response_names(plant)))
 
 
 def motion_delays(problem: Problem) -> list[Delay]:
@@ -139,7 +139,7 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
         if sensing.estimates:
             return sensors
         raw = sensing.raw(plant, all_shown, late)
-        return [*sensors, on_face(plant, sensing.estimator.block(plant.face, problem.period, first, raw))]
+        return [*sensors, sensing.estimator.block(plant, problem.period, first, raw)]
     assert late is not None
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
     return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
@@ -205,7 +205,7 @@ def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response)
 def _seen_block(problem: Problem, shown: Shown) -> Block:
     """Block -> the state and the response that are measured in place of the true ones."""
     state = problem.truth.function(shown[0][0].elements, seen=True)
-    response = problem.truth.function(response_names(problem.plant.face), seen=True)
+    response = problem.truth.function(response_names(problem.plant), seen=True)
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
@@ -260,13 +260,13 @@ def shows_truth(problem: Problem) -> bool:
     if problem.foreign is None:
         return False
     plant = problem.plant
-    return {*plant.output.elements, *response_names(plant.face)} <= set(problem.foreign.measures)
+    return {*plant.output.elements, *response_names(plant)} <= set(problem.foreign.measures)
 
 
 def foreign_block(problem: Problem, motion: Sequence[Signal], response: Signal) -> Block:
     """Block (answer) -> motion and response in the model's order, and the answer as it came; what is not measured is zero."""
     assert problem.foreign is not None
-    names, answered = list(problem.foreign.measures), response_names(problem.plant.face)
+    names, answered = list(problem.foreign.measures), response_names(problem.plant)
     raw, held = foreign_signals(problem)
     wanted = {**{signal.name: signal.elements for signal in motion}, response.name: answered}
 
@@ -305,11 +305,11 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
         motion: signal of the state, or of the outputs where the plant has some.
         response: signal of the response.
     """
-    face, period = problem.plant.face, problem.period
+    period = problem.period
     orders = problem.plant.response_orders
     if not any(orders.values()):
         return sense  # a response of order 0 is the output, and no difference
-    places = {c: face.state.elements.index(c) for c in orders}
+    places = {c: problem.plant.output.elements.index(c) for c in orders}
     entries = [(c, j) for c, order in orders.items() for j in range(1, order + 1)]
     past = Signal(_PAST, tuple(f"{c}@{j}" for c, j in entries))
     known = Signal(_FULL)

@@ -33,14 +33,12 @@ def set_point_table(problem: Problem, setpoints: Setpoints | None, cycles: int) 
     signals, steps = given_signals(problem), _steps(problem, setpoints)
     if not signals:
         return np.zeros((cycles, 0))
-    names = problem.plant.face.names
+    names = list(problem.plant.chains)
     windows = signals[0].size // len(names)
     step = problem.horizon.step if problem.horizon is not None else 0.0
     times = (np.arange(cycles) * problem.period)[:, None] + step * np.arange(windows)
     columns = [_values(problem, name, steps[name], times) for name in names]
-    check_values(
-        problem.plant.face, problem.limits, {n: c.ravel().tolist() for n, c in zip(names, columns, strict=True)}
-    )
+    check_values(problem.plant, problem.limits, {n: c.ravel().tolist() for n, c in zip(names, columns, strict=True)})
     return np.stack(columns, axis=2).reshape(cycles, -1)
 
 
@@ -59,7 +57,7 @@ def set_points_now(problem: Problem, setpoints: SetpointsNow, before: np.ndarray
         InvalidValue: a set-point that is not finite, or outside the range or the limits of its state.
     """
     _check_names(problem, setpoints)
-    names = problem.plant.face.names
+    names = list(problem.plant.chains)
     rows = before.reshape(-1, len(names)).copy()
     for name, value in setpoints.items():
         numbers = _numbers(value)
@@ -69,7 +67,7 @@ def set_points_now(problem: Problem, setpoints: SetpointsNow, before: np.ndarray
             wanted = "one number" if len(rows) == 1 else f"one number, or {len(rows)}: now and at every later node"
             raise InvalidShape(f"set-point of '{name}': expected {wanted}, got {numbers.size}")
         rows[:, names.index(name)] = numbers
-    check_values(problem.plant.face, problem.limits, {n: rows[:, names.index(n)].tolist() for n in setpoints})
+    check_values(problem.plant, problem.limits, {n: rows[:, names.index(n)].tolist() for n in setpoints})
     return rows.ravel()
 
 

@@ -13,13 +13,13 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.by_name import ByName
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.controllers.online_reference import given_signals
 from fpirhc.controllers.sensing_chain import given_states, raw_signal
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue
 from fpirhc.fields.kinds import named_entries
+from fpirhc.plant.chain import measured_signals
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
@@ -218,7 +218,7 @@ class NumbersNow:
     @property
     def setpoints(self) -> dict[str, float | list[float]]:
         """The set-points in force, by coordinate or output; where they are announced, one per node of the horizon."""
-        names = self._live.problem.plant.face.names
+        names = self._live.problem.plant.chains
         rows = self._setpoints.reshape(-1, len(names)).T
         values = {
             n: row.tolist() if row.size > 1 else float(row[0]) for n, row in zip(names, rows, strict=True) if row.size

@@ -18,6 +18,7 @@ from fpirhc.horizon.cost import Cost, View
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
 from fpirhc.plant.maps import over
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.positions import StepDifference
 from fpirhc.sensing.sensing import Sensing
@@ -71,7 +72,7 @@ def settled_maps(
 def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
     instant = _instant(model)
-    at_once = bool(instant) and set(instant) == set(model.controlled or model.face.names)  # no derivative is looked for
+    at_once = bool(instant) and set(instant) == set(model.controlled or model.chains)  # no derivative is looked for
     if reality is not None and reality.plant.step is not None and model.step is None and not at_once:
         mistakes.add(
             "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write the "
@@ -89,22 +90,22 @@ def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes
             f"sensing: {type(sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
             "have; leave the estimator out, and differences of its steps are taken"
         )
-    if max(model.face.orders) > 1 and (sensing.observer is not None or sensing.measured is not None):
+    if max(model.chains.values()) > 1 and (sensing.observer is not None or sensing.measured is not None):
         mistakes.add(
             "sensing: believed states are not covered where an output of a map has an order above 1, because its next values are "
             "predicted from measured states; leave measured and observer out"
         )
-    later = [name for name, order in zip(model.face.names, model.face.orders, strict=True) if order > 1]
+    later = [name for name, order in model.chains.items() if order > 1]
     if later and reality is not None and reality.plant.step is None:
         mistakes.add(
-            f"reality: '{later[0]}' has the order {max(model.face.orders)} in the model's steps, and the reality has differential "
+            f"reality: '{later[0]}' has the order {model.chains[later[0]]} in the model's steps, and the reality has differential "
             "equations, in which every input shows within one cycle; write a model in which it does too"
         )
 
 
 def _instant(plant: Plant) -> tuple[str, ...]:
     """Controlled outputs that the command moves at once; their response is the output itself."""
-    return tuple(name for name in plant.controlled or plant.face.names if not plant.output_orders[name])
+    return tuple(name for name in plant.controlled or plant.chains if not plant.output_orders[name])
 
 
 def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
@@ -131,7 +132,7 @@ def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -
         judged: names whose errors are judged beside the controlled ones; None: no other need be there.
     """
     if sensing.observer is None:
-        return frozenset((*plant.coordinates, *plant.face.coordinates))
+        return frozenset((*plant.coordinates, *followed_units(plant)))
     measured = (name.rstrip("'") for name in needed_measurements(plant, sensing))
     return frozenset((*measured, *(judged or ()), *(plant.outputs or plant.controlled_names)))
 

@@ -51,9 +51,9 @@ class FilterBank:
     @property
     def given(self) -> Signal:
         """The signal of the set-points, node by node; those of later nodes are named 'q1@1'."""
-        names = self.plant.names
+        names = tuple(self.plant.chains)
         later = tuple(f"{name}@{k}" for k in range(1, self.nodes) for name in names)
-        units = tuple(self.plant.coordinates[name] for name in names)
+        units = self.plant.output.units[: len(names)]
         return Signal(_GIVEN, (*names, *later), units * self.nodes)
 
     @property
@@ -128,9 +128,9 @@ class FilterBank:
 
 def arranged(plant: Plant, chains: Sequence[Expression]) -> tuple[Expression, Expression]:
     """State in the plant's order and response, of (y, y', ..., y^(m)) of every coordinate."""
-    by_name = dict(zip(plant.names, chains, strict=True))
-    state = [by_name[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
-    response = [by_name[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
+    by_name = dict(zip(plant.chains, chains, strict=True))
+    state = [by_name[e.rstrip("'")][e.count("'")] for e in plant.output.elements]
+    response = [by_name[c][r] for c, r in plant.chains.items()]
     return ca.vertcat(*state), ca.vertcat(*response)
 
 

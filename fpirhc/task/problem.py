@@ -20,7 +20,7 @@ from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of
-from fpirhc.plant.motion import followed, words
+from fpirhc.plant.motion import followed, followed_units, words
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.units import derivative_unit
 from fpirhc.sensing.sensing import Sensing
@@ -106,7 +106,7 @@ class Problem(Checked):
         _check_start(self, mistakes)
         plant = self.plant
         _check_input_before(self, mistakes)
-        mistakes.unknown(f"judged: {followed(plant)}", self.judged or (), plant.face.coordinates)
+        mistakes.unknown(f"judged: {followed(plant)}", self.judged or (), followed_units(plant))
         disturbed = [*plant.inputs, *(() if self.foreign else (*self.real_plant.coordinates, *plant.outputs))]
         what = "input, coordinate or output" if plant.outputs else "input or coordinate"
         mistakes.unknown(f"disturbances: {what}", self.disturbances, disturbed)
@@ -117,7 +117,7 @@ class Problem(Checked):
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
-            lambda: check_steps(plant.face, self.limits, self.reference.set_points),
+            lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
             lambda: self.symbolic_reality.check(plant, self._needed) if self.symbolic_reality else None,
@@ -168,7 +168,7 @@ class Problem(Checked):
             return tuple(self.judged)
         weighed = (nominal(self.cost).tracked if self.cost is not None else None) or {}  # weights may be live
         controlled = self.plant.controlled_names
-        return tuple(n for n in self.plant.face.coordinates if n in controlled or (n in weighed and self._shows(n)))
+        return tuple(n for n in followed_units(self.plant) if n in controlled or (n in weighed and self._shows(n)))
 
     def _shows(self, name: str) -> bool:
         """Whether the plant that moves has a coordinate or an output of the model."""
@@ -213,7 +213,7 @@ class Problem(Checked):
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
         if self.reality is None:
             return self
-        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.face.coordinates}
+        known = {*self.plant.inputs, *self.plant.coordinates, *followed_units(self.plant)}
         disturbances = {name: one for name, one in self.disturbances.items() if name in known}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)
@@ -287,23 +287,23 @@ class Problem(Checked):
         It is the sum of dead time and estimator, for the slowest input and coordinate.
         """
         waiting = max(self.dead_time.inputs.values(), default=0.0) + self.dead_time.measurement
-        return waiting / self.period + self.sensing.delay(self.plant.face, self.period)
+        return waiting / self.period + self.sensing.delay(self.plant, self.period)
 
     @property
     def answers_late(self) -> bool:
         """Whether a response may take longer than the one cycle of every loop."""
-        return bool(self.dead_time.queued) or self.sensing.delay(self.plant.face, self.period) > 0
+        return bool(self.dead_time.queued) or self.sensing.delay(self.plant, self.period) > 0
 
     @property
     def warm_up_cycles(self) -> float:
         """Number of the first cycle whose realised response may be used; no deformation acts before it."""
-        return self.sensing.warm_up_cycles(self.plant.face, self.dead_time.measurement / self.period)
+        return self.sensing.warm_up_cycles(self.plant, self.dead_time.measurement / self.period)
 
     @property
     def longest_warm_up(self) -> float:
         """The same with the longest dead time that a run may set."""
         late = max(nominal(self.dead_time.measurement), self.dead_time.longest.get(MEASUREMENT, 0.0))
-        return self.sensing.warm_up_cycles(self.plant.face, late / self.period)
+        return self.sensing.warm_up_cycles(self.plant, late / self.period)
 
 
 def _check_times(problem: Problem, mistakes: Mistakes) -> None:
@@ -381,7 +381,7 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
             f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives nobody states; state it in "
             "steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
         )
-    if len(plant.inputs) == len(plant.controlled or plant.face.names):
+    if len(plant.inputs) == len(plant.controlled or plant.chains):
         states, inputs = nominal_run(plant, problem.reference, *nominal_start(problem))
         singular = singular_gain(plant, states, inputs, problem.period)
         if singular:
@@ -403,7 +403,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
         why = unsolved(plant, problem.start_state, problem.inputs_before, values)
         if why:
             mistakes.add(f"algebraic states at the start ({which} parameters): {why}")
-    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.face.coordinates)):
+    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
         return
     x, u, p = plant.symbols()
     response = plant.controlled_response_function(x, u, p)

@@ -24,6 +24,7 @@ from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.lie_derivatives import output_order, structural_order
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
@@ -226,7 +227,7 @@ class Reality(Checked):
             differences.append("other outputs")
         if (plant.step is None) != (model.step is None):
             differences.append("differential equations, and the model is a map")
-        if not differences and (plant.controlled or plant.face.names) != model.controlled_names:
+        if not differences and tuple(plant.controlled or plant.chains) != model.controlled_names:
             differences = [
                 f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"
             ]
@@ -243,7 +244,7 @@ class Reality(Checked):
 
 def _quantities_of(plant: Plant) -> dict[str, str]:
     """Return the units of what a reality can show: its coordinates and its outputs."""
-    return {**plant.coordinates, **plant.face.coordinates}
+    return {**plant.coordinates, **followed_units(plant)}
 
 
 def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
@@ -272,7 +273,7 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
     own, units, unit = seen.get(name, name), _quantities_of(plant), model.coordinates[name]
     if own not in units:
         if name not in seen:
-            followed = name in (model.controlled or model.face.names)
+            followed = name in (model.controlled or model.chains)
             believed = "" if followed else ", or have it believed: Sensing(measured=..., observer=ModelStates())"
             mistakes.add(
                 f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
@@ -289,7 +290,7 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
             f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
             f"the order {order}; give the model this order, or the reality a coordinate of its own"
         )
-    elif name in (model.controlled or model.face.names) and _order(plant, own) is None:
+    elif name in (model.controlled or model.chains) and _order(plant, own) is None:
         mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
 
 
@@ -301,7 +302,7 @@ def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
 
 def _check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes) -> None:
     """Add what is wrong with the output, or coordinate, of a reality of the name of an output of the model."""
-    unit = model.face.coordinates[name]
+    unit = followed_units(model)[name]
     units = _quantities_of(plant)
     if name not in units:
         mistakes.add(

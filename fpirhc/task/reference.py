@@ -22,7 +22,7 @@ import numpy as np
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, named_results, scalar_expression
-from fpirhc.plant.motion import followed
+from fpirhc.plant.motion import followed, followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import kind
@@ -47,19 +47,19 @@ class Reference(Checked, ABC):
         """Return {coordinate: expression of t}."""
 
     def function(self, plant: Plant) -> ca.Function:
-        """Function t -> (nominal state (nx), nominal response (n)); of a plant with outputs these are those of its face.
+        """Function t -> (nominal state (nx), nominal response (n)); of a plant with outputs these are those of its outputs.
 
         Raises:
             InvalidProblem: a coordinate is missing, unknown, or not a scalar.
         """
-        matrix, what, plant = kind(self.opaque), followed(plant), plant.face
+        matrix, what = kind(self.opaque), followed(plant)
         t = matrix.sym("t")
         motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
         _check(plant, motion, what)
         by = _differentiate if plant.step is None else _differences(plant.sampling)
-        derivatives = {c: by(motion[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
-        state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
-        response = [derivatives[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
+        derivatives = {c: by(motion[c], t, r) for c, r in plant.chains.items()}
+        state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.output.elements]
+        response = [derivatives[c][r] for c, r in plant.chains.items()]
         results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
         return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
 
@@ -215,8 +215,8 @@ def _differences(step: float) -> Callable[[Expression, Expression, int], list[Ex
 
 def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:
     mistakes = Mistakes("reference")
-    mistakes.unknown(what, motion, plant.coordinates)
-    for c in plant.names:
+    mistakes.unknown(what, motion, followed_units(plant))
+    for c in plant.chains:
         if c not in motion:
             mistakes.add(f"{what} '{c}' has no nominal motion; add '{c}' to the reference")
         elif motion[c].numel() != 1:

@@ -18,7 +18,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.kinds import Count, Positive
-from fpirhc.plant.motion import controlled_places
+from fpirhc.plant.chain import response_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
@@ -84,7 +84,6 @@ class Setpoint(Reference):
         Raises:
             InvalidProblem: a coordinate is missing or unknown, or its order is above that of the filter.
         """
-        plant = plant.face
         self._check_names(plant)
         t = ca.SX.sym("t")
         chains = [self._along_values(plant, name, m, t) for name, m in self._orders(plant).items()]
@@ -95,7 +94,7 @@ class Setpoint(Reference):
     def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
         """Return the signal of the set-points in force; announced ones of the next nodes follow node by node, 'q1@1'."""
         bank = self._bank(plant, stages)
-        first = tuple(pairs(name, self.values[name])[0][1] for name in plant.names)
+        first = tuple(pairs(name, self.values[name])[0][1] for name in plant.chains)
         return (replace(bank.given, start=first * bank.nodes),)
 
     def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
@@ -104,11 +103,11 @@ class Setpoint(Reference):
 
     def block(self, plant: Plant, stages: int, period: float) -> Block:
         """Return the block of the filter, which also logs the set-points in force and the response of the reference."""
-        bank, count = self._bank(plant, stages), len(plant.names)
+        bank, count = self._bank(plant, stages), len(plant.chains)
         motion = bank.motion(0.0)
-        rest = {name: self._rest(name) for name in plant.names}
+        rest = {name: self._rest(name) for name in plant.chains}
         start = tuple(rest.get(element, 0.0) for element in bank.elements)
-        units = tuple(plant.coordinates[name] for name in plant.names)
+        names, units = tuple(plant.chains), plant.output.units[:count]
 
         def step(s: Signals) -> dict[str, Expression]:
             own = bank.gathered(s)
@@ -119,7 +118,7 @@ class Setpoint(Reference):
                 f"{FILTER}_next": bank.advanced(s, period),
             }
 
-        shown = Signal("setpoint", plant.names, units), Signal("reference_response", plant.names, plant.response_units)
+        shown = Signal("setpoint", names, units), Signal("reference_response", names, response_units(plant))
         memory = Layout((Signal(FILTER, bank.elements, start=start),))
         return Block("set_points", Layout((bank.given,)), Layout((*shown, bank.own)), step, memory)
 
@@ -154,8 +153,8 @@ class Setpoint(Reference):
     def largest_jump(self, plant: Plant) -> float:
         """Largest jump of the controlled responses at a change of `values`; zero where the filter's order is above the plant's."""
         jumps: dict[float, list[float]] = {}
-        for k in controlled_places(plant):
-            name, order = plant.names[k], plant.orders[k]
+        for name in plant.controlled_names:
+            order = plant.chains[name]
             if self._orders(plant)[name] == order:
                 for time, change in self._changes(name):
                     jumps.setdefault(time, []).append(self._jump(plant, order) * change)
@@ -171,7 +170,7 @@ class Setpoint(Reference):
 
     def _orders(self, plant: Plant) -> dict[str, int]:
         """Order of the filter of every coordinate."""
-        return {c: self.order or r for c, r in zip(plant.names, plant.orders, strict=True)}
+        return {c: self.order or r for c, r in plant.chains.items()}
 
     def _rest(self, name: str) -> float:
         """Where the filter of a coordinate begins."""
@@ -196,8 +195,8 @@ class Setpoint(Reference):
 
     def _check_names(self, plant: Plant) -> None:
         mistakes = Mistakes("reference")
-        mistakes.unknown("coordinate", self.values, plant.coordinates)
-        for name, order in zip(plant.names, plant.orders, strict=True):
+        mistakes.unknown("coordinate", self.values, plant.chains)
+        for name, order in plant.chains.items():
             if name not in self.values:
                 mistakes.add(f"coordinate '{name}' has no set-point; add '{name}' to Setpoint(values=...)")
             if self.order is not None and self.order < order:

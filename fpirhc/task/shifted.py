@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, kind
@@ -54,7 +55,8 @@ class Shifted(Reference):
 
     def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
         """Return the own signals of the reference, and the shift."""
-        units = tuple(plant.coordinates[name] for name in plant.controlled_names)
+        every = followed_units(plant)
+        units = tuple(every[name] for name in plant.controlled_names)
         return (*self.reference.own(plant, stages), Signal(SHIFT, plant.controlled_names, units))
 
     def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
@@ -114,7 +116,7 @@ class Shifted(Reference):
         matrix, signals = kind(self.opaque), self.given(plant, stages)
         own = matrix.sym("own", self.own(plant, stages)[0].size)
         ends = np.cumsum([0, *(signal.size for signal in signals), 1]).tolist()
-        places = ca.DM(plant.state.size, len(plant.controlled_names))
+        places = ca.DM(plant.output.size, len(plant.controlled_names))
         for column, name in enumerate(plant.controlled_names):
-            places[plant.state.elements.index(name), column] = 1
+            places[plant.output.elements.index(name), column] = 1
         return matrix.sym("t"), own, ca.vertsplit(own, ends), places

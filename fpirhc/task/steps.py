@@ -55,7 +55,7 @@ def check_steps(plant: Plant, limits: Limits, set_points: Mapping[str, Steps]) -
     Raises:
         InvalidValue: see `pairs` and `check_values`.
     """
-    known = {name: steps for name, steps in set_points.items() if name in plant.coordinates}
+    known = {name: steps for name, steps in set_points.items() if name in plant.chains}
     check_values(plant, limits, {name: [v for _, v in pairs(name, steps)] for name, steps in known.items()})
 
 

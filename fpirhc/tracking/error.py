@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
@@ -89,8 +90,8 @@ class IntegralLaw(Tracking):
 def law_signals(plant: Plant) -> tuple[Layout, Layout]:
     """Signals that the law of an integrating tracking law reads and writes."""
     reads = (
-        plant.state,
-        Signal("_target", plant.state.elements, plant.state.units),
+        plant.output,
+        Signal("_target", plant.output.elements, plant.output.units),
         plant.response_signal("nominal"),
         scalar("warm_up"),
         integral_signal(plant, "_integral_before"),
@@ -190,22 +191,24 @@ def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
 
 def error_signal(plant: Plant) -> Signal:
     """Error to the target of every controlled coordinate."""
-    units = [plant.coordinates[c] for c in plant.controlled_names]
+    every = followed_units(plant)
+    units = [every[c] for c in plant.controlled_names]
     return vector("_target_error", plant.controlled_names, units)
 
 
 def integral_signal(plant: Plant, name: str) -> Signal:
     """Integral of the error of every controlled coordinate, under the given name."""
-    units = [f"{plant.coordinates[c]} {plant.time_unit}" for c in plant.controlled_names]
+    every = followed_units(plant)
+    units = [f"{every[c]} {plant.time_unit}" for c in plant.controlled_names]
     return vector(name, plant.controlled_names, units)
 
 
 def error_chains(plant: Plant, error: Expression) -> list[list[Expression]]:
     """Per controlled coordinate: [e, e', ...] below its relative order; nothing for one of order 0."""
-    place = plant.state.elements.index
+    place = plant.output.elements.index
     return [[error[place(name + "'" * s)] for s in range(order)] for name, order in plant.response_orders.items()]
 
 
 def own_errors(plant: Plant, error: Expression) -> list[Expression]:
     """The error e of every controlled coordinate."""
-    return [error[plant.state.elements.index(name)] for name in plant.controlled_names]
+    return [error[plant.output.elements.index(name)] for name in plant.controlled_names]

@@ -124,7 +124,7 @@ class Fractional(IntegralLaw):
         weights, stiffness = ca.DM(self.weights(cycles)), (self.rate * period) ** self.order
 
         def step(s: Signals) -> dict[str, Expression]:
-            error = s._target - s.state
+            error = s._target - getattr(s, plant.output.name)
             errors = error_chains(plant, error)
             running = s.warm_up > 0.5
             integral = ca.if_else(running, s._integral_before, 0)

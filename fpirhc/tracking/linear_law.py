@@ -76,7 +76,7 @@ class LinearLaw(IntegralLaw):
         first_gains = [self.gains(order)[0] for order in orders] if self.integral else []
 
         def step(s: Signals) -> dict[str, Expression]:
-            error = s._target - s.state
+            error = s._target - getattr(s, plant.output.name)
             errors, own = error_chains(plant, error), own_errors(plant, error)
             first_integral = ca.vertcat(*map(self._first_integral, own, errors))
             integral_before, remembered = bumpless(s, first_gains)

@@ -72,7 +72,7 @@ STATE = np.array([0.3, -0.2, 0.4, 0.1, -0.5, 0.2, 0.6])
 def test_outputs_of_unequal_orders_have_one_state() -> None:
     """As many directions as equations, whatever the orders: a, a', a'', d, e, e' are met, and the state beside them follows."""
     plant = several()
-    assert plant.face.orders == (3, 1, 2)
+    assert tuple(plant.chains.values()) == (3, 1, 2)
     y = seen(plant, STATE, ()) + 0.1 * np.random.default_rng(2).standard_normal(plant.output.size)
     start = found(plant, STATE, y)
     np.testing.assert_allclose(seen(plant, start, ()), y, atol=1e-9)

@@ -82,7 +82,7 @@ def test_cars_are_conserved() -> None:
 
 def test_the_density_at_the_merge_has_order_one() -> None:
     plant = task("freeway_metering").problem.plant
-    assert plant.face.orders == (1,)
+    assert tuple(plant.chains.values()) == (1,)
     assert 0 not in plant.output_orders.values()
 
 

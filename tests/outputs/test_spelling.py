@@ -22,6 +22,7 @@ from test_outputs import simulated
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.members import examples
+from fpirhc.plant.motion import followed_units
 
 
 def with_arguments(function: Any, names: Sequence[str]) -> Any:
@@ -159,10 +160,8 @@ def in_outputs(plant: fp.Plant) -> fp.Plant:
         values = plant.controlled_response_function(state, inputs.vector, parameters.vector)
         return dict(zip(plant.outputs, ca.vertsplit(values), strict=True))
 
-    face = plant.face
-    with_arguments(response, [f"d{k}" for k in range(max(face.orders))] + ["u", "p"])
-    order = dict(zip(face.names, face.orders, strict=True))
-    return fp.Plant(face.coordinates, plant.inputs, plant.parameters, response, order=order)
+    with_arguments(response, [f"d{k}" for k in range(max(plant.chains.values()))] + ["u", "p"])
+    return fp.Plant(followed_units(plant), plant.inputs, plant.parameters, response, order=plant.chains)
 
 
 def both(plant: fp.Plant, start: Mapping[str, float] | None = None, **settings: Any) -> tuple[fp.Problem, fp.Problem]:

@@ -41,7 +41,7 @@ def judged_by(curve: np.ndarray, name: str) -> float:
     for _ in range(2):
         chain.append(ca.jtimes(chain[-1], x, rate))
     shown = ca.Function("shown", [x, u, p, real], [ca.vertcat(*chain)])
-    wanted = PROBLEM.reference.function(PLANT.face)
+    wanted = PROBLEM.reference.function(PLANT)
     advance = PROBLEM.integrator.step(PLANT, PROBLEM.period)
     stepper = fp.Stepper(PROBLEM, TASK.controllers[name], compiled=False)
     memory, state, command, realised = stepper.start(), PROBLEM.start_state.copy(), np.zeros(1), np.zeros(1)

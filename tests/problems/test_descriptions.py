@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import fpirhc as fp
+from fpirhc.plant.motion import followed_units
 
 ROOT = Path(__file__).parents[2] / "problems"
 FILES = sorted([*ROOT.glob("*.py"), *(ROOT / "gallery").glob("*.py")])
@@ -62,7 +63,7 @@ def test_a_table_is_what_runs_give(path):
     assert bool(table) != (path.stem in WITHOUT)
     if not table:
         return
-    units = task.problem.plant.face.coordinates
+    units = followed_units(task.problem.plant)
     names = task.problem.judged_names
     assert table[0] == [HEAD, *(f"{n} [{units[n]}]" for n in names)]
     assert len(table) > 2

@@ -115,7 +115,7 @@ def test_model_as_what_moves_shows_its_own_outputs_and_responses(name):
     calm = np.zeros(len(plant.names))
     shown = problem.truth.function(plant.output.elements)(*at, calm)
     np.testing.assert_array_equal(shown, plant.output_function(*at, calm))
-    answered = problem.truth.function(response_names(plant.face))(*at, calm)
+    answered = problem.truth.function(response_names(plant))(*at, calm)
     np.testing.assert_array_equal(answered, plant.controlled_response_function(*at))
 
 

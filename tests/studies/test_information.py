@@ -116,7 +116,7 @@ def test_outputs_are_measured_beside_the_state():
     known = [comparison[name].information for name in ("CTC", "CTC+FPI")]
     assert all(known)
     uses = [one.uses for one in known if one]
-    face = short.plant.face
-    responses = {name + "'" * order for name, order in zip(face.names, face.orders, strict=True)}
-    assert set(face.names) <= set(uses[0])
+    chains = short.plant.chains
+    responses = {name + "'" * order for name, order in chains.items()}
+    assert set(chains) <= set(uses[0])
     assert set(uses[1]) - set(uses[0]) == responses

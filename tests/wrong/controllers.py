@@ -26,7 +26,7 @@ class Gentle(Controller):
     def blocks(self, problem):
         """Return reference, law and the closing blocks."""
         plant, motion = problem.plant, self.motion(problem.plant)
-        size = len(plant.face.names)
+        size = len(plant.chains)
 
         def step(s):
             error = s.reference - getattr(s, motion.name)
@@ -41,7 +41,7 @@ class Gentle(Controller):
 
     def check(self, problem):
         """Refuse plants without velocities."""
-        if problem.plant.step is not None or set(problem.plant.face.orders) != {2}:
+        if problem.plant.step is not None or set(problem.plant.chains.values()) != {2}:
             raise NotSupported("Gentle feeds back an error and its derivative: outputs of relative order 2 only")
 
     def motion(self, plant):

@@ -25,7 +25,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block
-from fpirhc.controllers.face import on_face
 from fpirhc.controllers.tracking_cycle import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -87,9 +86,9 @@ class AccelerationFeedback(Controller):
             self._feedback_block(problem),
             invert_block(plant),
             *closing,
-            on_face(plant, bounded(problem, self.tracking).update(plant.face, problem.period)),
+            bounded(problem, self.tracking).update(plant, problem.period),
         ]
-        return blocks, [*delays, *self.tracking.delays(plant.face)]
+        return blocks, [*delays, *self.tracking.delays(plant)]
 
     def _feedback_block(self, problem: Problem) -> Block:
         """Block (desired, realised) -> request; before the first response the request is the desired response."""

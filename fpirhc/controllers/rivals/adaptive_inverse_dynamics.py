@@ -10,7 +10,6 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, closing_blocks, fed, like
-from fpirhc.controllers.face import on_face
 from fpirhc.controllers.mirror import MEASURED_TIME
 from fpirhc.controllers.online_reference import own_signals
 from fpirhc.controllers.response_pairs import ResponsePairs
@@ -95,9 +94,9 @@ class AdaptiveInverseDynamics(Controller):
             *desired_blocks(problem, self.tracking),
             self._learn_block(problem),
             *(fed(block, "parameters", believed) for block in closing),
-            on_face(plant, bounded(problem, self.tracking).update(plant.face, problem.period)),
+            bounded(problem, self.tracking).update(plant, problem.period),
         ]
-        return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant.face)]
+        return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant)]
 
     @property
     def _learning(self) -> Learning:
@@ -117,14 +116,14 @@ class AdaptiveInverseDynamics(Controller):
         def gradient(s: Signals, then: Expression, estimate: Expression) -> Pair:
             state = then if paired else s.state
             matrix, _ = equation(state, s.realised, s._command_before, estimate, s.parameters)
-            chains = error_chains(plant.face, target(s) - state)
+            chains = error_chains(plant, target(s) - state)
             if self.tracking.integral:
                 chains = [[s._integral_used[k], *chain] for k, chain in enumerate(chains)]
             weights = fixed if rows is None else ca.vertsplit(getattr(s, rows.signal.name))
             along = [sum(w * e for w, e in zip(weights, chain, strict=True)) for chain in chains]
             return matrix, ca.vertcat(*along)
 
-        reads = (*reads, integral_signal(plant.face, "_integral_used"))
+        reads = (*reads, integral_signal(plant, "_integral_used"))
         if rows is None:
             return learning.block(problem, reads, gradient)
         return replace(learning.block(problem, (*reads, *rows.reads.signals), gradient), derived=rows.derived)

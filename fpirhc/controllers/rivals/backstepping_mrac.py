@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
-from fpirhc.controllers.face import on_face
 from fpirhc.controllers.rivals.reference_model import decay_gains, model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, Mistakes
@@ -87,8 +86,8 @@ class BacksteppingMRAC(Controller):
         """Return the blocks reference, reference model, nested errors, deform, invert, limit, judge, running."""
         plant = problem.plant
         closing, delays = closing_blocks(problem, self.deformation)
-        own = model_block(plant.face, self.model_rate, problem.period), self._nested_block(plant.face)
-        return [reference_block(problem), *(on_face(plant, block) for block in own), *closing], delays
+        own = model_block(plant, self.model_rate, problem.period), self._nested_block(plant)
+        return [reference_block(problem), *own, *closing], delays
 
     def _nested_block(self, plant: Plant) -> Block:
         """Block (state, model, response of the model) -> (nested errors, desired)."""
@@ -96,12 +95,12 @@ class BacksteppingMRAC(Controller):
         names = tuple(f"{c}_{i + 1}" for c in plant.controlled_names for i in range(len(self.rates)))
 
         def step(s: Signals) -> dict[str, Expression]:
-            chains = [ca.vertcat(*chain) for chain in error_chains(plant, s.model - s.state)]
+            chains = [ca.vertcat(*chain) for chain in error_chains(plant, s.model - getattr(s, plant.output.name))]
             nested = [ca.vertcat(*(ca.dot(numbers(row[:-1]), chain) for row in rows[:-1])) for chain in chains]
             feedback = [ca.dot(numbers(rows[-1][:-1]), chain) for chain in chains]
             return {"nested": ca.vertcat(*nested), "desired": s.nominal + ca.vertcat(*feedback)}
 
-        reads = Layout((plant.state, like(plant.state, "model"), plant.response_signal("nominal")))
+        reads = Layout((plant.output, like(plant.output, "model"), plant.response_signal("nominal")))
         return Block("nested", reads, Layout((vector("nested", names), plant.response_signal("desired"))), step)
 
 

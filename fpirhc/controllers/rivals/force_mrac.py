@@ -24,7 +24,6 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like
 from fpirhc.controllers.contract import Deforms, PlantModel
-from fpirhc.controllers.face import on_face
 from fpirhc.controllers.scale_selection import command_demand
 from fpirhc.controllers.tracking_cycle import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation, Mirror, automatic
@@ -98,9 +97,9 @@ class ForceMRAC(Controller):
             *desired_blocks(problem, self.tracking),
             self._force_block(plant, problem.warm_up_cycles),
             *closing,
-            on_face(plant, bounded(problem, self.tracking).update(plant.face, problem.period)),
+            bounded(problem, self.tracking).update(plant, problem.period),
         ]
-        return blocks, [*delays, *self.tracking.delays(plant.face)]
+        return blocks, [*delays, *self.tracking.delays(plant)]
 
     def _force_block(self, plant: Plant, warm_up_cycles: float) -> Block:
         """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""

@@ -34,13 +34,13 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.form_check import check_derivatives
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
+from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
@@ -97,7 +97,7 @@ class LyapunovMRAC(Controller):
         """
         check_derivatives(problem, "LyapunovMRAC proves that errors vanish by")
         plant, mistakes = problem.plant, Mistakes("LyapunovMRAC")
-        followed = plant.face.names
+        followed = plant.chains
         if len(plant.controlled_names) != len(followed):
             free = [c for c in followed if c not in plant.controlled_names]
             mistakes.add(f"the plant is not fully actuated: '{free[0]}' has no input of its own; use ComputedTorque")
@@ -114,7 +114,7 @@ class LyapunovMRAC(Controller):
         closing, delays = commanding_blocks(problem)
         blocks = [
             reference_block(problem),
-            on_face(plant, model_block(plant.face, self.rate, problem.period)),
+            model_block(plant, self.rate, problem.period),
             self._law_block(plant),
             *closing,
             self._adapt_block(plant, problem.period, _sign(problem)),
@@ -124,7 +124,7 @@ class LyapunovMRAC(Controller):
 
     def _law_block(self, plant: Plant) -> Block:
         """Block (state, model, reference, gains) -> command, regressor, p z, and the gains in use."""
-        face, seen = plant.face, plant.output
+        seen = plant.output
         rows = [self.weights(order)[-1] for order in plant.response_orders.values()]
         start, response, rate = _start_gains(plant), plant.controlled_response_function, self.rate
 
@@ -133,7 +133,7 @@ class LyapunovMRAC(Controller):
 
         def step(s: Signals) -> dict[str, Expression]:
             motion = getattr(s, seen.name)
-            errors = error_chains(face, s.reference - motion)
+            errors = error_chains(plant, s.reference - motion)
             feedback = [ca.dot(numbers(decay_gains(rate, len(c))), ca.vertcat(*c)) for c in errors]
             desired = s._reference_response + ca.vertcat(*feedback)
             begun = start(s.state, desired, s.parameters)
@@ -141,7 +141,7 @@ class LyapunovMRAC(Controller):
             gains = ca.if_else(s.warm_up > 0.5, s._gains_before, begun)
             regressor = ca.vertcat(s.state, desired, 1)
             command = ca.mtimes(ca.reshape(gains, desired.numel(), regressor.numel()), regressor)
-            chains = error_chains(face, s.model - motion)
+            chains = error_chains(plant, s.model - motion)
             return {
                 "desired": desired,
                 "command_unclipped": command,

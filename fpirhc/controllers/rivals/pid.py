@@ -24,12 +24,12 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
-from fpirhc.controllers.face import measured_signals
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
+from fpirhc.plant.chain import measured_signals
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.functions import quotient
@@ -120,9 +120,9 @@ class PID(Controller):
             rename("desired", response, plant.response_signal("desired")),
             self._law(problem),
             *closing,
-            integral_update(plant.face, problem.period, self._useful(problem)),
+            integral_update(plant, problem.period, self._useful(problem)),
         ]
-        return blocks, [*delays, *integral_delay(plant.face)]
+        return blocks, [*delays, *integral_delay(plant)]
 
     def _useful(self, problem: Problem) -> list[Useful]:
         """What the integrals may ask for: commands inside the limits of their inputs, by those of the build."""
@@ -135,15 +135,15 @@ class PID(Controller):
 
     def _law(self, problem: Problem) -> Block:
         """Block (state, reference, integral, warm_up) -> command, and the model's response to it (for readers of a log)."""
-        plant, face, seen = problem.plant, problem.plant.face, problem.plant.output
+        plant, seen = problem.plant, problem.plant.output
         gains = [self.gains(name, order) for name, order in plant.response_orders.items()]
         integral_gains = [k[0] for k in gains]
 
         def step(s: Signals) -> dict[str, Expression]:
             away = s.reference - getattr(s, seen.name)
-            own = own_errors(face, away)
+            own = own_errors(plant, away)
             # An output of order 0 has no chain, but an error.
-            errors = [chain or [e] for chain, e in zip(error_chains(face, away), own, strict=True)]
+            errors = [chain or [e] for chain, e in zip(error_chains(plant, away), own, strict=True)]
             direct = [
                 total(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
             ]
@@ -160,15 +160,15 @@ class PID(Controller):
                 **remembered,
             }
 
-        before, in_use = integral_signal(face, "_integral_before"), integral_signal(face, "_integral_used")
+        before, in_use = integral_signal(plant, "_integral_before"), integral_signal(plant, "_integral_used")
         reads = (*measured_signals(plant), like(seen, "reference"), plant.parameter, scalar("warm_up"), before)
         writes = (
-            error_signal(face),
+            error_signal(plant),
             in_use,
             like(plant.input, "command_unclipped"),
             plant.response_signal("_deformed_unclipped"),
         )
-        return Block("pid", Layout(reads), Layout(writes), step, gains_before(face, integral_gains))
+        return Block("pid", Layout(reads), Layout(writes), step, gains_before(plant, integral_gains))
 
 
 EXAMPLES = (

@@ -60,10 +60,12 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
     ends = np.cumsum([0, *(len(chain) for chain in chains)]).tolist()
 
     def step(s: Signals) -> dict[str, Expression]:
-        first = ca.vertcat(*(e for chain in error_chains(plant, s.reference - s.state) for e in chain))
+        first = ca.vertcat(
+            *(e for chain in error_chains(plant, s.reference - getattr(s, plant.output.name)) for e in chain)
+        )
         deviation = ca.vertsplit(ca.if_else(s.warm_up > 0.5, s.model_deviation, first), ends)
         spread = dict(zip(memory.signals[0].elements, ca.vertsplit(ca.vertcat(*deviation)), strict=True))
-        lag = ca.vertcat(*(spread.get(e, 0) for e in plant.state.elements))
+        lag = ca.vertcat(*(spread.get(e, 0) for e in plant.output.elements))
         pull = [ca.dot(numbers(g), d) for g, d in zip(gains, deviation, strict=True)]
         entries = ca.vertsplit(
             expression(ca.DM(fixed)) if live is None else getattr(s, live.signal.name), ends_of_steps
@@ -77,11 +79,11 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
         }
 
     reads = (
-        plant.state,
-        like(plant.state, "reference"),
+        plant.output,
+        like(plant.output, "reference"),
         plant.response_signal("_reference_response"),
         scalar("warm_up"),
     )
-    writes = (like(plant.state, "model"), plant.response_signal("nominal"))
+    writes = (like(plant.output, "model"), plant.response_signal("nominal"))
     block = Block("reference_model", Layout(reads), Layout(writes), step, memory)
     return block if live is None else replace(block, reads=block.reads + Layout((live.signal,)), derived=live.derived)

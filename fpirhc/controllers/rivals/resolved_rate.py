@@ -33,7 +33,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block, like, reference_block
-from fpirhc.controllers.face import on_face
 from fpirhc.controllers.form_check import check_derivatives
 from fpirhc.controllers.online_reference import motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.reference_model import decay_gains
@@ -92,7 +91,7 @@ class ResolvedAccelerationRate(Controller):
         blocks = [
             reference_block(problem),
             _nominal_block(problem),
-            on_face(plant, self._rate_block(problem)),
+            self._rate_block(problem),
             _increment_block(problem),
             invert_block(plant),
             *closing,
@@ -100,11 +99,11 @@ class ResolvedAccelerationRate(Controller):
         return blocks, delays
 
     def _rate_block(self, problem: Problem) -> Block:
-        """Block (state, realised, reference now and one cycle later) -> (desired, its change in this cycle), of the face."""
-        plant, period, warm_up_cycles = problem.plant.face, problem.period, problem.warm_up_cycles
+        """Block (state, realised, reference now and one cycle later) -> (desired, its change in this cycle)."""
+        plant, period, warm_up_cycles = problem.plant, problem.period, problem.warm_up_cycles
 
         def step(s: Signals) -> dict[str, Expression]:
-            errors = error_chains(plant, s.reference - s.state)
+            errors = error_chains(plant, s.reference - getattr(s, plant.output.name))
             change, first = [], []
             for k, chain in enumerate(errors):
                 whole = [*chain, s.nominal[k] - s.realised[k]]
@@ -116,7 +115,7 @@ class ResolvedAccelerationRate(Controller):
             return {"_change": ca.vertcat(*change), "desired": ca.if_else(running, desired, ca.vertcat(*first))}
 
         names = ("nominal", "_nominal_later", "realised")
-        reads = (plant.state, like(plant.state, "reference"), *map(plant.response_signal, names), scalar("warm_up"))
+        reads = (plant.output, like(plant.output, "reference"), *map(plant.response_signal, names), scalar("warm_up"))
         return Block(
             "rate", Layout(reads), Layout((plant.response_signal("_change"), plant.response_signal("desired"))), step
         )
@@ -125,7 +124,7 @@ class ResolvedAccelerationRate(Controller):
 def _nominal_block(problem: Problem) -> Block:
     """Block time -> nominal response now and one cycle later."""
     plant, function = problem.plant, motion_of(problem, ahead=problem.period)
-    controlled = controlled_places(plant.face)
+    controlled = controlled_places(plant)
 
     def step(s: Signals) -> dict[str, Expression]:
         later = function(s.time, *own_values(problem, s))[1][controlled]

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
-from fpirhc.controllers.face import on_face
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -96,7 +95,7 @@ class SlidingMode(Controller):
         blocks = [
             reference_block(problem),
             rename("nominal", response, problem.plant.response_signal("nominal")),
-            on_face(problem.plant, self._surface_block(problem.plant.face)),
+            self._surface_block(problem.plant),
             *closing,
         ]
         return blocks, delays
@@ -107,7 +106,7 @@ class SlidingMode(Controller):
 
         def step(s: Signals) -> dict[str, Expression]:
             surfaces, drifts = [], []
-            for chain in error_chains(plant, s.reference - s.state):
+            for chain in error_chains(plant, s.reference - getattr(s, plant.output.name)):
                 degree = len(chain) - 1
                 gains = [math.comb(degree, k) * power(self.rate, degree - k) for k in range(degree + 1)]
                 surfaces.append(sum(g * e for g, e in zip(gains, chain, strict=True)))
@@ -116,7 +115,7 @@ class SlidingMode(Controller):
             switching = self.gain * ca.tanh(surface / self.width)
             return {"surface": surface, "desired": s.nominal + ca.vertcat(*drifts) + switching}
 
-        reads = Layout((plant.state, like(plant.state, "reference"), plant.response_signal("nominal")))
+        reads = Layout((plant.output, like(plant.output, "reference"), plant.response_signal("nominal")))
         writes = Layout((vector("surface", plant.controlled_names, units), plant.response_signal("desired")))
         return Block("surface", reads, writes, step)
 

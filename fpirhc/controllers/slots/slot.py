@@ -1,13 +1,14 @@
 """A time slot: one coordinate, controlled alone with its own relative order, tracking law and deformation.
 
-On a plant a slot becomes a `Channel`: the coordinate's chain of derivatives, and its face, the light plant y^(r) = u. So tracking
+On a plant a slot becomes a `Channel`: the coordinate's chain of derivatives, and the light plant y^(r) = u. So tracking
 laws and deformations work in a slot as they do on a whole plant, or on the outputs of one.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -17,12 +18,11 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.lie_derivatives import light_plant
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.relative_order import OutputChain, output_chain
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -62,7 +62,7 @@ class Channel:
         slot: that is on the plant.
         chain: the derivatives of its coordinate.
         number: place among the slots.
-        plant: its face, y^(r) = u.
+        plant: the light one, y^(r) = u.
         start_gain: d y^(r)/du of the model at the problem's start.
     """
 
@@ -106,9 +106,7 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
     gain = float(chain.gain(problem.start_state, rest, plant.approximate))
     if not (np.isfinite(gain) and gain != 0):
         raise NotInvertible(f"'{chain.input}' has no effect on '{slot.coordinate}' at the start (gain {gain:g})")
-    name, acting = chain.coordinate, {chain.input: plant.inputs[chain.input]}
-    light = light_plant(plant, {name: chain.unit}, {name: chain.order}, (name,), acting)
-    return Channel(slot, chain, number, light, gain)
+    return Channel(slot, chain, number, _light_plant(plant, chain), gain)
 
 
 def _check_deformation(deformation: Deformation) -> None:
@@ -179,3 +177,29 @@ def delays_for_channel(delays: tuple[Delay, ...], one: Channel) -> list[Delay]:
         Delay(Signal(one.wire(d.now.name), d.now.elements, d.now.units, d.now.start), one.wire(d.source))
         for d in delays
     ]
+
+
+def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
+    """Return the plant y^(r) = u of one quantity and the input that acts on it."""
+    name = chain.coordinate
+
+    def response(*arguments: Named) -> dict[str, Expression]:
+        return {name: arguments[-2][chain.input]}
+
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    lower = [f"d{k}" for k in range(chain.order)]
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in (*lower, "u", "p")])
+    return replace(
+        plant,
+        coordinates={name: chain.unit},
+        inputs={chain.input: plant.inputs[chain.input]},
+        parameters={},
+        response=response,
+        order=chain.order,
+        controlled=(name,),
+        inverse=None,
+        ranges={},
+        outputs={},
+        algebraic=None,
+        next=None,
+    )

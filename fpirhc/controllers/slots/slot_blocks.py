@@ -18,10 +18,10 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 
 from fpirhc.controllers.base import clip, error_signal, like
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.online_reference import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.slot import Channel, First
 from fpirhc.deformation.model_referenced import settled
+from fpirhc.plant.chain import measured_signals
 from fpirhc.status import Status
 from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block
@@ -57,7 +57,7 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     """
     plant, chain, seen = problem.plant, one.chain, problem.plant.output
     elements = one.plant.state.elements
-    derivatives = problem.reference.chain(plant.face, stages_of(problem), chain.coordinate, chain.order)
+    derivatives = problem.reference.chain(plant, stages_of(problem), chain.coordinate, chain.order)
     place = plant.input.elements.index(chain.input)
     smallest = smallest_gain * abs(one.start_gain)
 

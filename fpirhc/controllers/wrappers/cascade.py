@@ -27,11 +27,12 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like, reference_block
 from fpirhc.controllers.contract import Deforms, without_deformation
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.target_pairing import ThroughModel
 from fpirhc.deformation.base import Deformation, Demand, automatic
 from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.members import Example
+from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.motion import followed_units
 from fpirhc.symbolic.block import Block, Composite, Delay
 from fpirhc.symbolic.expression import Signals, expression, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -140,7 +141,7 @@ class Cascade(Controller):
         """Block (reference, measured outputs, what a limit did to the last command) -> shift of the target."""
         plant, names = problem.plant, problem.plant.controlled_names
         seen, pairing = plant.output, self.paired
-        places, units = [seen.elements.index(n) for n in names], tuple(plant.face.coordinates[n] for n in names)
+        places, units = [seen.elements.index(n) for n in names], tuple(followed_units(plant)[n] for n in names)
         start = tuple(map(float, problem.start_output[places]))
         own = self.deformation.memory(names)
         last = Signal("shift_last", names, units), Signal("target_last", names, units, start), scalar("shift_cycles")

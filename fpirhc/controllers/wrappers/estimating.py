@@ -100,7 +100,7 @@ class Estimating(Controller):
         self.controller.check(modelled)
         if self.dead_time is not None:
             self.dead_time.check(problem.plant, problem.period)
-        lost = problem.sensing.believed_response(problem.plant.face)
+        lost = problem.sensing.believed_response(problem.plant)
         if lost and self.estimator.reads_response(modelled.plant):
             raise NotSupported(
                 f"{type(self.estimator).__name__} learns from the response, which needs {', '.join(lost)}, and no sensor shows it; "

@@ -30,14 +30,13 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
-from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.online_reference import own_signals
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
-from fpirhc.plant.chain import derivatives_function
+from fpirhc.plant.chain import derivatives_function, measured_signals
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant

@@ -34,7 +34,7 @@ from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import Differences, response_age
-from fpirhc.plant.motion import controlled_places
+from fpirhc.plant.motion import controlled_places, followed_units
 from fpirhc.plant.output import Output
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import quantities, response_names
@@ -112,7 +112,7 @@ class DisturbanceKalman(ParameterEstimator):
         mistakes.unknown("measured: state, output or response", self.measured, quantities(plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
         mistakes.raise_if_any()
-        late = problem.sensing.delay(plant.face, problem.period) + response_age(plant)
+        late = problem.sensing.delay(plant, problem.period) + response_age(plant)
         if self._responses(plant) and late > 0:
             raise NotSupported(
                 f"DisturbanceKalman: {', '.join(self._responses(plant))} is estimated {late:.4g} cycles late, and the filter needs "
@@ -217,12 +217,12 @@ class DisturbanceKalman(ParameterEstimator):
 
     def _responses(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured responses."""
-        return tuple(n for n in self.measured if n in response_names(plant.face))
+        return tuple(n for n in self.measured if n in response_names(plant))
 
     def _measured(self, model: Plant, seen: Seen) -> Expression:
         """The measured quantities as a column."""
         states = {e: seen.state[k] for k, e in enumerate(model.state.elements)}
-        responses = {e: seen.response[k] for k, e in enumerate(response_names(model.face))}
+        responses = {e: seen.response[k] for k, e in enumerate(response_names(model))}
         outputs = {} if seen.output is None else {e: seen.output[k] for k, e in enumerate(model.output.elements)}
         return ca.vertcat(*({**outputs, **states, **responses}[name] for name in self.measured))
 
@@ -238,7 +238,7 @@ class DisturbanceKalman(ParameterEstimator):
             )
         if self._responses(model):
             responses = ca.vertsplit(model.controlled_response_function(x, u, p))
-            states |= dict(zip(response_names(model.face), responses, strict=True))
+            states |= dict(zip(response_names(model), responses, strict=True))
         return ca.Function("fpirhc_shown", [x, u, p], [ca.densify(ca.vertcat(*(states[n] for n in self.measured)))])
 
     def _matrices(self, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -324,9 +324,9 @@ def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
     seen, response = problem.reference.function(plant)(0.0)
     known = zip(problem.start_state, plant.known_by_outputs, strict=True)
     state = ca.DM([value if place < 0 else float(seen[place]) for value, place in known])
-    if plant.controlled is None and len(plant.inputs) != len(plant.face.names):
+    if plant.controlled is None and len(plant.inputs) != len(plant.chains):
         return state, ca.DM.zeros(len(plant.inputs)), plant.approximate
-    needed = plant.inverse_function(state, response[controlled_places(plant.face)], plant.approximate)
+    needed = plant.inverse_function(state, response[controlled_places(plant)], plant.approximate)
     return state, needed, plant.approximate
 
 
@@ -347,9 +347,9 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
         NotSupported: a response that has a disturbance already.
     """
     mistakes = Mistakes("disturbed")
-    responses = dict(zip(response_names(plant.face), plant.controlled_names, strict=True)) if plant.outputs else {}
+    responses = dict(zip(response_names(plant), plant.controlled_names, strict=True)) if plant.outputs else {}
     what = "coordinate, output or response of an output" if plant.outputs else "coordinate"
-    mistakes.unknown(what, names, [*plant.names, *plant.face.names, *responses])
+    mistakes.unknown(what, names, [*plant.names, *plant.chains, *responses])
     if not names:
         mistakes.add("name at least one coordinate whose response is disturbed")
     for name in (_disturbance_name(c) for c in names):
@@ -357,7 +357,7 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
             mistakes.add(f"the plant has a parameter '{name}' already; rename it")
     mistakes.raise_if_any()
     coordinates = [n for n in names if n in plant.coordinates]
-    units = dict(plant.face.coordinates) | dict(zip(plant.names, plant.response_units, strict=True))
+    units = dict(followed_units(plant)) | dict(zip(plant.names, plant.response_units, strict=True))
     if responses:
         units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
     added = {_disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
@@ -445,7 +445,7 @@ def _inverse(
     plant: Plant, inverse: Callable[..., Mapping[str, Expression]], names: Sequence[str]
 ) -> Callable[..., Mapping[str, Expression]]:
     """The user's inverse for the response without its disturbance; that of an output itself changes no response."""
-    responses = dict(zip(response_names(plant.face), plant.controlled_names, strict=True))
+    responses = dict(zip(response_names(plant), plant.controlled_names, strict=True))
     by = {responses.get(n, n): _disturbance_name(n) for n in names if n in responses or n in plant.names}
 
     def undisturbed(*arguments: Named) -> Mapping[str, Expression]:

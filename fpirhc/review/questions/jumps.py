@@ -53,7 +53,7 @@ def jumps(problem: Problem) -> list[Jump]:
     rests = np.abs(_rests(times, values, slopes))
     scales = np.maximum(np.ptp(values, axis=1), 1e-12 * np.abs(values).max(axis=1, initial=0.0))
     detected = []
-    for place, name in enumerate(problem.plant.face.state.elements):
+    for place, name in enumerate(problem.plant.output.elements):
         largest = np.sort(np.argsort(rests[place])[-_LOOKED_AT:])
         candidates = (_jump(motion, place, name, times[k], times[k + 1]) for k in largest)
         real = (one for one in candidates if abs(one.size) > _SIZE * scales[place] > 0)
@@ -72,7 +72,7 @@ def reference_free_of_jumps(grid: ReviewGrid) -> Answer:
         return Answer(
             TEXT, Verdict.YES, "every state of the reference is the integral of the next one", "", {"jumps": 0.0}
         )
-    units = dict(zip(problem.plant.face.state.elements, problem.plant.face.state.units, strict=True))
+    units = dict(zip(problem.plant.output.elements, problem.plant.output.units, strict=True))
     listed = [f"{j.state} by {j.size:.3g} {units[j.state]} at t = {j.time:.4g} {problem.time_unit}" for j in detected]
     first = detected[0]
     numbers = {"jumps": float(len(detected)), "time": first.time, "size": first.size}
@@ -84,8 +84,8 @@ def reference_free_of_jumps(grid: ReviewGrid) -> Answer:
 
 def _instead(problem: Problem, jump: Jump) -> str:
     """A set-point filtered by one pole more than the coordinate's order, with as many continuous derivatives."""
-    plant = problem.plant.face
-    order = plant.orders[plant.names.index(jump.state.rstrip("'"))]
+    plant = problem.plant
+    order = plant.chains[jump.state.rstrip("'")]
     terms = ["1", "w*s", *(f"(w*s)**{k}/{_factorial(k)}" for k in range(2, order + 1))]
     return (
         f"Use a filtered set-point: 1 - ca.exp(-w*s) * ({' + '.join(terms)}) with s = ca.fmax(t - {jump.time:.4g}, 0) rises "
@@ -99,13 +99,13 @@ def _factorial(k: int) -> int:
 
 def _motion(problem: Problem) -> Motion:
     """Times (m,) -> states of the reference and their derivatives, shape (nx, m) each."""
-    plant, function = problem.plant.face, problem.reference.function(problem.plant)
-    elements = plant.state.elements
+    plant, function = problem.plant, problem.reference.function(problem.plant)
+    elements, names = plant.output.elements, list(plant.chains)
 
     def values(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         states, responses = (np.asarray(v.full()) for v in function.map(len(times))(times[None, :]))
         rows = [
-            states[elements.index(e + "'")] if e + "'" in elements else responses[plant.names.index(e.rstrip("'"))]
+            states[elements.index(e + "'")] if e + "'" in elements else responses[names.index(e.rstrip("'"))]
             for e in elements
         ]
         return states, np.array(rows)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fpirhc.plant.motion import followed_units
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
@@ -33,7 +34,7 @@ def by_name(names: Sequence[str], values: np.ndarray) -> dict[str, float]:
 
 def coordinate_unit(problem: Problem, coordinate: str) -> str:
     """Return the unit of a judged coordinate or output."""
-    return problem.plant.face.coordinates[coordinate]
+    return followed_units(problem.plant)[coordinate]
 
 
 def input_unit(problem: Problem, name: str) -> str:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fpirhc.plant.motion import followed_units
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import written_out
 from fpirhc.task.problem import Problem
@@ -113,7 +114,7 @@ def ranges(problem: Problem) -> dict[str, float]:
 
 def quarter_turns(problem: Problem) -> dict[str, float]:
     """Return a quarter turn for every judged angle whose reference does not move; beyond it gravity and projections turn round."""
-    moving, units = ranges(problem), problem.plant.face.coordinates
+    moving, units = ranges(problem), followed_units(problem.plant)
     return {n: _QUARTER_TURN[units[n]] for n in problem.judged_names if n not in moving and units[n] in _QUARTER_TURN}
 
 

@@ -59,7 +59,7 @@ def sentences(problem: Problem, known: Mapping[str, Information]) -> tuple[str, 
 
 def _given(problem: Problem) -> str:
     plant, sensing = problem.plant, problem.sensing
-    names = sensing.measures(plant) if sensing.estimates else (*plant.face.state.elements, *response_names(plant.face))
+    names = sensing.measures(plant) if sensing.estimates else (*plant.output.elements, *response_names(plant))
     if plant.outputs and sensing.observer is None:  # the state too
         names = (*plant.state.elements, *(n for n in names if n not in plant.state.elements))
     names = tuple(dict.fromkeys(names))  # an output of order 0 is its own response
@@ -103,7 +103,7 @@ def _used(problem: Problem, loop: Composite) -> tuple[str, ...]:
     for place, signal in enumerate(inside.reads.signals, start=1):
         if signal.name not in _SAMPLE:
             continue
-        names = names_of_responses(problem.plant.face, signal) if signal.name == "realised" else signal.elements
+        names = names_of_responses(problem.plant, signal) if signal.name == "realised" else signal.elements
         columns = {k for result in (0, 2) for k in inside.function.jac_sparsity(result, place).get_triplet()[1]}
         used += [names[k] for k in sorted(columns) if names[k] not in used]
     return tuple(used)

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fpirhc.by_name import FoundByName
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.units import with_space
 from fpirhc.simulation.common_columns import judged_motion
 from fpirhc.simulation.metrics.entries.commands import at_limit
@@ -156,7 +157,7 @@ def _sentence(
     if any(math.isnan(c.after) for c in changes.values()):
         return f"{head}failed, {adaptive} does not finish where {plain} does, with nothing to adapt."
     shown = sorted(changes.values(), key=lambda c: -c.ratio if c.ratio == c.ratio else 0.0)
-    units = {name: with_space(unit) for name, unit in null.plant.face.coordinates.items()}
+    units = {name: with_space(unit) for name, unit in followed_units(null.plant).items()}
     numbers = ", ".join(f"{c.name} {c.before:.3g} -> {c.after:.3g}{units[c.name]}" for c in shown)
     if outcome in (Outcome.BETTER, Outcome.NO_DIFFERENCE):
         tiny = all(c.size < ROUNDING for c in changes.values())
