@@ -34,6 +34,7 @@ KEPT = 1e-6  # the same as a share of half the range, where it has one
 _ITERATIONS = "iterations", "most_iterations"  # settings of an optimiser that bound its work
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 _PATIENCE = 4  # calls in a row that may leave the violation as it is
+_AT_LIMIT = 1e-9  # of the range of an input, within which it stands at a limit
 _SHRINKING = 0.9  # a violation counts as shrinking below this share of the last one
 
 
@@ -275,6 +276,26 @@ def improved(
         stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
     diagnostics[3] = iterations if diagnostics[3] >= 0 else diagnostics[3]
     return inputs, diagnostics, memory, count
+
+
+def first_plan(
+    optimiser: Optimiser, ocp: OptimalControl, state: np.ndarray, data: np.ndarray | ca.DM, *, calls: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Return what `improved` does from no input or, where that plan is at limits only, from their middle if this is cheaper.
+
+    A plan whose inputs all stand at a limit may be stationary because the plant has left what they act on: an empty tank
+    flows out as before, whatever the pump adds to nothing.
+    """
+    layout = optimiser.memory(ocp)
+    found = improved(optimiser, ocp, state, data, layout.start(), calls=calls)
+    lower, upper = (np.asarray(b)[:, None] for b in (ocp.input_lower, ocp.input_upper))
+    reach = upper - lower
+    if not np.isfinite(reach).all() or not (np.minimum(found[0] - lower, upper - found[0]) <= _AT_LIMIT * reach).all():
+        return found
+    memory = layout.start()
+    memory[layout.slice("plan_inputs")] = np.tile(lower + reach / 2, ocp.stages).ravel(order="F")
+    other = improved(optimiser, ocp, state, data, memory, calls=calls)
+    return other if other[1][4] == Status.OK and other[1][0] < found[1][0] else found
 
 
 class _Same:

@@ -18,7 +18,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Optimiser, improved, require_settings, sane, shift
+from fpirhc.optimisers.base import Optimiser, first_plan, require_settings, sane, shift
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
 from fpirhc.optimisers.plain import MOST, PlainSettings, plain_memory, plain_step, shifted_plain
@@ -128,7 +128,7 @@ class FixedPoint(Optimiser):
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
         """The memory after the first horizon is solved to the tolerance, as far as that succeeds."""
-        memory = improved(self, ocp, state, data, self.memory(ocp).start(), calls=_FIRST_CALLS)[2]
+        memory = first_plan(self, ocp, state, data, calls=_FIRST_CALLS)[2]
         return memory if np.isfinite(memory).all() else self.memory(ocp).start()
 
     def _plain(self, iterations: int, *, converging: bool) -> PlainSettings:

@@ -13,7 +13,7 @@ from fpirhc.by_name import ByName
 from fpirhc.fields.checked import checked_call
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
-from fpirhc.optimisers.base import FEASIBLE, Optimiser, improved, judge
+from fpirhc.optimisers.base import FEASIBLE, Optimiser, first_plan, improved, judge
 from fpirhc.optimisers.bounds import tolerated
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
@@ -157,17 +157,19 @@ def solve(
         state: s_0, shape (ns,).
         data: shape (ntheta, N + 1).
         calls: most calls of the optimiser's step.
-        start: first inputs, shape (nu, N); None: zero.
+        start: first inputs, shape (nu, N); None: zero, and the middle of the limits where that ends at limits only.
 
     Raises:
         NotSupported: the optimiser cannot serve the problem.
     """
     optimiser.check(ocp)
-    layout = optimiser.memory(ocp)
-    memory = layout.start()
-    inputs = np.zeros((ocp.input.size, ocp.stages)) if start is None else np.asarray(start, dtype=float)
-    memory[layout.slice("plan_inputs")] = inputs.ravel(order="F")
-    inputs, diagnostics, _, count = improved(optimiser, ocp, state, data, memory, calls=calls)
+    if start is None:
+        inputs, diagnostics, _, count = first_plan(optimiser, ocp, state, data, calls=calls)
+    else:
+        layout = optimiser.memory(ocp)
+        memory = layout.start()
+        memory[layout.slice("plan_inputs")] = np.asarray(start, dtype=float).ravel(order="F")
+        inputs, diagnostics, _, count = improved(optimiser, ocp, state, data, memory, calls=calls)
     states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
     status = Status(int(diagnostics[4]))
     known = status != Status.NON_FINITE

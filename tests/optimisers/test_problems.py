@@ -94,3 +94,32 @@ def test_indefinite_costs_are_refused_with_what_to_use_instead():
     ocp = transcribe(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), fp.Horizon(5, 0.1), cost, fp.Limits())
     with pytest.raises(fp.FpirhcError, match=r"bends upwards.*Use ReducedGradient"):
         fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.zeros(2), np.zeros((ocp.data.size, 6)))
+
+
+def test_a_first_plan_at_its_limits_alone_is_sought_again():
+    """A valve of the tanks 10 % off: from no input the search ends at an empty tank, in which no pump has an effect."""
+    task = fp.load_problem("leaking_tanks")
+    valves = dict(task.problem.plant.parameters)
+    valves["s2"] = replace(valves["s2"], approximate=4.4e-5)
+    problem = replace(task.problem, plant=replace(task.problem.plant, parameters=valves), duration=60.0)
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    ocp = transcribe(
+        problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, start=problem.start_state
+    )
+    data = np.asarray(
+        stage_data(problem.plant, problem.reference, problem.horizon, problem.cost)(
+            0.0, problem.plant.approximate
+        ).full()
+    )
+    first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-6)
+    empty = fp.solve(ocp, optimiser, first, data, start=np.zeros((1, ocp.stages)))
+    assert empty.status == fp.Status.OK
+    assert not empty.inputs.any()
+    found = fp.solve(ocp, optimiser, first, data)
+    assert found.cost == pytest.approx(fp.solve(ocp, fp.Ipopt(tolerance=1e-6), first, data).cost, rel=1e-6)
+    assert found.cost < 1e-3 * empty.cost
+    run = fp.simulate(problem, task.controllers["RHC"], seed=0, compiled=False)
+    assert run["command"].min() > 40.0
+    assert fp.measure(problem, run).rms_error["h2"] < 0.03
