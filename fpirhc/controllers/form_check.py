@@ -7,8 +7,8 @@ from typing import Protocol
 from fpirhc.controllers.mirror_path import NONE
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import form_inside
-from fpirhc.deformation.queue import every
 from fpirhc.errors import NotSupported
+from fpirhc.symbolic.queue import every
 from fpirhc.task.problem import Problem
 
 

@@ -25,7 +25,7 @@ from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, copied, live_number
-from fpirhc.symbolic.paths import changed_at, content_at, names_in, paths_to
+from fpirhc.symbolic.paths import changed_at, content_at, names_in, opened, paths_to
 from fpirhc.task.problem import Problem
 
 _OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing")
@@ -55,6 +55,11 @@ class LiveSettings:
     def start(self) -> dict[str, float]:
         """The numbers of the build by path."""
         return {path: float(self._content(path)) for path in (*self.paths, *self.automatic)}
+
+    @property
+    def of_problem(self) -> list[str]:
+        """The paths that begin at the problem."""
+        return [path for path in self.paths if self._in_problem(path)]
 
     @property
     def signals(self) -> Layout:
@@ -191,8 +196,10 @@ def live_settings(problem: Problem, controller: Controller, paths: Sequence[str]
         InvalidValue: no number stands at a path.
         NotSupported: a setting that decides what the loop is made of.
     """
-    ready = resolved(problem, controller)
     every = tuple(dict.fromkeys(end for path in paths for end in _ends(problem, controller, path)))
+    of_problem = [path for path in every if _owner(problem, controller, path) is problem]
+    problem, controller = opened(problem, of_problem), opened(controller, [p for p in every if p not in of_problem])
+    ready = resolved(problem, controller)
     automatic = tuple(_differences(controller, ready)) if every else ()
     return LiveSettings(problem, controller, ready, every, automatic)
 

@@ -24,12 +24,12 @@ from fpirhc.controllers.mirror_path import (
 )
 from fpirhc.controllers.twin import BEFORE, twin_block, twin_of_outputs
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.queue import every
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, unseen
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.queue import every
 from fpirhc.task.problem import Problem
 
 _BEFORE, _ANSWERS = "mirror_state_before", "mirror_answers"

@@ -10,10 +10,10 @@ import casadi as ca
 
 from fpirhc.controllers.exogenous_block import KnownSignals
 from fpirhc.deformation.base import Mirror
-from fpirhc.deformation.queue import Queue, every
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal, scalar
+from fpirhc.symbolic.queue import Queue, every
 from fpirhc.task.problem import Problem
 
 MEASURED_OUTPUT = "_measured_output"  # the outputs of the same instant

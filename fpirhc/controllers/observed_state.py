@@ -19,7 +19,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.exogenous_block import KnownSignals
-from fpirhc.deformation.queue import Queue
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
@@ -29,6 +28,8 @@ from fpirhc.symbolic.block import Block, Delay, bridged, call
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.gap import GAP
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.queue import Queue
 from fpirhc.task.problem import Problem
 
 
@@ -260,8 +261,10 @@ class SampleTime:
         """Queue of the commands: the newest one is that of the last cycle, and acts on the sample's cycle after all dead times."""
         names, late = self.problem.plant.inputs, self.late + more
         waits = [self.problem.dead_time.wait(name, self.problem.period) for name in names]
-        room = max((wait.room for wait in waits), default=0.0)
-        return Queue(tuple(cast(float, wait.cycles + late) for wait in waits), longest=room + late if room else None)
+        cycles = [cast(float, wait.cycles) for wait in waits]
+        rooms = [nominal(c) if wait.longest is None else wait.longest for c, wait in zip(cycles, waits, strict=True)]
+        longest = max(rooms) + late if any(wait.longest is not None for wait in waits) else None
+        return Queue(tuple(c + late for c in cycles), longest=longest)
 
     @property
     def _length(self) -> int:

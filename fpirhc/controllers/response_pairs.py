@@ -16,10 +16,10 @@ from functools import cached_property
 import casadi as ca
 
 from fpirhc.controllers.mirror_path import MEASURED, measured_output, measured_state
-from fpirhc.deformation.queue import Queue
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.gap import straightened
 from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.queue import Queue
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 
@@ -134,7 +134,7 @@ class ResponsePairs:
     def _commands(self) -> Queue:
         period, late = self.problem.period, self.dead_time
         waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)
-        return Queue(tuple(_rounded(wait / period) + self._delay for wait in waits))
+        return Queue(tuple(wait / period + self._delay for wait in waits))
 
 
 def _queued(s: Signals, name: str, queue: Queue, now: Expression) -> tuple[Expression, dict[str, Expression]]:
@@ -143,12 +143,6 @@ def _queued(s: Signals, name: str, queue: Queue, now: Expression) -> tuple[Expre
         return now, {}
     column, size = ca.vertcat(now, getattr(s, name)), now.numel()
     return queue.delayed(column, size), {f"{name}_next": column[: size * (queue.length - 1)]}
-
-
-def _rounded(cycles: float) -> float:
-    """The cycles; what is a whole number but for rounding is whole."""
-    whole = round(cycles)
-    return float(whole) if abs(cycles - whole) < _NONE * max(1, whole) else cycles
 
 
 def _past(name: str, elements: tuple[str, ...], first: list[float], length: int) -> tuple[Signal, ...]:

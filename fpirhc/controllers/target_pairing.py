@@ -21,12 +21,12 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.deformation.queue import MOST, Queue, every
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.maps import growth_of
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.queue import MOST, Queue, every
 from fpirhc.task.problem import Problem
 
 _STILL = 1e-9  # smallest decay of a settling mode, as a share of the fastest mode's rate
@@ -93,7 +93,7 @@ class ThroughModel(Checked):
         cycles = self._late(problem) / problem.period
         if cycles > MOST:
             raise InvalidValue(f"{self!r}: {cycles:g} cycles of dead time, more than {MOST}")
-        return Queue(round(cycles) if abs(cycles - round(cycles)) < 1e-9 else cycles)
+        return Queue(cycles)
 
     def memory(self, problem: Problem) -> tuple[Signal, ...]:
         """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start."""

@@ -20,14 +20,12 @@ from __future__ import annotations
 
 import math
 
-from fpirhc.deformation.queue import Cycles, every
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.functions import between, smaller, sqrt
+from fpirhc.symbolic.queue import MOST, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
-_LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
-
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
 
@@ -92,6 +90,37 @@ def check_pole(owner: str, pole: float) -> None:
     """Raise InvalidValue where the pole is outside [0, 1)."""
     if not (finite_number(pole) and 0 <= pole < 1):
         raise InvalidValue(f"{owner}(pole={pole!r}): expected a number from 0 (no leak) to below 1")
+
+
+def check_longest(owner: str, longest: float | None, cycles: Cycles) -> None:
+    """Raise InvalidValue for a longest dead time that is shorter than one of the dead times, or beyond 1000 cycles."""
+    if longest is not None and not max(every(cycles)) <= longest <= MOST:
+        raise InvalidValue(
+            f"{owner}: cycles={cycles!r} with longest={longest!r}: expected a longest dead time between the dead time and {MOST} "
+            "control cycles"
+        )
+
+
+def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
+    """Raise InvalidValue for a dead time that is negative, not finite, or beyond 1000 cycles, and for an empty tuple."""
+    values = every(cycles)
+    if not values or not all(finite_number(c) and 0 <= c <= MOST for c in values):
+        raise InvalidValue(
+            f"{owner}({name}={cycles!r}): expected a dead time between 0 and {MOST} control cycles, or a tuple with one for "
+            "every controlled coordinate"
+        )
+
+
+def check_uncertainty(owner: str, uncertainty: int, cycles: Cycles) -> None:
+    """Raise InvalidValue for an uncertainty that is no whole number or exceeds the shortest dead time, rounded up."""
+    shortest = min(every(cycles))
+    if not (
+        isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and 0 <= uncertainty <= math.ceil(shortest)
+    ):
+        raise InvalidValue(
+            f"{owner}(uncertainty={uncertainty!r}): expected whole cycles from 0 to {math.ceil(shortest)}, the dead time of "
+            f"{shortest:g} rounded up: a dead time cannot be too long by more than itself"
+        )
 
 
 def _least_pole(product: float, uncertainty: float) -> float:

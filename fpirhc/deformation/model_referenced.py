@@ -27,14 +27,14 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing
-from fpirhc.deformation.leaky import check_pole, chosen_pole
-from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every, several
+from fpirhc.deformation.leaky import check_cycles, check_pole, check_uncertainty, chosen_pole
 from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.queue import Cycles, Queue, every, several
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import ceil
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.task.dead_time import Wait, delay_block
+from fpirhc.symbolic.queue import Queue
+from fpirhc.task.dead_time import delay_block
 
 _STREAM = 1  # separates the sensors' random series from the series of disturbances
 
@@ -201,7 +202,7 @@ class Sensing(Checked):
             columns += [(lost.random(times.size) < sensor.dropout).astype(float)] if sensor.dropout else []
         return np.column_stack(columns) if columns else np.zeros((times.size, 0))
 
-    def raw(self, plant: Plant, first: Mapping[str, float], late: Wait | None) -> Signal:
+    def raw(self, plant: Plant, first: Mapping[str, float], late: Queue | None) -> Signal:
         """Signal of the raw measurements as they arrive, with their values at the start.
 
         Args:
@@ -214,7 +215,7 @@ class Sensing(Checked):
         return vector(name, names, [_unit(plant, n) for n in names], [first[n] for n in names])
 
     def blocks(
-        self, plant: Plant, first: Mapping[str, float], late: Wait | None, true: Sequence[Signal]
+        self, plant: Plant, first: Mapping[str, float], late: Queue | None, true: Sequence[Signal]
     ) -> list[Block]:
         """Blocks from the true motion and response to the raw measurements that arrive.
 

@@ -14,6 +14,7 @@ from fpirhc.fields.given import described
 from fpirhc.fields.kinds import finite_number, named_entries
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.paths import opened
 from fpirhc.task.problem import Problem
 
 Changes = Mapping[float, Numbers]  # by time, s
@@ -48,6 +49,7 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
     _check_times(changes)
     if not (live.paths or settings or changes):
         return InForce(problem, live.controller, {}, (), ())
+    problem = opened(problem, live.of_problem)
     first = replace(live, problem=problem)
     if problem.dead_time.longest != live.problem.dead_time.longest:
         raise InvalidValue(

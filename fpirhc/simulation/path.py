@@ -24,7 +24,8 @@ from fpirhc.simulation.exogenous_blocks import real_name
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.task.dead_time import MEASUREMENT, Wait, delay_block
+from fpirhc.symbolic.queue import Queue
+from fpirhc.task.dead_time import MEASUREMENT, delay_block
 from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, logged_signal
 from fpirhc.task.problem import Problem
 
@@ -145,7 +146,7 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
 
 
-def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Wait | None) -> list[Block]:
+def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Queue | None) -> list[Block]:
     """Blocks of the dead time from true signals to measured ones, with the values before the run."""
     if late is None:
         return [rename(f"see_{to.name}", true, to) for true, to, _ in states]

@@ -1,73 +1,26 @@
 """Dead time of a plant: the time that commands and measurements take to arrive.
 
-A queue implements a dead time of (d + phi) control cycles, 0 <= phi < 1: the input that acts in a cycle is
-
-    (1 - phi) u_{k-d} + phi u_{k-d-1},
-
-the mean over the cycle of the delayed, held command; measured values are interpolated in the same way. A computation that
-takes a full cycle is one more cycle of input dead time.
-
-A dead time may be live up to a stated longest one, `simulator(..., live=["dead_time.inputs.Q1"])`. The queue then has the length of
-the longest, and the place where it is read is data.
+A queue implements it (`fpirhc.symbolic.queue`). A computation that takes a full cycle is one more cycle of input dead time.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.functions import entry_at
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import Number, expressed, is_live, live_numbers, nominal
+from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.queue import MOST, Queue, room
 
-MOST = 1000  # cycles of dead time
 MEASUREMENT = "measurement"  # the name beside those of the inputs
-_WHOLE = 1e-9  # of a cycle: what differs from a whole number by less is that number
-
-
-@dataclass(frozen=True)
-class Wait:
-    """How long a value waits in a queue.
-
-    Args:
-        cycles: delay; it need not be whole.
-        room: longest delay that a run may set, in cycles; 0: none is live.
-    """
-
-    cycles: Number
-    room: float = 0.0
-
-    @property
-    def length(self) -> int:
-        """Values that the queue holds.
-
-        Raises:
-            NotSupported: a live delay without room.
-        """
-        for path in () if self.room else live_numbers(self.cycles):
-            raise NotSupported(
-                f"setting '{path}' cannot be live without its longest value, which is the length of a queue; state "
-                f"DeadTime(longest={{'{path.rpartition('.')[2]}': ...}})"
-            )
-        return math.ceil(max(nominal(self.cycles), self.room) - _WHOLE)
-
-    def read(self, past: Expression) -> Expression:
-        """Return what entered a queue `cycles` ago; the newest value is its first entry."""
-        if is_live(self.cycles):
-            return _read_live(past, expressed(self.cycles, past))
-        delay = float(self.cycles)
-        whole = math.floor(delay + _WHOLE)
-        share = max(delay - whole, 0.0) if whole < math.ceil(delay - _WHOLE) else 0.0
-        return past[whole] if share == 0 else (1 - share) * past[whole] + share * past[whole + 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +33,7 @@ class DeadTime(Checked):
         before: commands that are on their way at the start, by input. `Problem(input_before=...)` says the
             same, and also serves problems without dead time.
         longest: longest dead time, by input or "measurement", that a run may set; there is then a queue even where the dead time is
-            zero.
+            zero. Twice the dead time where it is not named.
     """
 
     inputs: Mapping[str, float] = field(default_factory=dict)
@@ -94,12 +47,19 @@ class DeadTime(Checked):
         late = {**self.inputs, MEASUREMENT: self.measurement}
         return tuple(n for n in dict.fromkeys((*late, *self.longest)) if n in self.longest or nominal(late[n]))
 
-    def wait(self, name: str, period: float) -> Wait:
-        """Return how long commands of an input, or measurements, wait."""
-        late = self.measurement if name == MEASUREMENT else self.inputs.get(name, 0.0)
-        return Wait(late / period, self.longest.get(name, 0.0) / period)
+    def opened(self, paths: tuple[str, ...]) -> DeadTime:
+        """Return it with queues of twice the dead time where one becomes live and no longest one is stated."""
+        late = {**self.inputs, MEASUREMENT: self.measurement}
+        names = [path.removeprefix("inputs.") for path in paths]
+        more = {n: room(late[n]) for n in names if late.get(n) and n not in self.longest}
+        return replace(self, longest={**self.longest, **more}) if more else self
 
-    def measurement_wait(self, period: float) -> Wait | None:
+    def wait(self, name: str, period: float) -> Queue:
+        """Return the queue in which commands of an input, or measurements, wait."""
+        late = self.measurement if name == MEASUREMENT else self.inputs.get(name, 0.0)
+        return Queue(late / period, longest=self.longest[name] / period if name in self.longest else None)
+
+    def measurement_wait(self, period: float) -> Queue | None:
         """Return how long measurements wait; None where there is no queue."""
         return self.wait(MEASUREMENT, period) if MEASUREMENT in self.queued else None
 
@@ -134,7 +94,7 @@ class DeadTime(Checked):
         mistakes.raise_if_any()
 
 
-def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Wait]) -> Block:
+def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Queue]) -> Block:
     """Block that delays every entry of `source` by its own number of cycles.
 
     Args:
@@ -146,7 +106,7 @@ def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Wait]
     Raises:
         NotSupported: a live delay without a stated longest one.
     """
-    lengths = [wait.length for wait in waits]
+    lengths = [wait.length - 1 for wait in waits]
     start = target.start_vector()
     queues = Signal(
         f"{name}_queue",
@@ -162,16 +122,9 @@ def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Wait]
         delayed, queues_next = [], []
         for k, (wait, n) in enumerate(zip(waits, lengths, strict=True)):
             past = ca.vertcat(now[k], queue[ends[k] : ends[k + 1]])
-            delayed.append(wait.read(past))
+            delayed.append(wait.delayed(past, 1))
             if n:  # CasADi's [:0] of one entry is that entry
                 queues_next.append(past[:n])
         return {target.name: ca.vertcat(*delayed), f"{queues.name}_next": ca.vertcat(*queues_next)}
 
     return Block(name, Layout((source,)), Layout((target,)), step, Layout((queues,)))
-
-
-def _read_live(past: Expression, delay: Expression) -> Expression:
-    """`Wait.read` with the delay as data, in the same operations."""
-    whole = ca.floor(delay + _WHOLE)
-    share = ca.if_else(whole < ca.ceil(delay - _WHOLE), ca.fmax(delay - whole, 0), 0)
-    return (1 - share) * entry_at(past, whole) + share * entry_at(past, whole + 1)

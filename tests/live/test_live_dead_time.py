@@ -10,7 +10,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.scenarios.bench import Bench, Conditions
@@ -142,13 +142,18 @@ def test_a_belief_that_is_set_is_the_one_that_is_built(name, compiled):
 
 
 def test_a_dead_time_is_live_up_to_its_stated_longest():
-    """Without a longest one there is no room in the queue; beyond it a number is refused before a run begins."""
-    with pytest.raises(NotSupported, match=r"dead_time\.inputs\.Q.*longest=\{'Q'"):
-        simulator(LATE.problem, LATE.controllers["CTC"], live=["dead_time.inputs.Q"])
-    with pytest.raises(NotSupported, match=r"deformation\.cycles.*longest"):
-        simulator(LATE.problem, LATE.controllers["CTC+FPI paired"], live=["deformation.cycles"])
-    with pytest.raises(NotSupported, match=r"inputs.*longest"):
-        simulator(LATE.problem, LATE.controllers["RHC"], live=["inputs"])
+    """Without a longest one there is room for twice the dead time; beyond it a number is refused before a run begins."""
+    late = LATE.problem.dead_time.inputs["Q"]
+    for name, path, value in (
+        ("CTC", "dead_time.inputs.Q", late),
+        ("CTC+FPI paired", "deformation.cycles", 60.0),
+        ("RHC", "inputs", late),
+    ):
+        short = replace(LATE.problem, duration=0.15, measure_from=0.0)
+        roomy = simulator(short, LATE.controllers[name], compiled=False, live=[path])
+        roomy.run(seed=0, settings={path: 2 * value}, variant=replace(short, duration=0.1))
+        with pytest.raises((InvalidValue, InvalidProblem), match="longest"):
+            roomy.run(seed=0, settings={path: 2.1 * value})
     ready = simulator(QUEUED, TWO.controllers["CTC"], compiled=False, live=PLANT)
     for value, words in (
         (0.0123, "longer than its stated longest"),

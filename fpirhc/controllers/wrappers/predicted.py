@@ -24,7 +24,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -42,10 +43,11 @@ from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.functions import entry_at, rounded
+from fpirhc.symbolic.functions import rounded
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import expressed, is_live, live_numbers
-from fpirhc.task.dead_time import MOST, DeadTime
+from fpirhc.symbolic.live import expressed, nominal
+from fpirhc.symbolic.queue import MOST, Queue, room
+from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 
 
@@ -170,7 +172,7 @@ class Predicted(Controller):
         inputs: dead time of the inputs, s; the sum of both dead times is rounded to control cycles.
         measurement: dead time of the measurement, s.
         by: how the state is predicted.
-        longest: the longest sum of both dead times that a run may set, s, `live=["inputs"]`; None: they are not live.
+        longest: the longest sum of both dead times that a run may set, s, `live=["inputs"]`; None: twice the sum.
 
     Raises:
         InvalidValue: a dead time that is negative or not finite; a longest one that is shorter than their sum.
@@ -210,9 +212,10 @@ class Predicted(Controller):
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """Return the notes of the wrapped controller; with set-points, that they are followed late by the dead time."""
         notes = self.controller.notes(problem)
-        if not own_signals(problem) or not self._cycles(problem):
+        cycles = nominal(self)._queue(problem).cycles
+        if not own_signals(problem) or not cycles:
             return notes
-        late = f"{self._cycles(problem) * problem.period:g} {problem.time_unit}"
+        late = f"{cast(float, cycles) * problem.period:g} {problem.time_unit}"
         return (
             *notes,
             f"Predicted follows set-points {late} late: one that is not known ahead cannot act before the dead time is over",
@@ -247,109 +250,63 @@ class Predicted(Controller):
         feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: plant.time}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
-        ahead_by = _Lead(self._cycles(problem), self._length(problem), self.inputs)
-        predict = _predict_block(problem, self.by, ahead_by, before, tuple(ahead.values()))
+        predict = _predict_block(problem, self, self._queue(problem), before, tuple(ahead.values()))
         return [predict, embedded("controller", inner, feeds)], [Delay(before, sent.name)]
 
-    def _cycles(self, problem: Problem) -> float:
-        """Cycles over which the state is predicted; they may be live."""
-        return rounded((self.inputs + self.measurement) / problem.period)
+    def opened(self, paths: tuple[str, ...]) -> Predicted:
+        """Return it with a queue of twice the dead time where a dead time becomes live and no longest one is stated."""
+        if self.longest is not None or not {"inputs", "measurement"} & set(paths):
+            return self
+        return replace(self, longest=room(self.inputs + self.measurement))
+
+    def _queue(self, problem: Problem) -> Queue:
+        """The values that are on their way; as many as the cycles over which the state is predicted."""
+        longest = None if self.longest is None else round(self.longest / problem.period)
+        return Queue(rounded((self.inputs + self.measurement) / problem.period), longest=longest)
 
     def _length(self, problem: Problem) -> int:
-        """Cycles for which there is a queue."""
-        if self.longest is not None:
-            return round(self.longest / problem.period)
-        for path in live_numbers(self.inputs, self.measurement):
-            raise NotSupported(
-                f"setting '{path}' cannot be live without its longest value, which is the length of a queue; give "
-                "Predicted(longest=...)"
-            )
-        return int(self._cycles(problem))
+        """Most cycles over which the state may be predicted."""
+        return self._queue(problem).length - 1
 
 
-@dataclass(frozen=True)
-class _Lead:
-    """How far ahead the state is predicted.
-
-    Args:
-        cycles: over which the state is integrated; they may be live.
-        longest: cycles for which there is a queue.
-        time: by which the clock is ahead, s.
-    """
-
-    cycles: float
-    longest: int
-    time: float
-
-    def cycles_of(self, like_this: Expression) -> Expression:
-        """Return the cycles as an expression of the same kind."""
-        return expressed(self.cycles, like_this) if is_live(self.cycles) else expression(float(self.cycles))
-
-    def oldest(self, queued: Expression, size: int) -> Expression:
-        """Return the value that acted while the response was realised."""
-        if not is_live(self.cycles):
-            return queued[size * int(self.cycles) : size * (int(self.cycles) + 1)]
-        place = expressed(self.cycles, queued)
-        return ca.vertcat(*(entry_at(queued[j::size], place) for j in range(size)))
-
-    def integrated(
-        self, advance: ca.Function, state: Expression, sent: list[Expression], same: list[Expression]
-    ) -> Expression:
-        """Return the state after the values on their way, `sent`, the oldest of which is the last one."""
-        if not is_live(self.cycles):
-            count = int(self.cycles)
-            if not count:
-                return state
-            columns = ca.horzcat(*reversed(sent[:count]))
-            path = advance.mapaccum("fpirhc_predicted", count)(state, columns, *(ca.repmat(v, 1, count) for v in same))
-            return path[:, -1]
-        # Where fewer values are on their way than the queue holds, the first steps leave the state as it is.
-        x, u, due = ca.SX.sym("x", state.numel()), ca.SX.sym("u", sent[0].numel()), ca.SX.sym("due")
-        held = [ca.SX.sym(f"held{k}", v.numel()) for k, v in enumerate(same)]
-        step = ca.Function("fpirhc_due", [x, u, *held, due], [ca.if_else(due, advance(x, u, *held), x)])
-        acts = expressed(self.cycles, state) > ca.DM(list(reversed(range(self.longest)))).T
-        columns = ca.horzcat(*reversed(sent))
-        repeated = (ca.repmat(v, 1, self.longest) for v in same)
-        return step.mapaccum("fpirhc_predicted", self.longest)(state, columns, *repeated, acts)[:, -1]
-
-
-def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal, writes: tuple[Signal, ...]) -> Block:
-    plant, size, cycles = problem.plant, before.size, lead.longest
+def _predict_block(
+    problem: Problem, ahead: Predicted, queue: Queue, before: Signal, writes: tuple[Signal, ...]
+) -> Block:
+    plant, size, by = problem.plant, before.size, ahead.by
     # One value more than is on its way: the oldest acted while the response was realised.
-    past = tuple(f"{e}@{k}" for k in range(1, cycles + 2) for e in before.elements)
-    queue = Signal("sent", past, start=by.sent_at_start(problem) * (cycles + 1))
+    past = tuple(f"{e}@{k}" for k in range(1, queue.length + 1) for e in before.elements)
+    sent = Signal("sent", past, start=by.sent_at_start(problem) * queue.length)
     residual = Signal("residual", plant.names, plant.response_units)
-    advance = by.advance(plant, problem.period)
+    advance, cycles = by.advance(plant, problem.period), cast(float, queue.cycles)
     corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
     responses = (plant.response_signal("realised"),) if corrected else ()
     reads = (plant.time, *measured_signals(plant), *responses, plant.parameter, before)
     last = _answered_at(problem) if corrected else ()
-    own = (queue, residual, *last) if corrected else (queue,)
+    own = (sent, residual, *last) if corrected else (sent,)
     # An output that is the state is where the state is.
     outputs_ahead = {s.name: output_ahead(plant) for s in measured_signals(plant)[1:]}
 
     def step(s: Signals) -> dict[str, Expression]:
-        queued = ca.vertcat(s._sent_before, s.sent[: size * cycles])
+        queued = queue.pushed(s.sent, s._sent_before)
         memory_next = {"sent_next": queued}
         error = expression(ca.MX.zeros(len(plant.names)))
         if corrected:
             at = getattr(s, last[0].name) if last else s.state
-            error = corrected(s.residual, at, lead.oldest(queued, size), s.realised, s.parameters)
+            error = corrected(s.residual, at, queue.delayed(queued, size), s.realised, s.parameters)
             memory_next |= {"residual_next": error, **{f"{signal.name}_next": s.state for signal in last}}
-        on_their_way = [queued[size * k : size * (k + 1)] for k in range(cycles)]
-        state = lead.integrated(advance, s.state, on_their_way, [s.parameters, error])
+        state = queue.driven(advance, s.state, queued, size, [s.parameters, error])
         for name, function in outputs_ahead.items():
-            time = lead.cycles_of(s.state) * problem.period
+            time = expressed(cycles, s.state) * problem.period
             memory_next[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, time)
-        return {"time_ahead": s.time + lead.time, "state_ahead": state, **memory_next}
+        return {"time_ahead": s.time + ahead.inputs, "state_ahead": state, **memory_next}
 
     def wait(s: Signals) -> dict[str, Expression]:
         """The value that is held was sent once more."""
-        later = {"sent_next": ca.vertcat(s._sent_before, s.sent[: size * cycles]), "time_ahead": s.time + lead.time}
+        later = {"sent_next": queue.pushed(s.sent, s._sent_before), "time_ahead": s.time + ahead.inputs}
         return {**later, **{f"{signal.name}_next": getattr(s, signal.name) for signal in own[1:]}}
 
-    ahead = tuple(w for w in writes if w.name == "time_ahead")
-    waits = Block("predict_waits", Layout((plant.time, before)), Layout(ahead), wait, Layout(own))
+    time = tuple(w for w in writes if w.name == "time_ahead")
+    waits = Block("predict_waits", Layout((plant.time, before)), Layout(time), wait, Layout(own))
     return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True, waits=waits)
 
 

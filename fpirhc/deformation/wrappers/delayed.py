@@ -26,17 +26,17 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Pairing
-from fpirhc.deformation.leaky import check_pole, chosen_pole
-from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_longest, check_uncertainty, every, several
+from fpirhc.deformation.leaky import check_cycles, check_longest, check_pole, check_uncertainty, chosen_pole
 from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.queue import MOST, Cycles, Queue, every, room, several
 
 __all__ = ["MOST", "Increment", "Paired"]
 
@@ -56,7 +56,7 @@ class _Queued(Wrapper):
         map: any deformation that iterates.
         cycles: dead time d between a request and its response, beyond the one cycle that every loop has; a tuple gives every
             controlled coordinate its own.
-        longest: longest dead time that a run may set, `live=["deformation.cycles"]`; None: the dead time is not live.
+        longest: longest dead time that a run may set, `live=["deformation.cycles"]`; None: twice the dead time.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
@@ -71,6 +71,11 @@ class _Queued(Wrapper):
         pairing = Pairing(max(every(self.cycles)), channels=several(self.cycles))
         channels = len(every(self.cycles)) if several(self.cycles) else self.map.iteration.channels
         return replace(self.map.iteration, pairing=pairing, channels=channels)
+
+    def opened(self, paths: tuple[str, ...]) -> Self:
+        """Return it with queues of twice the dead time where that becomes live and no longest one is stated."""
+        live = any(path.startswith("cycles") for path in paths)
+        return replace(self, longest=room(max(every(self.cycles)))) if live and self.longest is None else self
 
     @property
     @abstractmethod
@@ -131,7 +136,7 @@ class Paired(_Queued):
         map: any deformation that iterates.
         cycles: dead time d, or one for every controlled coordinate.
         uncertainty: half width of the triangular mean over the requests around the pair, whole cycles, at most d.
-        longest: longest dead time that a run may set; None: the dead time is not live.
+        longest: longest dead time that a run may set; None: twice the dead time.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
@@ -176,7 +181,7 @@ class Increment(_Queued):
         uncertainty: m, by how many cycles the dead time may be wrong, at most d rounded up; None: max(1, 10 % of d), and 0
             without dead time.
         pole: p of the leak, in [0, 1); None: from the uncertainty, by the theorem.
-        longest: longest dead time that a run may set; None: the dead time is not live.
+        longest: longest dead time that a run may set; None: twice the dead time.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time; a pole

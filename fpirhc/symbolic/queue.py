@@ -1,18 +1,19 @@
-"""Past values of a vector, each entry with a delay of its own; pairing remembers them.
+"""Past values of a vector, each entry with a delay of its own; a fraction of a cycle is interpolated.
 
-A delay may be live up to a stated longest one: the queue then has the length of the longest, and the place where it is read is
-data.
+A delay of (d + phi) control cycles, 0 <= phi < 1, is the mean over the cycle of the delayed, held value,
+
+    (1 - phi) u_{k-d} + phi u_{k-d-1}.        A delay may be live up to `longest`: the place in the queue is then data.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.fields.kinds import finite_number
+from fpirhc.errors import NotSupported
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.functions import ceil, entry_at
 from fpirhc.symbolic.layout import Expression
@@ -20,11 +21,12 @@ from fpirhc.symbolic.live import expressed, is_live, live_numbers, nominal
 
 MOST = 1000  # cycles of dead time; the memory has a fixed size
 Cycles = float | tuple[float, ...]  # one dead time for all channels, or one for each
+_WHOLE = 1e-9  # of a cycle: what differs from a whole number by less is that number
 
 
 @dataclass(frozen=True)
 class Queue:
-    """Delays of the entries of a vector; a fraction of a cycle is interpolated between two cycles.
+    """Delays of the entries of a vector.
 
     The column of past values holds the newest value of every entry first, then the values of the cycle before, and so on.
 
@@ -40,16 +42,24 @@ class Queue:
 
     @property
     def length(self) -> int:
-        """Number of cycles that are remembered, the newest included."""
+        """Number of cycles that are remembered, the newest included.
+
+        Raises:
+            NotSupported: a live delay without a longest one.
+        """
         if self.longest is not None:
-            return math.ceil(self.longest) + self.width + 1
-        self._refuse_without_room()
+            return math.ceil(self.longest - _WHOLE) + self.width + 1
+        for path in live_numbers(self.cycles):
+            raise NotSupported(
+                f"setting '{path}' cannot be live here without its longest value, which is the length of a queue; state it as "
+                "longest=..."
+            )
         return self._reach(nominal(self.cycles))
 
     def needed(self, beside: Expression) -> Expression | int:
         """Return how many of them the delays reach back to; `beside` is an expression of the same kind."""
         if not is_live(self.cycles):
-            return self._reach(self.cycles)
+            return self._reach(nominal(self.cycles))
         ends = [expressed(ceil(c), beside) for c in every(self.cycles)]
         return ca.mmax(ca.vertcat(*ends)) + self.width + 1
 
@@ -64,14 +74,42 @@ class Queue:
         if is_live(self.cycles):
             each = every(self.cycles) * (1 if isinstance(self.cycles, tuple) else size)
             return ca.vertcat(*(self._read(queue[j::size], c) for j, c in enumerate(each)))
-        if not isinstance(self.cycles, tuple):
-            shares = self._shares(self.cycles)
+        cycles = nominal(self.cycles)
+        if not isinstance(cycles, tuple):
+            shares = self._shares(cycles)
             return total(share * queue[size * k : size * (k + 1)] for k, share in shares.items())
-        channels = [self._shares(c) for c in self.cycles]
+        channels = [self._shares(c) for c in cycles]
         entries = (
             total(share * queue[size * k + j] for k, share in shares.items()) for j, shares in enumerate(channels)
         )
         return ca.vertcat(*entries)
+
+    def driven(
+        self, step: ca.Function, state: Expression, queue: Expression, size: int, held: Sequence[Expression]
+    ) -> Expression:
+        """Return a state after the values that are on their way, the oldest first; the delay is whole and one for all entries.
+
+        Args:
+            step: Function (state, value, held...) -> state one cycle later.
+            state: of now.
+            queue: the past values; those that entered less than `cycles` ago are on their way.
+            size: number of entries of a value.
+            held: arguments that stay the same.
+        """
+        assert not isinstance(self.cycles, tuple)
+        longest = int(nominal(self.cycles)) if not is_live(self.cycles) else self.length - 1
+        if not longest:
+            return state
+        columns = ca.horzcat(*(queue[size * k : size * (k + 1)] for k in reversed(range(longest))))
+        repeated = (ca.repmat(v, 1, longest) for v in held)
+        if not is_live(self.cycles):
+            return step.mapaccum("fpirhc_driven", longest)(state, columns, *repeated)[:, -1]
+        # Where fewer values are on their way than the queue holds, the first steps leave the state as it is.
+        x, u, due = ca.SX.sym("x", state.numel()), ca.SX.sym("u", size), ca.SX.sym("due")
+        same = [ca.SX.sym(f"held{k}", v.numel()) for k, v in enumerate(held)]
+        one = ca.Function("fpirhc_due", [x, u, *same, due], [ca.if_else(due, step(x, u, *same), x)])
+        acts = expressed(self.cycles, state) > ca.DM(list(reversed(range(longest)))).T
+        return one.mapaccum("fpirhc_driven", longest)(state, columns, *repeated, acts)[:, -1]
 
     def _reach(self, cycles: Cycles) -> int:
         return max(max(self._shares(c)) for c in every(cycles)) + 1
@@ -79,8 +117,9 @@ class Queue:
     def _read(self, past: Expression, cycles: float) -> Expression:
         """What was pushed a live number of cycles ago: the sum of `_shares`, in the same operations."""
         delay = expressed(cycles, past)
-        whole = ca.floor(delay)
-        part, heights = delay - whole, [self._height(j) for j in range(-self.width, self.width + 1)]
+        whole = ca.floor(delay + _WHOLE)
+        part = ca.if_else(whole < ca.ceil(delay - _WHOLE), ca.fmax(delay - whole, 0), 0)
+        heights = [self._height(j) for j in range(-self.width, self.width + 1)]
         shares = [
             before * part + own * (1 - part) for before, own in zip([0.0, *heights], [*heights, 0.0], strict=True)
         ]
@@ -90,23 +129,22 @@ class Queue:
         """Of the triangle, `j` cycles from its middle."""
         return (1 - abs(j) / (self.width + 1)) / (self.width + 1)
 
-    def _refuse_without_room(self) -> None:
-        for path in live_numbers(self.cycles):
-            raise NotSupported(
-                f"setting '{path}' cannot be live without its longest value, which is the length of a queue; give longest=... "
-                "beside cycles=..."
-            )
-
     def _shares(self, cycles: float) -> dict[int, float]:
         """Weights of what was pushed k cycles ago: a triangle over `width` cycles on both sides of `cycles`, interpolated."""
         shares: dict[int, float] = {}
-        whole, part = math.floor(cycles), cycles - math.floor(cycles)
+        whole = math.floor(cycles + _WHOLE)
+        part = max(cycles - whole, 0.0) if whole < math.ceil(cycles - _WHOLE) else 0.0
         for j in range(-self.width, self.width + 1):
             height = self._height(j)
             for place, share in ((whole + j, height * (1 - part)), (whole + j + 1, height * part)):
                 if share > 0:
                     shares[place] = shares.get(place, 0.0) + share
         return shares
+
+
+def room(delay: float) -> float:
+    """Return the longest delay that a run may set where none is stated: twice the delay of the build."""
+    return 2 * delay
 
 
 def every(cycles: Cycles) -> tuple[float, ...]:
@@ -117,34 +155,3 @@ def every(cycles: Cycles) -> tuple[float, ...]:
 def several(cycles: Cycles) -> tuple[float, ...]:
     """The dead times where each entry has its own; else an empty tuple."""
     return cycles if isinstance(cycles, tuple) else ()
-
-
-def check_longest(owner: str, longest: float | None, cycles: Cycles) -> None:
-    """Raise InvalidValue for a longest dead time that is shorter than one of the dead times, or beyond 1000 cycles."""
-    if longest is not None and not max(every(cycles)) <= longest <= MOST:
-        raise InvalidValue(
-            f"{owner}: cycles={cycles!r} with longest={longest!r}: expected a longest dead time between the dead time and {MOST} "
-            "control cycles"
-        )
-
-
-def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
-    """Raise InvalidValue for a dead time that is negative, not finite, or beyond 1000 cycles, and for an empty tuple."""
-    values = every(cycles)
-    if not values or not all(finite_number(c) and 0 <= c <= MOST for c in values):
-        raise InvalidValue(
-            f"{owner}({name}={cycles!r}): expected a dead time between 0 and {MOST} control cycles, or a tuple with one for "
-            "every controlled coordinate"
-        )
-
-
-def check_uncertainty(owner: str, uncertainty: int, cycles: Cycles) -> None:
-    """Raise InvalidValue for an uncertainty that is no whole number or exceeds the shortest dead time, rounded up."""
-    shortest = min(every(cycles))
-    if not (
-        isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and 0 <= uncertainty <= math.ceil(shortest)
-    ):
-        raise InvalidValue(
-            f"{owner}(uncertainty={uncertainty!r}): expected whole cycles from 0 to {math.ceil(shortest)}, the dead time of "
-            f"{shortest:g} rounded up: a dead time cannot be too long by more than itself"
-        )
