@@ -119,6 +119,8 @@ def test_a_first_plan_at_its_limits_alone_is_sought_again():
     assert not empty.inputs.any()
     found = fp.solve(ocp, optimiser, first, data)
     assert found.cost == pytest.approx(fp.solve(ocp, fp.Ipopt(tolerance=1e-6), first, data).cost, rel=1e-6)
+    assert empty.cost is not None
+    assert found.cost is not None
     assert found.cost < 1e-3 * empty.cost
     run = fp.simulate(problem, task.controllers["RHC"], seed=0, compiled=False)
     assert run["command"].min() > 40.0
