@@ -19,7 +19,7 @@ SECTIONS = {
     "Horizons and optimisers": ("horizon", "optimisers"),
     "Learning": ("learning",),
     "Running and measuring": ("simulation", "status"),
-    "Review, studies and reports": ("review", "studies", "report", "baselines"),
+    "Review, studies and reports": ("review", "probing", "studies", "report", "baselines"),
     "Testing and errors": ("conformance", "errors"),
 }
 BESIDE = {  # for authors of members and for tools; imported from the module
@@ -31,6 +31,7 @@ BESIDE = {  # for authors of members and for tools; imported from the module
     "Metrics": "fpirhc.simulation.metrics",
     "OutputChain": "fpirhc.plant.relative_order",
     "Prediction": "fpirhc.review.response_prediction",
+    "Probe": "fpirhc.probing.probe",
     "Regressor": "fpirhc.plant.regressor",
     "Review": "fpirhc.review.answer",
     "ScenarioComparison": "fpirhc.studies.scenarios.scenario_comparison",

@@ -63,6 +63,7 @@ from .plant.output import Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
 from .plant.plant import Parameter, Plant
 from .plant.regressor import linear_parameters
+from .probing.probe import probe
 from .problem_files.problem_file import load_problem
 from .problem_files.settings import LogSpan, Span, with_settings
 from .report.html import write_report
@@ -260,6 +261,7 @@ __all__ = [
     "measure",
     "outside",
     "predict_response",
+    "probe",
     "review",
     "signed_power",
     "simulate",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import shlex
 import subprocess
@@ -268,6 +269,11 @@ def stale() -> None:
 JOURNEYS: dict[str, Any] = {
     "list": [(None, "", 0), (None, "--alll", 2)],
     "review": [(None, "line.py", 0), (None, "line.py --mismatch 250", 2), (too_weak, "line.py", 1)],
+    "probe": [
+        (None, "line.py --cycles 80 --no-trials", 0),
+        (None, "line.py --cycles 10", 2),
+        (too_weak, "line.py --cycles 80", 1),
+    ],
     "solve": [
         (None, "line.py", 2),
         (receding, "line.py", 0),
@@ -399,3 +405,19 @@ def test_seeds_is_scenarios_for_one_version(name, capsys):
     assert (options.scenarios, options.seed) == (7, 3)
     assert "the option --seeds is now --scenarios" in capsys.readouterr().err
     assert "--seeds" not in help_of(name, capsys)
+
+
+# --- probe ------------------------------------------------------------------------------------------------------------
+
+
+def test_journey_of_probe(folder, capsys):
+    """The estimates of a problem whose plant is 1.6 times as strong as its model, as text and as JSON."""
+    words = ["probe", "line.py", "--cycles", "60", "--controller", "CTC", "--no-trials"]
+    assert main(words) == ExitCode.FINISHED
+    printed = capsys.readouterr().out
+    assert re.search(r"gain of y +1\.6", printed)
+    assert re.search(r"dead time of u, cycles +0", printed)
+    assert "deformation=fp." in printed
+    assert main([*words, "--json"]) == ExitCode.FINISHED
+    facts = json.loads(capsys.readouterr().out)
+    assert set(facts) == {"gain", "dead_time", "lag", "noise", "drift", "lines", "why", "trials", "notes"}

@@ -1,0 +1,220 @@
+"""Gain, dead time, lag, noise and drift of a response f, from the model's response m to the commands that acted.
+
+    f_i = sum_j lambda_ij (G m)_j + w_i + n_i,        G: d cycles, then x_k = rho x_{k-1} + (1 - rho) m_k with rho = e^(-T / tau)
+
+w drifts (white noise, integrated p times), n is noise (white, or a difference of white noise where positions are differentiated).
+For every d, tau and share of the drift the differences are whitened, and lambda is least squares: the exact profile of the
+likelihood, as in L. Ljung, System Identification, 1999, sec. 7.4. It is consistent in closed loop: every loop has a cycle of delay.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from scipy.signal import lfilter
+
+from fpirhc.errors import InvalidValue
+
+LEAST_CYCLES = 40
+_ENOUGH = 5.0  # difference of 2 log L, with which a dead time or a lag is still in its interval
+_WIDER = 1.5  # factor of all intervals: no body is exactly of this form
+_MOST_DEAD = 10  # cycles that are searched first
+_SETTLED = 5  # cycles after the longest dead time that count
+_COARSE_LAGS, _FINE_LAGS = 12, 25
+_NOISES = ((1, 0), (2, 0), (1, 1), (2, 1))  # integrations of the drift, differences of the noise
+_COARSE, _FINE = np.arange(-8, 3.1, 1.0), np.arange(-8, 3.1, 0.5)  # log10 of the drift's share
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate and what contains the truth 19 times of 20."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether it is one number."""
+        return self.low == self.high
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """What one response is made of.
+
+    Args:
+        gains: lambda_ij of every model response j.
+        dead_time: d, cycles.
+        lag: tau, in the problem's unit of time.
+        noise: rms of what is no response of the plant.
+        drift: what is, and the model does not have: w by cycle.
+        drifting: rms change of w per square root of the unit of time.
+        edge: what the record is too short to bound: "dead time", "lag", or nothing.
+    """
+
+    gains: tuple[Interval, ...]
+    dead_time: Interval
+    lag: Interval
+    noise: float
+    drift: np.ndarray = field(repr=False)
+    drifting: float = 0.0
+    edge: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """One point of the search."""
+
+    likelihood: float
+    dead: int
+    lag: float
+    noise: tuple[int, int]
+    ratio: float
+    gains: np.ndarray
+    deviation: np.ndarray
+    innovation: float
+
+
+def identify(
+    measured: np.ndarray, modelled: np.ndarray, period: float, usable: np.ndarray | None = None
+) -> tuple[Channel, ...]:
+    """Return what every response is made of.
+
+    Args:
+        measured: f, shape (cycles, n).
+        modelled: m of the same cycles, shape (cycles, n).
+        period: of the control cycle.
+        usable: which cycles count; None: all.
+
+    Raises:
+        InvalidValue: fewer than 40 cycles, or a model response that does not move.
+    """
+    cycles = len(measured)
+    if cycles < LEAST_CYCLES:
+        raise InvalidValue(f"probe: {cycles} cycles of record; at least {LEAST_CYCLES} are needed, 50 to 500 are usual")
+    still = np.ptp(modelled, axis=0) <= 1e-12 * (1 + np.abs(modelled).max(axis=0))
+    if still.any():
+        raise InvalidValue(
+            f"probe: the model's response {int(np.argmax(still)) + 1} does not move in the record, so its gain is not known; "
+            "excite it, or record a run in which the commands move"
+        )
+    good = np.ones(cycles, dtype=bool) if usable is None else usable
+    return tuple(_channel(measured[:, i], modelled, period, good) for i in range(measured.shape[1]))
+
+
+def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> Channel:
+    cycles, most = len(f), _MOST_DEAD
+    while True:  # an estimate at the edge of the search widens it
+        lags = np.r_[0.0, np.geomspace(0.4 * period, 0.2 * cycles * period, _COARSE_LAGS)]
+        fits = _profile(f, m, period, good, range(most + 1), lags, _COARSE)
+        best = max(fits, key=lambda one: one.likelihood)
+        if best.dead < most - 1 or 2 * most > cycles // 4:
+            break
+        most *= 2
+    near = _near(fits, 40.0)
+    deads = range(max(min(one.dead for one in near) - 1, 0), min(max(one.dead for one in near) + 2, most + 1))
+    low = max((tau for tau in lags if tau < min(one.lag for one in near)), default=0.0)
+    high = min((tau for tau in lags if tau > max(one.lag for one in near)), default=float(lags[-1]))
+    fine = np.linspace(low, high, _FINE_LAGS) if low < 0.4 * period else np.geomspace(low, high, _FINE_LAGS)
+    fits += _profile(f, m, period, good, list(deads)[:_MOST_DEAD], fine, _FINE)
+    return _answer(f, m, period, fits, (most, float(lags[-1])))
+
+
+def _answer(f: np.ndarray, m: np.ndarray, period: float, fits: list[_Fit], searched: tuple[int, float]) -> Channel:
+    best, near = max(fits, key=lambda one: one.likelihood), _near(fits, _ENOUGH * _WIDER**2)
+    within = np.array([one.gains for one in _near(fits, _ENOUGH)])
+    half = _WIDER * np.hypot(2 * best.deviation, 0.5 * np.ptp(within, axis=0))
+    gains = tuple(Interval(float(g), float(g - h), float(g + h)) for g, h in zip(best.gains, half, strict=True))
+    dead = Interval(best.dead, min(one.dead for one in near), max(one.dead for one in near))
+    lag = Interval(best.lag, min(one.lag for one in near), max(one.lag for one in near))
+    differences = best.noise[1]
+    root = abs(_whitener(sum(best.noise), best.ratio)[-1])
+    noise = math.sqrt(best.innovation * root * (2 if differences else 1))
+    rest = f - delayed(m, best.dead, best.lag, period) @ best.gains
+    drift = _smoothed(rest, *best.noise, 10.0**best.ratio)
+    moved = float(np.sqrt(np.mean(np.diff(drift[_SETTLED:]) ** 2) / period))
+    edge = "dead time" if dead.high >= searched[0] else "lag" if lag.high >= searched[1] else ""
+    return Channel(gains, dead, lag, noise, drift, moved, edge)
+
+
+def delayed(m: np.ndarray, dead: int, lag: float, period: float) -> np.ndarray:
+    """Return G m of model responses, shape (cycles, n): late by whole cycles and lagging; before the record it is at rest."""
+    late = np.vstack([np.repeat(m[:1], dead, axis=0), m[: len(m) - dead]])
+    if not lag:
+        return late
+    rho = math.exp(-period / lag)
+    return np.asarray(lfilter([1 - rho], [1, -rho], late, axis=0, zi=rho * late[:1])[0])
+
+
+def _profile(
+    f: np.ndarray,
+    m: np.ndarray,
+    period: float,
+    good: np.ndarray,
+    deads: Sequence[int],
+    lags: np.ndarray,
+    ratios: np.ndarray,
+) -> list[_Fit]:
+    """The best gains at every point of a grid; all points of one noise are whitened together."""
+    points = [(d, float(tau)) for d in deads for tau in lags]
+    rows = np.array([delayed(m, d, tau, period).T for d, tau in points])  # (points, n, cycles)
+    counts = good.copy()
+    counts[: min(max(deads) + _SETTLED, len(f) // 3)] = False
+    found = []
+    for p, c in _NOISES:
+        x, y = (np.diff(one, p, axis=-1) for one in (rows, f))
+        some = counts[p:]
+        total = int(some.sum())
+        for ratio in ratios:
+            whitener = _whitener(p + c, float(ratio))
+            xw, yw = (lfilter([1.0], whitener, one, axis=-1)[..., some] for one in (x, y))
+            square = xw @ xw.transpose(0, 2, 1)
+            square += 1e-12 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(m.shape[1])
+            inverse, mixed = np.linalg.inv(square), xw @ yw
+            gains = (inverse @ mixed[..., None])[..., 0]
+            rest = np.maximum(yw @ yw - np.sum(gains * mixed, axis=1), 1e-300) / total
+            spread = np.sqrt(rest[:, None] * np.diagonal(inverse, axis1=1, axis2=2))
+            likelihood = -0.5 * total * np.log(rest)
+            found += [
+                _Fit(float(value), d, tau, (p, c), float(ratio), gain, std, float(s))
+                for (d, tau), value, gain, std, s in zip(points, likelihood, gains, spread, rest, strict=True)
+            ]
+    return found
+
+
+def _near(fits: Sequence[_Fit], distance: float) -> list[_Fit]:
+    """The points whose 2 log L is that near to the best."""
+    best = max(one.likelihood for one in fits)
+    return [one for one in fits if 2 * (best - one.likelihood) < distance]
+
+
+@cache
+def _whitener(order: int, ratio: float) -> np.ndarray:
+    """The stable factor of r z^n + (-1)^n (1 - z)^2n: the moving average that drift and noise are together."""
+    difference = np.array([1.0])
+    for _ in range(2 * order):
+        difference = np.convolve(difference, [1.0, -1.0])
+    spectrum = (-1) ** order * difference
+    spectrum[order] += 10.0**ratio
+    roots = np.roots(spectrum)
+    return np.real(np.poly(roots[np.argsort(np.abs(roots))][:order]))
+
+
+def _smoothed(rest: np.ndarray, integrations: int, differences: int, ratio: float) -> np.ndarray:
+    """The drift in what the gains leave: the smoother of its own model, by penalised least squares."""
+    from scipy import sparse
+    from scipy.sparse.linalg import spsolve
+
+    size = len(rest)
+    jumps = sparse.eye(size, format="csc")
+    for _ in range(integrations):
+        rows = jumps.shape[0] - 1
+        jumps = sparse.diags([-np.ones(rows), np.ones(rows)], [0, 1], shape=(rows, rows + 1)) @ jumps
+    summed = sparse.csc_matrix(np.tril(np.ones((size, size)))) if differences else sparse.eye(size, format="csc")
+    normal = summed.T @ summed + (jumps.T @ jumps) / max(ratio, 1e-9)
+    return np.asarray(spsolve(sparse.csc_matrix(normal), summed.T @ (summed @ rest)))

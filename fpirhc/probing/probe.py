@@ -1,0 +1,225 @@
+"""The probe: a plant that nobody knows is excited or listened to, and answers what its response is made of and what suits it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from fpirhc.by_name import FoundByName
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.deformation.base import Deformation
+from fpirhc.describe import as_written
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
+from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import Count, Seed
+from fpirhc.probing.excitation import Record, excited
+from fpirhc.probing.identification import Interval, identify
+from fpirhc.probing.recording import read_recording
+from fpirhc.probing.rule import Estimates, Rule
+from fpirhc.probing.trials import Trial, best, tried
+from fpirhc.summary import line, number, table
+from fpirhc.task.problem import Problem
+
+_CLIPPED = 0.2  # share of the cycles at a limit, from which it is said
+
+
+@dataclass(frozen=True, eq=False)
+class Probe(FoundByName):
+    """What a probe has found.
+
+    Args:
+        gain: lambda by response and model response, both by controlled quantity: 1 where the model is right.
+        dead_time: by input, in control cycles beyond the one that every loop has.
+        lag: by input, the dominant one, in the problem's unit of time.
+        noise: by controlled quantity, rms of the measured response.
+        drift: by controlled quantity, rms change of what the model does not have, per square root of the unit of time.
+        deformation: the adaptation to use; None: no adaptation.
+        why: it is this one, or none.
+        trials: by name of the candidate, errors on the plant over those of the controller alone; empty where none were made.
+        candidates: by the same names.
+        problem: the problem with the estimated plant as its reality, to be reviewed or swept; None: it has no equations.
+        notes: what to know beside.
+    """
+
+    gain: Mapping[str, Mapping[str, Interval]]
+    dead_time: Mapping[str, Interval]
+    lag: Mapping[str, Interval]
+    noise: Mapping[str, float]
+    drift: Mapping[str, float]
+    deformation: Deformation | None
+    why: str
+    trials: Mapping[str, Trial] = field(default_factory=dict)
+    candidates: Mapping[str, Deformation] = field(default_factory=dict)
+    problem: Problem | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def lines(self) -> str:
+        """The line to paste into a problem file, as the deformation of the controller."""
+        if self.deformation is None:
+            return "deformation=fp.Identity(),"
+        return "deformation=" + re.sub(r"\b([A-Z]\w*\()", r"fp.\1", as_written(self.deformation)) + ","
+
+    def __repr__(self) -> str:
+        return line(self, *(f"{name} {value}" for name, value in self.facts), self.lines, self.why)
+
+    def _repr_html_(self) -> str:
+        """The estimates as a table, for notebooks."""
+        return table("Probe", ("", "estimate"), list(self.facts), [self.lines, self.why, *self.notes])
+
+    @property
+    def plain(self) -> dict[str, object]:
+        """Everything but the problem, as plain data."""
+        return {
+            "gain": {n: {m: asdict(one) for m, one in entries.items()} for n, entries in self.gain.items()},
+            "dead_time": {name: asdict(one) for name, one in self.dead_time.items()},
+            "lag": {name: asdict(one) for name, one in self.lag.items()},
+            "noise": dict(self.noise),
+            "drift": dict(self.drift),
+            "lines": self.lines,
+            "why": self.why,
+            "trials": {name: asdict(one) for name, one in self.trials.items()},
+            "notes": list(self.notes),
+        }
+
+    @property
+    def facts(self) -> tuple[tuple[str, str], ...]:
+        """Every estimate as two texts."""
+        gains = [
+            (f"gain of {row}" + (f" by {column}" if len(entries) > 1 else ""), _interval(one))
+            for row, entries in self.gain.items()
+            for column, one in entries.items()
+        ]
+        dead = [(f"dead time of {name}, cycles", _interval(one)) for name, one in self.dead_time.items()]
+        lags = [(f"lag of {name}", _interval(one)) for name, one in self.lag.items()]
+        noise = [(f"noise of {name}", number(one)) for name, one in self.noise.items()]
+        return (*gains, *dead, *lags, *noise, *((f"drift of {name}", number(one)) for name, one in self.drift.items()))
+
+
+@checked_call
+def probe(
+    problem: Problem,
+    controller: Controller,
+    *,
+    cycles: Count = 300,
+    amplitude: float | Mapping[str, float] | None = None,
+    recording: str | Path | None = None,
+    chatter: float | Mapping[str, float] | None = None,
+    trials: bool = True,
+    seed: Seed = 0,
+) -> Probe:
+    """Return what the response of a plant is made of, and the adaptation that suits it.
+
+        f_i = sum_j lambda_ij (f^_j, late by d cycles and a lag) + drift + noise,      f^: the model's response to the same commands
+
+    The controller keeps the plant safe, without its deformation, while a small random binary sequence adds to its desired response.
+    Candidates are chosen on the plant as estimated, keep their margins at every corner of the intervals, and are then run on the
+    plant itself, beside the controller alone: the best one is kept, or none.
+
+    Args:
+        problem: with the plant that is to be probed, mostly an `ExternalPlant`.
+        controller: that keeps it safe.
+        cycles: of the excitation, 50 to 500.
+        amplitude: of the sequence, in the unit of the response, by controlled quantity or one for all; 0 only listens. None: twice
+            the noise and a tenth of the deviation of the desired response, both in a first run without it.
+        recording: CSV file in place of runs, with the columns "time", every input, and what is measured.
+        chatter: largest rms step of the command per cycle, in the input's unit, by input or one for all; None: 1.5 times that of
+            the controller alone, or 2 % of the input's range.
+        trials: whether candidates are tried on the plant; False on a machine that must not be risked.
+        seed: of sequence and runs.
+
+    Raises:
+        InvalidValue: too few cycles, a record in which nothing moves, an amplitude that is negative.
+        FpirhcError: every error that the controller raises about the problem.
+    """
+    _check(problem, amplitude, chatter)
+    bare = without_deformation(resolved(problem, controller))
+    if recording is not None:
+        record = read_recording(Path(recording), problem)
+    else:
+        record = excited(problem, bare, cycles=cycles, amplitude=amplitude, seed=seed)
+    estimates = Estimates(identify(record.measured, record.modelled, problem.period, record.usable), seed)
+    notes = list(_notes(record))
+    estimated, candidates, why = None, {}, estimates.refused
+    if not why:
+        try:
+            rule = Rule(problem, bare, estimates, chatter)
+            estimated = rule.problem
+            candidates = {name: one.deformation for name, one in rule.shortlist().items()}
+            why = "" if candidates else "no setting that keeps its margins makes the error clearly less"
+        except FpirhcError as error:
+            why = f"the plant as estimated cannot be run ({error})"
+    results = tried(problem, bare, candidates, seed=seed + 1) if trials and recording is None and candidates else {}
+    name = best(results) if results else "cautious" if "cautious" in candidates else None
+    if results and name is None:
+        why = "in trials on the plant no candidate made the error clearly less, and that of no coordinate larger"
+    elif candidates and name is None:
+        why = "no candidate bears twice the gain, which one that is not tried has to"
+    elif name is not None:
+        tests = (
+            f": {results[name].error:.3g} of the error of the controller alone"
+            if results
+            else ", not tried on the plant"
+        )
+        why = f"{name}{tests}"
+    chosen = None if name is None else candidates[name]
+    return _answer(problem, estimates, chosen, why, results, candidates, estimated, notes)
+
+
+def _answer(
+    problem: Problem,
+    estimates: Estimates,
+    chosen: Deformation | None,
+    why: str,
+    results: Mapping[str, Trial],
+    candidates: Mapping[str, Deformation],
+    estimated: Problem | None,
+    notes: list[str],
+) -> Probe:
+    names, inputs, channels = problem.plant.controlled_names, tuple(problem.plant.inputs), estimates.channels
+    return Probe(
+        gain={n: dict(zip(names, one.gains, strict=True)) for n, one in zip(names, channels, strict=True)},
+        dead_time={n: one.dead_time for n, one in zip(inputs, channels, strict=True)},
+        lag={n: one.lag for n, one in zip(inputs, channels, strict=True)},
+        noise={n: one.noise for n, one in zip(names, channels, strict=True)},
+        drift={n: one.drifting for n, one in zip(names, channels, strict=True)},
+        deformation=chosen,
+        why=why,
+        trials=dict(results),
+        candidates=dict(candidates),
+        problem=estimated,
+        notes=tuple(notes),
+    )
+
+
+def _notes(record: Record) -> list[str]:
+    notes = [f"the run ended early: {record.stop}"] if record.stop else []
+    if record.clipped > _CLIPPED:
+        notes.append(f"commands stood at a limit in {record.clipped:.0%} of the cycles, which tell less")
+    return notes
+
+
+def _check(
+    problem: Problem, amplitude: float | Mapping[str, float] | None, chatter: float | Mapping[str, float] | None
+) -> None:
+    for what, given, names, least in (
+        ("amplitude", amplitude, problem.plant.controlled_names, "of at least 0"),
+        ("chatter", chatter, tuple(problem.plant.inputs), "above 0"),
+    ):
+        entries = given if isinstance(given, Mapping) else {"": given}
+        for name, value in entries.items():
+            if name and name not in names:
+                raise InvalidName(f"probe({what}=...): '{name}' is unknown.{nearest(name, names)}")
+            least_value = 0.0 if what == "amplitude" else np.nextafter(0.0, 1.0)
+            wrong = value is not None and not least_value <= value < np.inf
+            if wrong:
+                raise InvalidValue(f"probe({what}={value!r}): expected a number {least}, in the unit of the signal")
+
+
+def _interval(one: Interval) -> str:
+    return number(one.value) if one.certain else f"{number(one.value)} ({number(one.low)} to {number(one.high)})"

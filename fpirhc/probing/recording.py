@@ -1,0 +1,76 @@
+"""A recording of a run: commands and measurements of every cycle, from a CSV file."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.probing.excitation import Record
+from fpirhc.sensing.base import response_names
+from fpirhc.task.problem import Problem
+
+_EVEN = 0.01  # share of the period by which a time may be off
+
+
+def read_recording(path: Path, problem: Problem) -> Record:
+    """Return the record in a CSV file.
+
+    Its columns are "time", every input by name (the command that is sent at this time), the elements of the model's state, and the
+    responses ("q1''"); a response without a column is the difference of its lower derivative over a cycle.
+
+    Args:
+        path: of the file.
+        problem: whose model and period it is of.
+
+    Raises:
+        InvalidValue: missing columns, other times than those of the period, entries that are no numbers; all mistakes together.
+    """
+    columns = _columns(path)
+    plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
+    responses = response_names(plant)
+    lower = {name: name[:-1] for name in responses}
+    needed = ("time", *plant.inputs, *plant.state.elements)
+    for name in needed:
+        if name not in columns:
+            mistakes.add(f"it has no column '{name}'; its columns are {', '.join(columns)}")
+    for name in responses:
+        if name not in columns and lower[name] not in columns:
+            mistakes.add(f"it has no column '{name}', nor '{lower[name]}' to take the difference of")
+    mistakes.raise_if_any()
+    steps = np.diff(columns["time"])
+    if not len(steps) or np.abs(steps - period).max() > _EVEN * period:
+        mistakes.add(f"its times are not {period:g} {plant.time_unit} apart, the period of the problem")
+    mistakes.raise_if_any()
+    states = np.column_stack([columns[e] for e in plant.state.elements])
+    commands = np.column_stack([columns[n] for n in plant.inputs])
+    measured = np.column_stack(
+        [columns[n] if n in columns else np.diff(columns[lower[n]], prepend=np.nan) / period for n in responses]
+    )[1:]
+    modelled = np.array(plant.controlled_response_function(states[1:].T, commands[:-1].T, plant.approximate)).T
+    usable = np.isfinite(measured).all(axis=1) & np.isfinite(modelled).all(axis=1)
+    if usable.sum() < len(usable):
+        measured, modelled = (np.where(np.isfinite(one), one, 0.0) for one in (measured, modelled))
+    return Record(measured, modelled, usable)
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            head, *rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise InvalidValue(f"recording {path}: cannot be read as a CSV file with a line of names ({error})") from None
+    values = []
+    for number, row in enumerate(rows, start=2):
+        if len(row) != len(head):
+            raise InvalidValue(f"recording {path.name}: row {number} has {len(row)} entries, the first one {len(head)}")
+        try:
+            values.append([float(entry) if entry.strip() else np.nan for entry in row])
+        except ValueError:
+            raise InvalidValue(
+                f"recording {path.name}: row {number} is not made of numbers: {', '.join(row)}"
+            ) from None
+    table = np.array(values).reshape(-1, len(head))
+    return {name.strip(): column for name, column in zip(head, table.T, strict=True)}

@@ -1,0 +1,359 @@
+"""Which adaptation suits a plant as estimated: candidates are run on it, and keep their margins at the corners of all intervals.
+
+Gains are shares g of the deadbeat gain, 1 / the largest eigenvalue of Lambda. A mirror that is right takes lateness for right and
+leaves it, so mirrors without dead time and without lag are candidates too, and one with a lag three times as long: an estimated lag
+stands for everything slow. Of the safe settings within a tenth of the least error the one with the least steps is the bold one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import without_deformation
+from fpirhc.deformation.affine import Affine
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.leaky import default_pole
+from fpirhc.deformation.model_referenced import ModelReferenced
+from fpirhc.deformation.wrappers.delayed import Paired
+from fpirhc.deformation.wrappers.filtered import Filtered
+from fpirhc.errors import FpirhcError
+from fpirhc.probing.estimated_plant import estimated_problem, gain_name
+from fpirhc.probing.identification import Channel
+from fpirhc.simulation.error_pair import errors_of
+from fpirhc.simulation.linearise.asked_loop import AskedLoop
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import simulator
+from fpirhc.simulation.trials import weighed
+from fpirhc.task.problem import Problem
+
+SHARES = (0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
+_RINGING = (4.0, 1.0)  # g / (1 - pole) of the filters
+_FIRST, _LONG = 0.2, 0.2  # shares with which forms are compared, and of the candidate with a long lag
+_FORMS = 3  # that are searched in full
+_LARGEST_PRODUCT = 1.99
+_DRAWS, _QUANTILE = 400, 0.025
+_DRAWN = 1  # of the draws, at every corner
+_STEPS, _OF_RANGE = 1.5, 0.02  # largest step of a command: times that of the controller alone, or of the input's range
+_NEAR, _WORTH = 1.1, 0.95  # errors that count as equal, and one that is worth an adaptation
+_STABLE = 1 - 1e-7
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A candidate.
+
+    Args:
+        referenced: whether the form is model-referenced; else the plain one.
+        share: g, of the deadbeat gain.
+        pole: of the filter; 0: none.
+        cycles: believed dead time of every input.
+        lags: believed lag of every input.
+        wrong: cycles by which the dead time may be wrong.
+    """
+
+    referenced: bool
+    share: float
+    pole: float
+    cycles: tuple[float, ...]
+    lags: tuple[float, ...]
+    wrong: float
+
+    def deformation(self, largest: float) -> Deformation:
+        """Return the deformation, with gains rounded to three digits.
+
+        Args:
+            largest: eigenvalue of Lambda.
+        """
+        size = self.share / largest
+        chosen: Deformation = Affine(gain=_rounded(-2 * size))
+        if self.pole:
+            chosen = Filtered(chosen, pole=_rounded(self.pole))
+        cycles, lag = _one(self.cycles), _one(tuple(_rounded(tau) for tau in self.lags))
+        late = max(self.cycles) > 0
+        if not self.referenced:
+            return Paired(chosen, cycles=cycles) if late else chosen
+        leak = default_pole(min(max(self.share, size, 1.0), _LARGEST_PRODUCT), self.wrong) if late else None
+        return ModelReferenced(chosen, cycles=cycles, lag=lag, pole=None if leak is None else _rounded(float(leak)))
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """A setting on the estimated plant.
+
+    Args:
+        error: rms tracking error over that of the controller alone, in the mean over the coordinates.
+        steps: rms step of the command over the largest that is allowed.
+    """
+
+    setting: Setting
+    deformation: Deformation
+    error: float
+    steps: float
+
+
+class Estimates:
+    """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them."""
+
+    def __init__(self, channels: Sequence[Channel], seed: int) -> None:
+        """Take the channels and the seed of the draws."""
+        self.channels = tuple(channels)
+        self.gains = np.array([[g.value for g in one.gains] for one in channels])
+        self._deviations = np.array([[(g.high - g.low) / 4 for g in one.gains] for one in channels])
+        random = np.random.default_rng(seed)
+        self.draws = self.gains + self._deviations * random.standard_normal((_DRAWS, *self.gains.shape))
+        values = np.linalg.eigvals(self.draws)
+        real, size = values.real.min(axis=1), np.abs(values) ** 2 / np.maximum(np.abs(values.real), 1e-300)
+        self.smallest = float(np.quantile(real, _QUANTILE))
+        self.largest_real = float(np.quantile(values.real.max(axis=1), 1 - _QUANTILE))
+        self.largest = float(np.quantile(size.max(axis=1), 1 - _QUANTILE))
+
+    @property
+    def refused(self) -> str:
+        """Why nothing may be adapted; empty where something may."""
+        edges = [one.edge for one in self.channels if one.edge]
+        if self.largest_real <= 0:
+            return "the sign of the gain is wrong: the plant answers against its model; turn the sign of an input in the model"
+        if np.linalg.eigvals(self.gains).real.min() <= 0:
+            return "an eigenvalue of the gains has the wrong sign: an input of the model has, or is paired with the wrong output"
+        if self.smallest <= 0:
+            return "the sign of a gain is not certain: excite more or longer (amplitude=, cycles=)"
+        return f"the record is too short for the {edges[0]}: take more cycles" if edges else ""
+
+    @cached_property
+    def dead(self) -> np.ndarray:
+        """Least, estimated, and greatest dead time of every input, shape (3, n)."""
+        return np.array([(one.dead_time.low, one.dead_time.value, one.dead_time.high) for one in self.channels]).T
+
+    @cached_property
+    def lag(self) -> np.ndarray:
+        """Least, estimated, and greatest lag of every input, shape (3, n)."""
+        return np.array([(one.lag.low, one.lag.value, one.lag.high) for one in self.channels]).T
+
+    @property
+    def drift(self) -> np.ndarray:
+        """By cycle, shape (cycles, n)."""
+        return np.column_stack([one.drift for one in self.channels])
+
+
+@dataclass(frozen=True)
+class Corner:
+    """A dead time and a lag of every input."""
+
+    cycles: tuple[float, ...]
+    lags: tuple[float, ...]
+
+
+class Rule:
+    """The choice for one problem and controller."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        controller: Controller,
+        estimates: Estimates,
+        chatter: float | Mapping[str, float] | None,
+    ) -> None:
+        """Build the estimated plant and run the controller alone on it.
+
+        Raises:
+            FpirhcError: a plant without equations.
+        """
+        self.bare, self.estimates, self._names = (
+            without_deformation(controller),
+            estimates,
+            weighed(problem, controller),
+        )
+        self._given = problem
+        self._problems: dict[Corner, Problem] = {}
+        self._loops: dict[tuple[Corner, Deformation | None], _Loop] = {}
+        self._judged: dict[tuple[Deformation, bool], bool] = {}
+        noise = [one.noise for one in estimates.channels]
+        middle = estimates.dead[1], estimates.lag[1]
+        self.problem = estimated_problem(problem, estimates.gains, *middle, estimates.drift, noise)
+        self._alone = self._run(self.bare)
+        self._room = self._allowed(chatter)
+        self.stable = self._alone.stop is None
+
+    def shortlist(self) -> dict[str, Predicted]:
+        """Return the candidates by name, cautious first; none where nothing safe makes the error clearly less."""
+        forms = sorted((self._predicted(form) for form in self._forms()), key=lambda one: one.error)[:_FORMS]
+        found = [self._predicted(s) for one in forms for s in _around(one.setting)]
+        calm = sorted((one for one in found if one.steps <= 1 and one.error < _WORTH), key=lambda one: one.error)
+        safe: list[Predicted] = []
+        for one in calm:
+            if safe and one.error > _NEAR * safe[0].error:
+                break
+            if self._safe(one):
+                safe.append(one)
+        chosen = {
+            "cautious": next((one for one in calm if self._safe(one) and self._safe(one, rough=True)), None),
+            "mirrored": next(
+                (one for one in calm if one.setting.lags == tuple(self.estimates.lag[2]) and self._safe(one)), None
+            ),
+            "long lag": self._long(),
+            "bold": min(safe, key=lambda one: one.steps, default=None),
+        }
+        kept: dict[str, Predicted] = {}
+        for name, candidate in chosen.items():
+            if candidate is not None and all(candidate.deformation != one.deformation for one in kept.values()):
+                kept[name] = candidate
+        return kept
+
+    def _forms(self) -> Iterator[Setting]:
+        """Forms, dead times and lags, with the share in which they are compared."""
+        low, value, high = self.estimates.dead
+        cycles = np.where(high > low, np.ceil((low + high) / 2), value)
+        wrong = float(max((high - cycles).max(), (cycles - low).max(), 1.0))
+        lags = [np.zeros(len(value)), self.estimates.lag[1], self.estimates.lag[2], self._long_lag]
+        ways = {tuple(map(float, c)): wrong if c.any() else 0.0 for c in (cycles, np.zeros(len(value)))}
+        for way, unsure in ways.items():
+            for lag in sorted({tuple(map(float, tau)) for tau in lags}):
+                yield Setting(True, _FIRST, 0.0, way, lag, unsure)
+            yield Setting(False, _FIRST, 0.0, way, (0.0,) * len(value), unsure)
+
+    @property
+    def _long_lag(self) -> np.ndarray:
+        """Three times the greatest lag, where there is one at all."""
+        low, value, high = self.estimates.lag
+        return np.where(low > 0.5 * self._given.period, 3 * high, value)
+
+    def _long(self) -> Predicted | None:
+        lag = tuple(map(float, self._long_lag))
+        if not any(self.estimates.lag[0] > 0.5 * self._given.period):
+            return None
+        cycles = tuple(map(float, np.ceil(self.estimates.dead[[0, 2]].mean(axis=0))))
+        one = self._predicted(Setting(True, _LONG, 0.0, cycles, lag, 1.0))
+        return one if self._safe(one) else None
+
+    def _predicted(self, setting: Setting) -> Predicted:
+        deformation = setting.deformation(self.estimates.largest)
+        nothing = Predicted(setting, deformation, math.inf, math.inf)
+        try:
+            run = self._run(self.bare.with_deformation(deformation))
+        except FpirhcError:  # a gain that a loop refuses
+            return nothing
+        if run.stop is not None:
+            return nothing
+        return Predicted(
+            setting,
+            deformation,
+            mean_ratio(self.problem, self._alone, run, self._names),
+            float((_steps(run) / self._room).max()),
+        )
+
+    def _run(self, controller: Controller) -> Run:
+        return simulator(self.problem, controller, compiled=False).run(seed=0)
+
+    def _allowed(self, chatter: float | Mapping[str, float] | None) -> np.ndarray:
+        """Largest rms step of every input."""
+        plant = self._given.plant
+        lower, upper = self._given.limits.input_bounds(plant)
+        width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
+        usual = np.maximum(_STEPS * _steps(self._alone), _OF_RANGE * width)
+        if chatter is None:
+            return np.asarray(np.maximum(usual, 1e-300))
+        given = chatter if isinstance(chatter, Mapping) else dict.fromkeys(plant.inputs, chatter)
+        return np.array([float(given.get(name, own)) for name, own in zip(plant.inputs, usual, strict=True)])
+
+    def _safe(self, one: Predicted, *, rough: bool = False) -> bool:
+        """Whether the whole loop is stable at every corner at which the controller alone is."""
+        deformation = one.deformation
+        if (deformation, rough) not in self._judged:
+            self._judged[deformation, rough] = all(
+                self._loop(corner, deformation).stable_where(self._loop(corner, None), gains)
+                for corner, gains in (self._far if rough else self._near)
+            )
+        return self._judged[deformation, rough]
+
+    @cached_property
+    def _near(self) -> tuple[tuple[Corner, tuple[float, ...]], ...]:
+        """Dead times and lags of the corners, and factors of the gains there: the gain margin is that of a review."""
+        dead, lag = self.estimates.dead, self.estimates.lag
+        corners = {Corner(tuple(dead[i]), tuple(lag[j])) for i in (0, 2) for j in (0, 2)}
+        return (Corner(tuple(dead[2] + 1), tuple(lag[1])), (1.0,)), *((one, (1.4, 1.0, 0.6)) for one in corners)
+
+    @cached_property
+    def _far(self) -> tuple[tuple[Corner, tuple[float, ...]], ...]:
+        """A lag is only a picture of what is slow: half as long again, and a command that is a cycle later."""
+        dead, slow = self.estimates.dead[2], 1.5 * np.maximum(self.estimates.lag[2], 0.25 * self._given.period)
+        return (Corner(tuple(dead), tuple(slow)), (2.0,)), (Corner(tuple(dead + 1), tuple(slow)), (1.4,))
+
+    def _loop(self, corner: Corner, deformation: Deformation | None) -> _Loop:
+        """The loop at a corner; None: of the controller alone."""
+        if (corner, deformation) not in self._loops:
+            problem = self._problems.setdefault(
+                corner, estimated_problem(self._given, self.estimates.gains, corner.cycles, corner.lags)
+            )
+            controller = self.bare if deformation is None else self.bare.with_deformation(deformation)
+            self._loops[corner, deformation] = _Loop(problem, controller, self.estimates)
+        return self._loops[corner, deformation]
+
+
+class _Loop:
+    """A loop on the estimated plant, linearised for any gains."""
+
+    def __init__(self, problem: Problem, controller: Controller, estimates: Estimates) -> None:
+        self._matrices = (estimates.gains, *estimates.draws[:_DRAWN])
+        self._radii: dict[float, float] = {}
+        names, count = list(problem.real_plant.parameters), range(len(estimates.gains))
+        places = [names.index(gain_name(i, j)) for i in count for j in count]
+        self._memory: np.ndarray | None = None
+        try:
+            self._loop = AskedLoop(problem, controller)
+            self._memory = self._loop.quietest(self._loop.run(self._loop.start(), 4 * self._loop.warm + 20))
+        except FpirhcError:  # it does not run
+            return
+        self._places = [self._loop.loop.memory.slice("_exact").start + k for k in places]
+
+    def stable_where(self, alone: _Loop, gains: Sequence[float]) -> bool:
+        """Whether it is stable with every factor of the gains with which the controller alone is."""
+        return all(self.radius(gain) < _STABLE for gain in gains if alone.radius(gain) < _STABLE)
+
+    def radius(self, gain: float) -> float:
+        """Largest radius over the gains, and a draw of them, times a factor; infinite where the loop does not run."""
+        if gain not in self._radii:
+            self._radii[gain] = max(self._radius(gain * one) for one in self._matrices)
+        return self._radii[gain]
+
+    def _radius(self, gains: np.ndarray) -> float:
+        if self._memory is None:
+            return math.inf
+        changed = self._memory.copy()
+        changed[self._places] = gains.ravel()
+        try:
+            return self._loop.at(changed).radius
+        except FpirhcError:
+            return math.inf
+
+
+def mean_ratio(problem: Problem, alone: Run, run: Run, names: frozenset[str] | None) -> float:
+    """Return the rms over the coordinates of their errors over those of the controller alone."""
+    pair = errors_of(problem, (alone, run), names)
+    return float(np.sqrt(np.mean([pair.ratio(name) ** 2 for name in pair.without])))
+
+
+def _around(form: Setting) -> Iterator[Setting]:
+    """The form with every share and filter."""
+    for share in SHARES:
+        for pole in {0.0, *(max(1 - share / ringing, 0.0) for ringing in _RINGING)}:
+            yield replace(form, share=share, pole=pole)
+
+
+def _steps(run: Run) -> np.ndarray:
+    """Rms step of every command, the transient left out."""
+    command = np.asarray(run["command"])
+    return np.sqrt(np.mean(np.diff(command[len(command) // 10 :], axis=0) ** 2, axis=0))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.3g}")
+
+
+def _one(values: tuple[float, ...]) -> float | tuple[float, ...]:
+    return values[0] if len(set(values)) == 1 else values

@@ -1,0 +1,238 @@
+"""A probe of bodies whose gain, dead time, lag and noise are known."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bodies import PERIOD, RHC, body_problem
+
+import fpirhc as fp
+from fpirhc.deformation.base import Deformation
+from fpirhc.probing.excitation import excited, sequence
+from fpirhc.probing.identification import Channel, identify
+from fpirhc.probing.trials import Trial, best, tried
+
+KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
+    (1.0, 0, 0.0, 0.05),
+    (0.4, 0, 0.0, 0.05),
+    (2.5, 0, 0.0, 0.05),
+    (1.0, 3, 0.0, 0.05),
+    (1.6, 7, 0.0, 0.3),
+    (0.6, 0, 0.05, 0.05),
+    (1.5, 2, 0.03, 0.3),
+]
+
+
+def identified(
+    problem: fp.Problem, cycles: int = 300, amplitude: float | None = None, seed: int = 0
+) -> tuple[Channel, ...]:
+    """What one excited run says of every response."""
+    record = excited(problem, RHC, cycles=cycles, amplitude=amplitude, seed=seed)
+    return identify(record.measured, record.modelled, problem.period, record.usable)
+
+
+# --- Estimates --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("gain", "dead", "lag", "noise"), KNOWN)
+def test_the_estimates_are_those_of_the_body(gain, dead, lag, noise):
+    """The dead time to the cycle; gain, lag and noise within 6, 10 and 10 %; all intervals contain the truth."""
+    (one,) = identified(body_problem(gain, dead, lag, noise))
+    assert (one.dead_time.low, one.dead_time.value, one.dead_time.high) == (dead, dead, dead)
+    assert one.gains[0].value == pytest.approx(gain, rel=0.06)
+    assert one.gains[0].low <= gain <= one.gains[0].high
+    assert one.lag.value == pytest.approx(lag, rel=0.1, abs=0.3 * PERIOD)
+    assert one.lag.low <= lag <= one.lag.high
+    assert one.noise == pytest.approx(noise, rel=0.1)
+
+
+def test_the_intervals_hold_over_seeds():
+    """Of 20 short records 19 contain the gain and the dead time: what an interval of 95 % promises."""
+    problem, held = body_problem(1.5, 2, 0.03, 0.3), []
+    for seed in range(20):
+        (one,) = identified(problem, cycles=150, seed=seed)
+        held.append(one.gains[0].low <= 1.5 <= one.gains[0].high and one.dead_time.low <= 2 <= one.dead_time.high)
+    assert sum(held) >= 19
+
+
+def test_a_dead_time_beyond_the_first_search_is_found():
+    """The search ends at 10 cycles at first; an estimate at its edge widens it."""
+    (one,) = identified(body_problem(1.0, 15, 0.0, 0.1))
+    assert (one.dead_time.value, one.edge) == (15, "")
+
+
+def test_listening_agrees_with_exciting():
+    """The jumps of plans excite a little: with amplitude 0 the intervals are wider and contain the truth."""
+    problem = body_problem(1.6, 2, 0.0, 0.1)
+    (heard,), (excited_,) = (identified(problem, amplitude=a) for a in (0.0, None))
+    assert heard.gains[0].low <= 1.6 <= heard.gains[0].high
+    assert heard.gains[0].high - heard.gains[0].low > excited_.gains[0].high - excited_.gains[0].low
+
+
+def test_coupled_bodies_have_a_gain_matrix():
+    """Every entry within its interval, of the columns' own inputs."""
+    gains = np.array([[0.8, 0.2], [-0.3, 0.7]])
+    found = identified(body_problem(gains.tolist(), 1, 0.0, 0.05))
+    for row, one in zip(gains, found, strict=True):
+        assert one.dead_time.value == 1
+        for value, interval in zip(row, one.gains, strict=True):
+            assert interval.low <= value <= interval.high
+            assert interval.value == pytest.approx(value, abs=0.06)
+
+
+def test_the_excitation_is_bounded_and_the_channels_independent():
+    """+-1, held for 16 cycles at most one after another of one sign twice, uncorrelated, and 0 at its end."""
+    signs = sequence(400, 2, seed=1)
+    assert set(np.unique(signs[:-1])) == {-1.0, 1.0}
+    assert not signs[-1].any()
+    assert abs(np.mean(signs[:, 0] * signs[:, 1])) < 0.2
+
+
+# --- The choice -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("known", [KNOWN[1], KNOWN[3]])
+def test_the_choice_is_near_the_best_of_a_grid_by_hand(known):
+    """At most 1.2 times the least error of 16 settings that are given the true gain, dead time and lag."""
+    gain, dead, _, _ = known
+    problem = body_problem(*known)
+    found = fp.probe(problem, RHC)
+
+    def error(deformation: Deformation | None) -> float:
+        assert deformation is not None
+        run = fp.simulate(problem, replace(RHC, deformation=deformation), seed=1, compiled=False)
+        return np.inf if run.stop else fp.measure(problem, run).rms_error["q"]
+
+    by_hand = [
+        error(fp.ModelReferenced(fp.Affine(gain=-2 * g / gain), cycles=float(d)))
+        for g in (0.05, 0.15, 0.3, 0.6)
+        for d in {0, dead}
+    ]
+    assert error(found.deformation) <= 1.2 * min(by_hand)
+    assert all(one.worst <= 1.03 for name, one in found.trials.items() if found.candidates[name] == found.deformation)
+
+
+def test_the_plant_as_estimated_predicts_the_body():
+    """The error of the controller alone, and with an adaptation, is that on the body within a tenth."""
+    problem = body_problem(1.6, 2, 0.03, 0.1)
+    found = fp.probe(problem, RHC, trials=False)
+    assert found.trials == {}
+    assert found.problem is not None
+    real = replace(problem, duration=found.problem.duration, measure_from=found.problem.measure_from)
+    for deformation in (fp.Identity(), fp.ModelReferenced(fp.Affine(gain=-0.6), cycles=2.0, lag=0.03, pole=0.5)):
+        predicted, true = (
+            fp.measure(p, fp.simulate(p, replace(RHC, deformation=deformation), seed=0, compiled=False)).rms_error["q"]
+            for p in (found.problem, real)
+        )
+        assert predicted == pytest.approx(true, rel=0.1)
+
+
+def test_a_wrong_sign_is_refused():
+    """The plant answers against its model: no gain of the map would do, and the reason says what to turn."""
+    found = fp.probe(body_problem(-0.5, 0, 0.0, 0.1), RHC, cycles=150)
+    assert found.gain["q"]["q"].high < 0
+    assert found.deformation is None
+    assert found.why.startswith("the sign of the gain is wrong")
+    assert found.lines == "deformation=fp.Identity(),"
+
+
+def test_inputs_that_are_exchanged_are_refused():
+    """With the two inputs of a pair exchanged, the gains have an eigenvalue of -1."""
+    found = fp.probe(body_problem([[0.0, 1.0], [1.0, 0.0]], 0, 0.0, 0.05), RHC, cycles=150)
+    assert found.deformation is None
+    assert "wrong sign" in found.why
+
+
+def test_trials_keep_none_that_is_worse():
+    """A gain far beyond the limit is tried, fails, and nothing is kept; nor is one that makes one coordinate worse."""
+    problem = replace(body_problem(1.0, 3, 0.0, 0.05), duration=3.0)
+    trials = tried(problem, RHC, {"wild": fp.ModelReferenced(fp.Affine(gain=-1.2))}, seed=1)
+    assert trials["wild"].error > 1
+    assert best(trials) is None
+    assert best({"a": Trial(0.5, 1.04), "b": Trial(0.7, 1.0), "c": Trial(0.97, 0.97)}) == "b"
+
+
+def test_the_budget_of_chatter_is_kept():
+    """Steps of a millionth of the controller's own leave nothing to choose."""
+    problem = body_problem(1.0, 0, 0.0, 0.3)
+    found = fp.probe(problem, RHC, chatter=1e-6, trials=False)
+    assert found.deformation is None
+    assert "no setting" in found.why
+
+
+# --- Recordings -------------------------------------------------------------------------------------------------------
+
+
+def write_recording(path: Path, *, response: bool) -> fp.Problem:
+    """Write a run of a body as a CSV file and return its problem."""
+    problem = replace(body_problem(1.6, 2, 0.0, 0.02), duration=4.0)
+    run = fp.simulate(problem, RHC, seed=3, compiled=False)
+    columns = {"time": run["time"].ravel(), "u": run["command.u"], "q": run["state.q"], "q'": run["state.q'"]}
+    columns |= {"q''": run["realised.q"]} if response else {}
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([list(columns), *zip(*columns.values(), strict=True)])
+    return problem
+
+
+@pytest.mark.parametrize("response", [True, False])
+def test_a_recording_is_probed_without_a_run(tmp_path, response):
+    """Gain and dead time follow from a file, where the response is a column and where it is a difference of velocities."""
+    problem = write_recording(tmp_path / "run.csv", response=response)
+    broken = replace(problem, reality=fp.ExternalPlant(Untouched(), QUANTITIES))
+    found = fp.probe(broken, RHC, recording=tmp_path / "run.csv")
+    assert found.dead_time["u"].value == 2
+    assert found.gain["q"]["q"].low <= 1.6 <= found.gain["q"]["q"].high
+    assert found.trials == {}
+
+
+QUANTITIES = {"q": "m", "q'": "m/s", "q''": "m/s^2"}
+
+
+class Untouched:
+    """A body that fails the test where it is asked anything."""
+
+    def reset(self, *_: object) -> list[float]:
+        """Not to be called."""
+        raise AssertionError("a recording needs no run")
+
+    step = reset
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time,u,q\n0,0,0\n0.01,0,0\n", "no column 'q''"),
+        ("time,u,q,q',q''\n0,0,0,0,0\n0.02,0,0,0,0\n", "not 0.01 s apart"),
+        ("time,u,q,q',q''\n0,0,0,x,0\n", "row 2 is not made of numbers"),
+        ("time,u,q,q',q''\n0,0,0,0\n", "row 2 has 4 entries, the first one 5"),
+    ],
+)
+def test_a_wrong_recording_says_what_is_wrong(tmp_path, text, words):
+    """Columns, times and entries, by name."""
+    (tmp_path / "run.csv").write_text(text)
+    with pytest.raises(fp.FpirhcError, match=words):
+        fp.probe(body_problem(1.0), RHC, recording=tmp_path / "run.csv")
+
+
+# --- Wrong arguments --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"cycles": 20}, "at least 40"),
+        ({"amplitude": -1.0}, "expected a number of at least 0"),
+        ({"amplitude": {"u": 1.0}}, "'u' is unknown"),
+        ({"chatter": 0.0}, "expected a number above 0"),
+        ({"chatter": {"q": 1.0}}, "'q' is unknown"),
+        ({"recording": "nowhere.csv"}, "cannot be read"),
+    ],
+)
+def test_wrong_arguments_are_refused(arguments, words):
+    """Each with what was expected."""
+    with pytest.raises(fp.FpirhcError, match=words):
+        fp.probe(body_problem(1.0), RHC, **arguments)
