@@ -97,13 +97,13 @@ class Motion(Checked):
         names, what = (tuple(self.outputs), "outputs") if self.outputs else (self.names, "coordinates")
         if len(self.inputs) > len(names):
             raise NotInvertible(
-                f"{len(self.inputs)} inputs ({', '.join(self.inputs)}) for {len(names)} of the {what} ({', '.join(names)}): every "
-                "input prescribes one. Add an output that the other input moves, leave an input out, or make one input of several, "
-                "with their shares in the response"
+                f"{len(self.inputs)} inputs ({', '.join(self.inputs)}) for {len(names)} of the {what} ({', '.join(names)}): each "
+                "input holds one. Add an output that the other input moves, leave an input out, or make one input of several: a "
+                "command that the equations share out among them"
             )
         if len(self.inputs) != len(names):
             raise NotInvertible(
-                f"{len(self.inputs)} input(s) cannot prescribe {len(names)} {what}: name the "
+                f"{len(self.inputs)} input{'s' * (len(self.inputs) > 1)} cannot hold {len(names)} {what}: name the "
                 f"controlled ones, as many as there are inputs: Plant(..., controlled=({names[0]!r},))"
             )
         return names

@@ -129,7 +129,7 @@ PLANTS = {
     "two inputs for one coordinate": Wrong(
         PENDULUM,
         (('{"torque": "N m"}', '{"torque": "N m", "brake": "N m"}'), ("u.torque - ", "u.torque - u.brake - ")),
-        ("2 inputs (torque, brake) for 1 of the coordinates (angle): every input prescribes one", "leave an input out"),
+        ("2 inputs (torque, brake) for 1 of the coordinates (angle): each input holds one", "leave an input out"),
     ),
     "controlled by one name": Wrong(
         TANKS,

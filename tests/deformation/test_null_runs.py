@@ -17,6 +17,7 @@ from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.null_test import null_test
 from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.summary import in_percent
 
 PLAIN = fp.ComputedTorque(fp.Exponential(rate=6.0))
 ONE = {"y": 1.0}
@@ -79,6 +80,21 @@ def test_an_own_error_is_judged_by_the_error_that_it_removes():
     harmful = null_of(adaptive, cured=harmless.after["y"] / 10)
     assert harmful.harmful
     assert "failed, CTC+FPI is worse than CTC although there is nothing to adapt" in harmful.text
+
+
+def test_a_null_test_of_rows_mostly_at_a_limit_is_not_informative():
+    """The sine needs 14.4 N of the model; with 2 N both commands stand at a limit, where nothing can be told of adaptation."""
+    narrow = fp.Limits(inputs={"u": (-2.0, 2.0)})
+    null = null_of(fp.ComputedTorque(PLAIN.tracking, replace(SIGMOID, gain=-0.05)), limits=narrow)
+    task = problem(plant=linear(1.0, 1.0), limits=narrow)
+    share = fp.measure(task, fp.simulate(task, PLAIN, seed=0, compiled=False)).values["at_limit"][""]
+    assert share > 0.9
+    assert null.text.startswith(
+        "Null test: not informative, the command stands at a limit in most cycles (that of CTC in "
+    )
+    assert f"that of CTC in {in_percent(share)}" in null.text
+    assert null.outcome is Outcome.NOT_COMPARABLE
+    assert not null.harmful
 
 
 def test_what_does_not_finish():

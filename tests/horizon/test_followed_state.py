@@ -86,3 +86,38 @@ def test_a_loop_with_deviations_on_an_output_runs_and_adapts():
     ]
     assert errors[1] < 0.2 * errors[0]
     assert errors[2] < 0.2 * errors[0]
+
+
+G, A, HOLE = 9.81, 0.01, 1e-4  # m/s^2, m^2, m^2
+
+
+def tanks(*, by_velocity: bool) -> fp.Plant:
+    """Two tanks in a row, the lower level the output; the upper one as its level, or as the velocity w = sqrt(2 g h) of its jet."""
+
+    def rates(x, u, p):
+        jet = x.upper if by_velocity else ca.sqrt(2 * G * x.upper)
+        filling = (u.flow - p.hole * jet) / A
+        return {
+            "upper": G / jet * filling if by_velocity else filling,
+            "lower": p.hole * (jet - ca.sqrt(2 * G * x.lower)) / A,
+        }
+
+    return fp.Plant.of_states(
+        states={"upper": "m/s" if by_velocity else "m", "lower": "m"},
+        inputs={"flow": "m^3/s"},
+        parameters={"hole": fp.Parameter(HOLE, 1.1 * HOLE, "m^2")},
+        rates=rates,
+        outputs={"shown": fp.Output("m", lambda x, _: x.lower)},
+    )
+
+
+def test_a_state_that_follows_one_to_one_can_be_written_so_that_it_is_linear():
+    """The level is refused; its jet's velocity gives the flow that holds the lower level, hole sqrt(2 g h)."""
+    cost = fp.Quadratic(**COST, deviation={"flow": 1.0})
+    still = fp.Trajectory(lambda t: {"shown": 0.2 + 0 * t})
+    with pytest.raises(NotSupported, match=r"needs the states upper.*rate"):
+        stage_data(tanks(by_velocity=False), still, HORIZON, cost)
+    plant = tanks(by_velocity=True)
+    data = np.asarray(stage_data(plant, still, HORIZON, cost)(0.0, plant.approximate).full())
+    needed = data[data_layout(plant, HORIZON).slice("feedforward")][0]
+    np.testing.assert_allclose(needed, HOLE * np.sqrt(2 * G * 0.2), rtol=1e-12)

@@ -40,7 +40,7 @@ def test_tutorial_does_what_it_says(tmp_path, monkeypatch, capsys):
     Path("drone.py").write_text(text)
     assert main(["compare", "drone.py"]) == 0
     output = capsys.readouterr().out.replace("\n", " ")
-    assert "from 0.0235 to 1.28e-05 m" in output
+    assert "from 0.0235 to 1.28e-5 m" in output
     Path("turned.py").write_text(text.replace("gain=-2.1", "gain=2.1"))
     assert main(["compare", "turned.py"]) == 2
     assert "has the wrong sign" in capsys.readouterr().err

@@ -368,7 +368,7 @@ def test_a_plant_shows_its_outputs() -> None:
 
 def test_fewer_inputs_than_outputs_need_the_controlled_ones() -> None:
     plant = double({**SQUARE, "b": fp.Output("m/s", lambda x, p: x.b)})
-    with pytest.raises(NotInvertible, match=r"1 input.* cannot prescribe 2 outputs"):
+    with pytest.raises(NotInvertible, match=r"1 input.* cannot hold 2 outputs"):
         _ = plant.controlled_names
 
 

@@ -91,7 +91,7 @@ def test_wrong_order_names_the_right_one():
 
 
 def test_underactuated_plant_asks_for_a_choice():
-    """One input cannot prescribe two coordinates."""
+    """One input cannot hold two coordinates."""
     with pytest.raises(NotInvertible, match="controlled="):
         _ = two_mass_chain().controlled_names
 
@@ -109,6 +109,33 @@ def test_more_inputs_than_coordinates_are_told_what_to_do():
     ) as told:
         _ = plant.controlled_names
     assert "controlled=" not in str(told.value)
+
+
+def test_an_over_actuated_plant_is_one_command_with_shares():
+    """What the refusal advises: two jets of 3 : 1 as one command have the errors of one jet of their sum."""
+
+    def jets(share: float) -> fp.Plant:
+        return fp.Plant(
+            coordinates={"y": "m"},
+            inputs={"thrust": "N"},
+            order=2,
+            parameters={"m": fp.Parameter(1.3, 1.0, "kg")},
+            response=lambda _q, _v, u, p: {"y": (share * u.thrust + (1 - share) * u.thrust) / p.m},
+        )
+
+    errors = []
+    for share in (1.0, 0.75):
+        problem = fp.Problem(
+            plant=jets(share),
+            reference=fp.Trajectory(lambda t: {"y": ca.sin(t)}),
+            start={"y": 0.0},
+            period=0.01,
+            duration=2.0,
+        )
+        law = fp.ComputedTorque(fp.Exponential(rate=5.0), fp.ModelReferenced(fp.Affine(gain=-1.0)))
+        errors.append(fp.measure(problem, fp.simulate(problem, law, seed=0, compiled=False)).rms_error["y"])
+    assert 0 < errors[1] < 0.1
+    assert errors[1] == pytest.approx(errors[0], rel=1e-9)
 
 
 @pytest.mark.parametrize(
