@@ -148,7 +148,15 @@ def _in_module_of_its_name(root: ModuleType, name: str) -> Any:
 
 
 FORMER_MEMBERS = {  # members and arguments of earlier versions
+    "Plant.controlled_response_function": "equations.controlled_response",
+    "Plant.derivative_function": "equations.rate",
+    "Plant.forced_derivative_function": "equations.forced_rate",
+    "Plant.inverse_function": "equations.inverse",
+    "Plant.next_function": "equations.next",
     "Plant.of_map": "discrete",
+    "Plant.output_function": "equations.output",
+    "Plant.output_orders": "equations.output_orders",
+    "Plant.response_function": "equations.response",
     "Sensing(belief)": "observer",
     "Stepper(watch)": "monitor",
     "Stepper.aim": "set_reference",

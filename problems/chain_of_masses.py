@@ -87,7 +87,7 @@ def rest(plant):
     size = len(plant.coordinates)
     free = ca.SX.sym("free", size - 3)
     still = ca.vertcat(free, ca.DM(END), ca.SX.zeros(size - 3))
-    force = plant.response_function(still, [0, 0, 0], plant.exact)[: size - 3]
+    force = plant.equations.response(still, [0, 0, 0], plant.exact)[: size - 3]
     value = ca.Function("force", [free], [force])
     slope = ca.Function("slope", [free], [ca.jacobian(force, free)])
     fraction = np.arange(1, size // 3)[:, None] / (size // 3)

@@ -19,6 +19,7 @@ from fpirhc.controllers.contract import checked, tracking_law
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.task.problem import Problem
@@ -39,7 +40,7 @@ def exact_parameters_are_unknown(trial: Trial, generator: np.random.Generator) -
     plant = trial.problem.plant
     if trial.controller.plant_model(trial.problem).exact or not plant.parameters:
         return
-    other = replace(trial.problem, plant=plant.with_exact(plant.exact * _OTHER))
+    other = replace(trial.problem, plant=with_exact_parameters(plant, plant.exact * _OTHER))
     one, two = (Replay(p, trial.controller, trial.run) for p in (trial.problem, other))
     for k, (cycle, moved) in enumerate(zip(one.cycles(), two.cycles(), strict=True)):
         command, its = cycle["command"], moved["command"]

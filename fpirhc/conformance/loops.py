@@ -192,7 +192,7 @@ def spelled_by_states(problem: Problem) -> Problem | None:
     names = {e: f"z{k}" for k, e in enumerate(reversed(elements))}
     units = dict(zip(elements, plant.state.units, strict=True))
     x, u, p = plant.symbols()
-    rates = ca.Function("rates", [x, u, p], [plant.forced_derivative_function(x, u, p, ca.DM.zeros(len(plant.names)))])
+    rates = ca.Function("rates", [x, u, p], [plant.equations.forced_rate(x, u, p, ca.DM.zeros(len(plant.names)))])
 
     def moved(z: Any, inputs: Any, values: Any) -> dict[str, Any]:
         state = ca.vertcat(*(-z[names[e]] for e in elements))

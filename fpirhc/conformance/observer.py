@@ -15,6 +15,7 @@ from fpirhc.conformance.observer_cycle import Cycle
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.wrappers.exact_model import ExactModel
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.observability import unobservable
 from fpirhc.sensing.sensing import Sensing
@@ -154,7 +155,7 @@ def one_step_with_the_controller(trial: _Trial, generator: np.random.Generator) 
 def exact_parameters_are_unknown(trial: _Trial, generator: np.random.Generator) -> None:
     """Prediction and correction do not depend on the exact parameters, which nobody knows of a real plant."""
     plant = trial.problem.plant
-    other = replace(trial.problem, plant=plant.with_exact(_OTHER * plant.exact))
+    other = replace(trial.problem, plant=with_exact_parameters(plant, _OTHER * plant.exact))
     one, two = Cycle(trial.observer, trial.problem), Cycle(trial.observer, other)
     sample = one.sample(generator)
     same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one(sample), two(sample), strict=True))

@@ -80,7 +80,7 @@ def response_is_finite(trial: _Trial, generator: np.random.Generator) -> None:
     plant = trial.plant
     for x, u in trial.points(generator):
         for which, p in trial.parameters.items():
-            response = _numbers(plant.response_function, x, u, p)
+            response = _numbers(plant.equations.response, x, u, p)
             for name, value in zip(plant.names, response, strict=True):
                 hold(
                     bool(np.isfinite(value)),
@@ -95,7 +95,7 @@ def both_parameter_sets_enter(trial: _Trial, generator: np.random.Generator) -> 
     for which, values in trial.parameters.items():
         hold(values.shape == (size,), f"the {which} parameters have shape {values.shape}, expected ({size},)")
     x, u, p = plant.symbols()
-    seen = plant.response_function(x, u, p), plant.output_function(x, u, p, ca.SX.zeros(len(plant.names)))
+    seen = plant.equations.response(x, u, p), plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
     pattern = ca.DM(ca.jacobian_sparsity(ca.vertcat(*seen), p), 1)
     entering = np.asarray(pattern.full()).sum(axis=0) > 0
     for k, name in enumerate(plant.parameters):
@@ -111,7 +111,7 @@ def response_is_pure(trial: _Trial, generator: np.random.Generator) -> None:
     """Building the response once more gives the same response: it has no random numbers and no memory."""
     again = replace(trial.plant)
     for x, u in trial.points(generator):
-        one, other = (_numbers(p.response_function, x, u, p.exact) for p in (trial.plant, again))
+        one, other = (_numbers(p.equations.response, x, u, p.exact) for p in (trial.plant, again))
         hold(np.array_equal(one, other), f"built twice, it gives {one} and then {other} {trial.where(x, u)}")
 
 
@@ -123,8 +123,8 @@ def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> No
         forcing = generator.normal(size=len(plant.names))
         if plant.steps > 1:  # a forcing of a map acts in each of its steps, and moves the state of the later ones
             forcing[:] = 0
-        forced = _numbers(plant.response_function, x, u, plant.exact) + forcing
-        rate = _numbers(plant.forced_derivative_function, x, u, plant.exact, forcing)
+        forced = _numbers(plant.equations.response, x, u, plant.exact) + forcing
+        rate = _numbers(plant.equations.forced_rate, x, u, plant.exact, forcing)
         for k, name in enumerate(elements):
             higher = f"{name}'"
             what = x[elements.index(higher)] if higher in elements else forced[plant.names.index(name.rstrip("'"))]
@@ -138,7 +138,7 @@ def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
     plant = trial.plant
     x, u, p = plant.symbols()
     z = ca.vertcat(x, u)
-    slope = ca.Function("slope", [z, p], [ca.densify(ca.jacobian(plant.response_function(x, u, p), z))])
+    slope = ca.Function("slope", [z, p], [ca.densify(ca.jacobian(plant.equations.response(x, u, p), z))])
     split = plant.state.size
     names = [*plant.state.elements, *plant.input.elements]
     for x0, u0 in trial.points(generator):
@@ -147,7 +147,7 @@ def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
         for k, name in enumerate(names):
             step = 1e-5 * max(1.0, abs(at[k]))
             ends = [at + side * step * np.eye(at.size)[k] for side in (1, -1)]
-            up, down = (_numbers(plant.response_function, end[:split], end[split:], plant.exact) for end in ends)
+            up, down = (_numbers(plant.equations.response, end[:split], end[split:], plant.exact) for end in ends)
             expected = (up - down) / (2 * step)
             scale = max(1.0, float(np.abs(expected).max()), float(np.abs(up).max()))
             missed = float(np.abs(slopes[:, k] - expected).max())
@@ -165,9 +165,9 @@ def inverse_inverts(trial: _Trial, generator: np.random.Generator) -> None:
         return
     for x, u in trial.points(generator):
         for which, p in trial.parameters.items():
-            wanted = _numbers(plant.controlled_response_function, x, u, p)
-            command = _numbers(plant.inverse_function, x, wanted, p)
-            got = _numbers(plant.controlled_response_function, x, command, p)
+            wanted = _numbers(plant.equations.controlled_response, x, u, p)
+            command = _numbers(plant.equations.inverse, x, wanted, p)
+            got = _numbers(plant.equations.controlled_response, x, command, p)
             missed = float(np.abs(got - wanted).max())
             hold(
                 within(missed, _INVERSE * (1 + float(np.abs(wanted).max()))),

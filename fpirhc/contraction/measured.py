@@ -8,6 +8,7 @@ import numpy as np
 from fpirhc.contraction.gains import predicted_factor
 from fpirhc.contraction.spectrum import Array
 from fpirhc.errors import InvalidShape
+from fpirhc.plant.motion import sampling
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
@@ -68,7 +69,7 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
     model, plant = problem.plant, problem.real_plant
-    matrix = kind(model.inverse_opaque or problem.real_integrator.opaque)
+    matrix = kind(model.equations.inverse_opaque or problem.real_integrator.opaque)
     x, state = matrix.sym("x", plant.state.size), matrix.sym("state", model.state.size)
     r, u = matrix.sym("r", len(model.controlled_names)), matrix.sym("u", model.input.size)
     exact, assumed = matrix.sym("exact", len(plant.parameters)), matrix.sym("assumed", len(model.parameters))
@@ -81,7 +82,7 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
     else:
         response = problem.truth.function(response_names(model), seen=True)(after, u, exact, calm)
     gain = ca.Function("fpirhc_sampled_gain", [x, u, later, exact], [ca.densify(ca.jacobian(response, u))])
-    command = model.inverse_function(state, r, assumed)
+    command = model.equations.inverse(state, r, assumed)
     jacobian = gain(x, command, command, exact) @ ca.jacobian(command, r)
     names = ["reality", "state", "deformed", "exact", "approximate"]
     arguments = [x, state, r, exact, assumed]
@@ -105,7 +106,7 @@ def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tu
     for name in model.controlled_names:
         order = model.chains[name]
         outputs = outputs_of(states[order - 1], *held)
-        entries.append(outputs[model.output.elements.index(name)] / model.sampling**order)
+        entries.append(outputs[model.output.elements.index(name)] / sampling(model) ** order)
     return ca.vertcat(*entries)
 
 

@@ -72,12 +72,12 @@ def response_jacobian(plant: Plant) -> ca.Function:
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    matrix = kind(plant.inverse_opaque)
+    matrix = kind(plant.equations.inverse_opaque)
     x = matrix.sym("x", plant.state.size)
     r = matrix.sym("r", len(plant.controlled_names))
     exact = matrix.sym("exact", plant.parameter.size if plant.parameters else 0)
     assumed = matrix.sym("approximate", exact.numel())
-    realised = plant.controlled_response_function(x, plant.inverse_function(x, r, assumed), exact)
+    realised = plant.equations.controlled_response(x, plant.equations.inverse(x, r, assumed), exact)
     jacobian = ca.densify(ca.jacobian(realised, r))
     names = ["state", "deformed", "exact", "approximate"]
     return ca.Function("fpirhc_response_jacobian", [x, r, exact, assumed], [jacobian], names, ["jacobian"])

@@ -31,7 +31,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.given import described
 from fpirhc.plant.chain import measured_signals, nominal_responses
-from fpirhc.plant.motion import followed_units
+from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -48,7 +48,7 @@ def controller_reads(problem: Problem, controller: Controller) -> Layout:
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
     parameters = controller.plant_model(problem).plant.parameter
-    return Layout((plant.time, *measured_signals(plant), realised, parameters, *given_signals(problem)))
+    return Layout((time_signal(plant), *measured_signals(plant), realised, parameters, *given_signals(problem)))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
@@ -188,7 +188,7 @@ def reference_block(problem: Problem) -> Block:
             "error": state[places] - getattr(s, seen.name)[places],
         }
 
-    reads = Layout((plant.time, seen, *own_signals(problem)))
+    reads = Layout((time_signal(plant), seen, *own_signals(problem)))
     writes = (like(seen, "reference"), plant.response_signal("_reference_response"), error_signal(problem, "error"))
     return Block("reference", reads, Layout(writes), step, opaque=problem.reference.opaque)
 
@@ -300,12 +300,14 @@ def _sane(error: Expression, largest: Sequence[float]) -> Expression | None:
 def invert_block(plant: Plant) -> Block:
     """Block (state, _deformed_unclipped, parameters) -> the command that the model needs for it."""
     reads = Layout((plant.state, plant.response_signal("_deformed_unclipped"), plant.parameter))
-    inverse = plant.inverse_function
+    inverse = plant.equations.inverse
 
     def step(s: Signals) -> dict[str, Expression]:
         return {"command_unclipped": inverse(s.state, s._deformed_unclipped, s.parameters)}
 
-    return Block("invert", reads, Layout((like(plant.input, "command_unclipped"),)), step, opaque=plant.inverse_opaque)
+    return Block(
+        "invert", reads, Layout((like(plant.input, "command_unclipped"),)), step, opaque=plant.equations.inverse_opaque
+    )
 
 
 def _limit_block(problem: Problem) -> Block:
@@ -346,9 +348,9 @@ def _meaning(plant: Plant) -> ca.Function:
     """
     x, u, p = plant.symbols()
     unclipped, r = ca.SX.sym("unclipped", u.numel()), ca.SX.sym("r", len(plant.controlled_names))
-    response = plant.controlled_response_function(x, u, p)
+    response = plant.equations.controlled_response(x, u, p)
     shifted = r + ca.mtimes(ca.jacobian(response, u), u - unclipped)
-    meaning = shifted if plant.affine else ca.if_else(ca.mmax(u != unclipped), response, r)
+    meaning = shifted if plant.equations.affine else ca.if_else(ca.mmax(u != unclipped), response, r)
     return ca.Function("fpirhc_meaning", [x, u, unclipped, r, p], [ca.densify(meaning)])
 
 

@@ -157,7 +157,7 @@ class Planner:
         plant = problem.plant
         if not self.starts_consistent(plant):
             return ()
-        pairs = zip(plant.state.elements, plant.known_by_outputs, strict=True)
+        pairs = zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)
         return tuple(e for e, place in pairs if place < 0 and e in problem.limits.states)
 
 

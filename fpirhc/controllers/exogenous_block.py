@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -100,5 +101,5 @@ class KnownSignals:
         parameter, opaque = self.plant.parameter, not values.is_a("SXFunction")
         writes = Layout((Signal(NOW, parameter.elements, parameter.units), *((acted,) if remembers else ())))
         memory = Layout((last,)) if remembers else Layout()
-        block = Block("signals", Layout((self.plant.time, parameter)), writes, step, memory, opaque)
+        block = Block("signals", Layout((time_signal(self.plant), parameter)), writes, step, memory, opaque)
         return replace(block, waits=block)  # time goes on

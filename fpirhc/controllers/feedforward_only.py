@@ -60,7 +60,7 @@ class FeedforwardOnly(Controller):
     def _block(self, problem: Problem) -> Block:
         """Block (reference, state, parameters) -> command, and the response that the model expects of it."""
         plant, wanted = problem.plant, problem.plant.response_signal("_reference_response")
-        inverse, response = plant.inverse_function, plant.controlled_response_function
+        inverse, response = plant.equations.inverse, plant.equations.controlled_response
         known = known_on_reference(plant)
 
         def step(s: Signals) -> dict[str, Expression]:
@@ -82,7 +82,7 @@ class FeedforwardOnly(Controller):
         responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
         reads = (like(plant.output, "reference"), wanted, plant.state, plant.parameter)
         writes = Layout((*responses, like(plant.input, "command_unclipped"), scalar(_SEEN)))
-        return Block("feedforward", Layout(reads), writes, step, opaque=plant.inverse_opaque)
+        return Block("feedforward", Layout(reads), writes, step, opaque=plant.equations.inverse_opaque)
 
 
 # Open loop: what is left is the dead time of the problem.

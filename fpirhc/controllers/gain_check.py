@@ -197,7 +197,7 @@ def _at_start(problem: Problem) -> Spectrum | None:
         before = tuple(map(float, problem.inputs_before))
         return _spectrum(problem.plant, tuple(map(float, problem.start_state)), before)
     plant, state = problem.plant, problem.start_state[None, :]
-    response = plant.controlled_response_function(problem.start_state, problem.inputs_before, plant.approximate)
+    response = plant.equations.controlled_response(problem.start_state, problem.inputs_before, plant.approximate)
     try:
         real = problem.real_start[None, :]
         [jacobian] = sampled_jacobians(problem, real, state, response.full().T, plant.approximate)
@@ -210,7 +210,7 @@ def _at_start(problem: Problem) -> Spectrum | None:
 @lru_cache(maxsize=8)  # a search checks many gains at the same start
 def _spectrum(plant: Plant, start: tuple[float, ...], before: tuple[float, ...]) -> Spectrum | None:
     state = np.array(start)[None, :]
-    response = plant.controlled_response_function(state[0], before, plant.approximate)
+    response = plant.equations.controlled_response(state[0], before, plant.approximate)
     try:
         return spectrum_over_run(plant, state, response.full().T)
     except InvalidValue:

@@ -24,6 +24,7 @@ from fpirhc.controllers.mirror_path import (
 )
 from fpirhc.controllers.twin import BEFORE, twin_block, twin_of_outputs
 from fpirhc.deformation.base import Deformation
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, unseen
 from fpirhc.symbolic.expression import Signals
@@ -69,7 +70,7 @@ def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
     writes = measured_reads(plant, blocks)
     if not writes:
         return list(blocks)
-    sources = {MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: plant.time}
+    sources = {MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
     reads = tuple(sources[w.name] for w in writes)
     first = Block(
         "measured", Layout(reads), Layout(writes), lambda s: {w.name: getattr(s, sources[w.name].name) for w in writes}
@@ -79,7 +80,7 @@ def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
 
 def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
     """Return the signals of the measured state and outputs and of their time, as far as some blocks read them."""
-    every = measured_state(plant), measured_output(plant), replace(plant.time, name=MEASURED_TIME)
+    every = measured_state(plant), measured_output(plant), replace(time_signal(plant), name=MEASURED_TIME)
     read = {name for block in blocks for name in block.reads.names}
     return tuple([signal for signal in every if signal.name in read])
 
@@ -108,7 +109,7 @@ def map_mirror(path: Path, *, lost: bool = False) -> Block:
         last = getattr(s, _BEFORE)
         last = straightened(last, getattr(s, MEASURED), s.gap) if lost else last
         parameters, signals = path.known.acted(s, path.late)
-        answers = ca.vertsplit(plant.controlled_response_function(last, acting, parameters))
+        answers = ca.vertsplit(plant.equations.controlled_response(last, acting, parameters))
         past = ca.vertsplit(getattr(s, _ANSWERS)) if waiting else []
         modelled, later, at = [], [], 0
         for answer, order in zip(answers, orders, strict=True):
@@ -133,7 +134,7 @@ def _instant_block(path: Path) -> Block:
     """Block (measured state, last command, parameters) -> the model's response at this instant."""
     plant = path.problem.plant
     x, u, p = plant.symbols()
-    response = ca.Function("fpirhc_modelled", [x, u, p], [plant.controlled_response_function(x, u, p)])
+    response = ca.Function("fpirhc_modelled", [x, u, p], [plant.equations.controlled_response(x, u, p)])
 
     def step(s: Signals) -> dict[str, Expression]:
         end, _, remembered = path.acted(s)

@@ -124,7 +124,7 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
     x, u, p = plant.symbols()
     values = values_of(plant, x, u, p)
     shown = ca.vertcat(*(values[n] for n in names))
-    rate = plant.derivative_function(x, u, p)
+    rate = plant.equations.rate(x, u, p)
     jacobians = ca.Function("fpirhc_observed", [x, u, p], [ca.jacobian(rate, x), ca.jacobian(shown, x)])
     states, slopes, seen = [], [], []
     for state, needed in _points(problem):
@@ -147,7 +147,7 @@ def _points(problem: Problem) -> Iterator[tuple[np.ndarray, np.ndarray]]:
             outputs, response = reference(t)
             state = reference_state(plant, outputs)
             if len(plant.controlled_names) == len(plant.inputs):
-                needed = np.asarray(plant.inverse_function(state, response, plant.approximate).full())
+                needed = np.asarray(plant.equations.inverse(state, response, plant.approximate).full())
             yield np.asarray(state.full()).ravel(), needed.ravel()
         return
     states, inputs = nominal_run(problem.plant, problem.reference, *nominal_start(problem))

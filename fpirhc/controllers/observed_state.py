@@ -115,7 +115,7 @@ class Believing:
         """States as the estimator has them, and as they are measured beside outputs."""
         plant = self.problem.plant
         entries = ca.vertsplit(motion)
-        pairs = zip(plant.state.elements, plant.known_by_outputs, strict=True)
+        pairs = zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)
         return {**measured, **{e: entries[place] for e, place in pairs if place >= 0}}
 
     def _wait(self, s: Signals) -> dict[str, Expression]:

@@ -44,6 +44,7 @@ from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
@@ -129,7 +130,7 @@ class RecedingHorizon(Controller):
 def _check_states_of_plans(plant: Plant, replanning: Replanning, on_failure: OnFailure) -> None:
     """Raise where a way of replanning, or of failing, needs states that the outputs do not give."""
     reason = ""
-    instant = [name for name, order in plant.output_orders.items() if not order]
+    instant = [name for name, order in plant.equations.output_orders.items() if not order]
     if instant:
         reason = f"{', '.join(instant)} depends on the command too (order 0), and plans are for functions of the state"
     elif plant.outputs and replanning.law is not None:
@@ -261,7 +262,7 @@ def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
     own, outputs = own_signals(problem), measured_signals(plant)[1:]
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
-    return Layout((plant.time, start, *outputs, plant.parameter, *last, *_derived_signals(ocp), *own))
+    return Layout((time_signal(plant), start, *outputs, plant.parameter, *last, *_derived_signals(ocp), *own))
 
 
 def _derived_signals(ocp: OptimalControl) -> tuple[Signal, ...]:

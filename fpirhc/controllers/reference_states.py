@@ -33,7 +33,7 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
     if known_on_reference(plant):
         referenced = np.asarray(problem.reference.function(plant).map(count)(times[None, :])[0].full())
-        return referenced[list(plant.known_by_outputs)]
+        return referenced[list(plant.equations.known_by_outputs)]
     states, _ = nominal_run(plant, problem.reference, *nominal_start(problem))
     places = np.minimum(np.round(times / problem.period).astype(int), states.shape[1] - 1)
     return states[:, places]
@@ -101,7 +101,7 @@ def _states(task: Problem) -> np.ndarray:
 def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.ndarray:
     count = states.shape[1]
     repeated = (np.repeat(v[:, None], count, axis=1) for v in (command, task.plant.approximate))
-    return np.asarray(task.plant.controlled_response_function.map(count)(states, *repeated).full())
+    return np.asarray(task.plant.equations.controlled_response.map(count)(states, *repeated).full())
 
 
 def _with(command: np.ndarray, k: int, value: float) -> np.ndarray:

@@ -83,7 +83,7 @@ class FromMeasurement(Replanning):
         """Return the blocks plan_state before the plan and nominal after it."""
         plant = problem.plant
         start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
-        response = without_disturbances(plant).controlled_response_function
+        response = without_disturbances(plant).equations.controlled_response
         reads = Layout((plant.state, like(plant.input, "planned"), plant.parameter))
         writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
 
@@ -174,12 +174,12 @@ def _propagate(plant: Plant, period: float) -> Block:
     """Block (target, planned input) -> (nominal response, target one cycle later by the model)."""
     reads = Layout((like(plant.state, "_target"), like(plant.input, "planned"), plant.parameter))
     writes = Layout((plant.response_signal("nominal"), like(plant.state, "target")))
-    response, rate = plant.controlled_response_function, plant.derivative_function
+    response, rate = plant.equations.controlled_response, plant.equations.rate
     calm = ca.DM.zeros(len(plant.names))
 
     def step(s: Signals) -> dict[str, Expression]:
         if plant.step is not None:
-            target_next = plant.next_function(s._target, s.planned, s.parameters, calm)
+            target_next = plant.equations.next(s._target, s.planned, s.parameters, calm)
         else:
             target_next = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
         return {"nominal": response(s._target, s.planned, s.parameters), "target": target_next}

@@ -49,7 +49,7 @@ def plan_demand(problem: Problem) -> Demand:
             "may jump by any amount; give the deformation its scale (Sigmoid(scale=...)), or Limits(inputs=...)"
         )
     x, u, p = plant.symbols()
-    gain = ca.Function("g", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
+    gain = ca.Function("g", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
     at_start = np.asarray(gain(problem.start_state, (lower + upper) / 2, plant.approximate).full())
     return Demand(float(np.linalg.norm(np.abs(at_start) @ (upper - lower))), sudden=True)
 
@@ -58,7 +58,7 @@ def command_demand(problem: Problem, parameters: np.ndarray) -> Demand:
     """Return the change period max|dQ/dt| of the command Q that the model with these parameters needs along the reference."""
     plant, times = problem.plant, np.linspace(0.0, problem.duration, _SAMPLES)
     wanted = nominal_motion(problem).map(_SAMPLES)(times[None, :])[1]
-    values = plant.inverse_function.map(_SAMPLES)(
+    values = plant.equations.inverse.map(_SAMPLES)(
         reference_states(problem, _SAMPLES), wanted, np.repeat(parameters[:, None], _SAMPLES, axis=1)
     )
     return Demand(problem.period * _steepest(np.asarray(values.full()), times), sudden=False)
@@ -81,7 +81,7 @@ def _largest_error(problem: Problem) -> float:
     states = reference_states(problem, _SAMPLES)
     wanted = np.asarray(nominal_motion(problem).map(_SAMPLES)(times[None, :])[1].full())
     model, still = np.repeat(plant.approximate[:, None], _SAMPLES, axis=1), np.zeros((plant.input.size, _SAMPLES))
-    free = np.asarray(plant.controlled_response_function.map(_SAMPLES)(states, still, model).full())
+    free = np.asarray(plant.equations.controlled_response.map(_SAMPLES)(states, still, model).full())
     sizes = np.linalg.norm(wanted - free, axis=0)
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 

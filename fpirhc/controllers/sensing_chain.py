@@ -180,7 +180,7 @@ def _ahead_block(plant: Plant, measured: Signal, *, lost: bool = False) -> Block
     powers = [e.count("'") for e in elements]
     x, u, p = plant.symbols()
     no_input, calm = ca.SX.zeros(u.numel()), ca.SX.zeros(len(plant.names))
-    expected_at = ca.Function("fpirhc_expected", [x, p], [plant.output_function(x, no_input, p, calm)])
+    expected_at = ca.Function("fpirhc_expected", [x, p], [plant.equations.output(x, no_input, p, calm)])
     past = Signal(_PAST, tuple(f"{e}@{i}" for e, j in zip(elements, powers, strict=True) for i in range(1, j + 1)))
     counted = Signal(_COUNT)
 

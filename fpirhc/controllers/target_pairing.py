@@ -135,7 +135,7 @@ def _slowest(problem: Problem) -> float:
     """Slowest time constant of the model at the start, with the command held."""
     plant = problem.plant
     x, u, p = plant.symbols()
-    slope = ca.Function("fpirhc_modes", [x, u, p], [ca.densify(ca.jacobian(plant.derivative_function(x, u, p), x))])
+    slope = ca.Function("fpirhc_modes", [x, u, p], [ca.densify(ca.jacobian(plant.equations.rate(x, u, p), x))])
     matrix = np.asarray(slope(problem.start_state, problem.inputs_before, plant.approximate).full())
     modes = np.linalg.eigvals(matrix) if np.isfinite(matrix).all() else np.zeros(1)
     rates = -growth_of(plant)(modes)

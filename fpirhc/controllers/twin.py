@@ -232,5 +232,5 @@ def _chain(problem: Problem) -> ca.Function:
     """Function (state, command, parameters) -> the model's outputs and their derivatives below the relative order."""
     plant = problem.plant
     x, u, p = plant.symbols()
-    entries = plant.output_function(x, u, p, np.zeros(len(plant.names)))
+    entries = plant.equations.output(x, u, p, np.zeros(len(plant.names)))
     return ca.Function("fpirhc_mirror_chain", [x, u, p], [entries])

@@ -82,7 +82,7 @@ def _newton(plant: Plant, orders: Mapping[str, int]) -> ca.Function:
     x, _, p = plant.symbols()
     y = ca.SX.sym("y", plant.output.size)
     rows = [k for k, e in enumerate(plant.output.elements) if orders.get(e.rstrip("'"), 0)]
-    outputs = plant.output_function(x, ca.SX.zeros(len(plant.inputs)), p, ca.SX.zeros(len(plant.names)))[rows]
+    outputs = plant.equations.output(x, ca.SX.zeros(len(plant.inputs)), p, ca.SX.zeros(len(plant.names)))[rows]
     basis, pulses = _basis(plant, x, p, list(orders.values()))
     seen = ca.mtimes(ca.jacobian(outputs, x), basis)
     c = ca.solve(ca.densify(seen), y[rows] - outputs)
@@ -93,10 +93,10 @@ def _newton(plant: Plant, orders: Mapping[str, int]) -> ca.Function:
 def _basis(plant: Plant, x: ca.SX, p: ca.SX, orders: list[int]) -> tuple[ca.SX, ca.SX]:
     """The directions, a column per order of every output; and the inputs of each, one below the other by k."""
     still, u = ca.SX.zeros(len(plant.inputs)), ca.SX.sym("u", len(plant.inputs))
-    drift, moved = plant.derivative_function(x, still, p), plant.derivative_function(x, u, p)
+    drift, moved = plant.equations.rate(x, still, p), plant.equations.rate(x, u, p)
     alone = ca.SX.eye(len(orders))
     if len(set(orders)) > 1:
-        slope = ca.substitute(ca.jacobian(plant.controlled_response_function(x, u, p), u), u, still)
+        slope = ca.substitute(ca.jacobian(plant.equations.controlled_response(x, u, p), u), u, still)
         alone = ca.solve(ca.densify(slope), alone)
     field = ca.substitute(ca.jacobian(moved, u), u, still)
     columns, pulses = [], []

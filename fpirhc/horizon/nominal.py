@@ -30,7 +30,7 @@ _SMALL = 1e-2  # share of the largest gain before a run that is not finite
 
 def known_on_reference(plant: Plant) -> bool:
     """Whether the reference gives the whole state."""
-    return min(plant.known_by_outputs) >= 0
+    return min(plant.equations.known_by_outputs) >= 0
 
 
 def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
@@ -43,14 +43,14 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
     Raises:
         NotSupported: the plant has states that no output shows.
     """
-    hidden = [e for e, place in zip(plant.state.elements, plant.known_by_outputs, strict=True) if place < 0]
+    hidden = [e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0]
     if hidden:
         raise NotSupported(
             f"the input along the reference needs the states {', '.join(hidden)}, which are no outputs and do not follow from "
             "them by linear equations, and so have no reference; weigh the rate of the input, Quadratic(rate=...), in place of "
             "its deviation from a feedforward"
         )
-    return outputs[list(plant.known_by_outputs)]
+    return outputs[list(plant.equations.known_by_outputs)]
 
 
 def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> Matrix:
@@ -67,7 +67,7 @@ def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> 
     """
     follows = None if known_on_reference(plant) else followed_state(plant)
     state = reference_state(plant, outputs) if follows is None else follows(outputs, p)
-    return plant.inverse_function(state, nominal_responses(plant, outputs, responses), p)
+    return plant.equations.inverse(state, nominal_responses(plant, outputs, responses), p)
 
 
 def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: float) -> Matrix:
@@ -81,7 +81,7 @@ def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: f
         rate: per unit of time.
     """
     calm = ca.DM.zeros(len(plant.names))
-    error = outputs - plant.output_function(x, ca.DM.zeros(plant.input.size), p, calm)
+    error = outputs - plant.equations.output(x, ca.DM.zeros(plant.input.size), p, calm)
     sums = []
     for name, order in plant.response_orders.items():
         places = [plant.output.elements.index(name + "'" * k) for k in range(order)]
@@ -110,13 +110,13 @@ def nominal_motion(
         rate: with which errors of the outputs decay, (d/dt + rate)^r e = 0; zero is the feedforward alone.
     """
     x, outputs, r = (ca.MX.sym(n, size) for n, size in _sizes(plant).items())
-    known = [(k, place) for k, place in enumerate(plant.known_by_outputs) if place >= 0]
+    known = [(k, place) for k, place in enumerate(plant.equations.known_by_outputs) if place >= 0]
     entries = ca.vertsplit(x)
     for k, place in known:
         entries[k] = outputs[place]
     at, p = ca.vertcat(*entries), ca.MX(ca.DM(plant.approximate))
     wanted = nominal_responses(plant, outputs, r)
-    needed = plant.inverse_function(at, wanted + output_feedback(plant, at, outputs, p, rate), p)
+    needed = plant.equations.inverse(at, wanted + output_feedback(plant, at, outputs, p, rate), p)
     command = ca.fmin(ca.fmax(needed, ca.DM(bounds[0])), ca.DM(bounds[1]))
     step = ca.Function("fpirhc_nominal", [x, outputs, r], [advance(at, command, p), at, command])
     outputs_at, responses_at = reference.function(plant).map(times.size)(times[None, :])
@@ -132,10 +132,10 @@ def followed_state(plant: Plant) -> ca.Function | None:
     """Return the Function (y, y', ... below each relative order; parameters) -> state; None where some state does not follow."""
     x, u, p = plant.symbols()
     y = ca.SX.sym("y", plant.output.size)
-    residuals = ca.vertsplit(plant.output_function(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names))) - y)
-    known = {i: y[place] for i, place in enumerate(plant.known_by_outputs) if place >= 0}
+    residuals = ca.vertsplit(plant.equations.output(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names))) - y)
+    known = {i: y[place] for i, place in enumerate(plant.equations.known_by_outputs) if place >= 0}
     left = [i for i in range(x.numel()) if i not in known]
-    rows = [_with(r, x, known) for k, r in enumerate(residuals) if k not in plant.known_by_outputs]
+    rows = [_with(r, x, known) for k, r in enumerate(residuals) if k not in plant.equations.known_by_outputs]
     while left:
         one = next(((r, i) for r in rows for i in left if _alone(r, x, i, left)), None)
         if one is None:
@@ -225,7 +225,7 @@ def singular_gain(plant: Plant, states: np.ndarray, inputs: np.ndarray, period: 
         period: length of a cycle.
     """
     x, u, p = plant.symbols()
-    response, count = plant.controlled_response_function(x, u, p), states.shape[1]
+    response, count = plant.equations.controlled_response(x, u, p), states.shape[1]
     gain = ca.Function("fpirhc_output_gain", [x, u, p], [ca.densify(ca.det(ca.jacobian(response, u)))])
     believed = np.repeat(plant.approximate[:, None], count, axis=1)
     gains = np.asarray(gain.map(count)(states, inputs, believed).full()).ravel()

@@ -16,6 +16,7 @@ from fpirhc.errors import NotSupported
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -38,7 +39,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     shown = horizon.measured
     offset = (Signal("offset", shown, tuple(units[e] for e in shown)),) if shown else ()
     signals = (
-        plant.time,
+        time_signal(plant),
         Signal("reference", plant.output.elements, plant.output.units),
         Signal("feedforward", plant.input.elements, plant.input.units),
         plant.parameter,
@@ -68,7 +69,7 @@ def stage_data(
     `previewed`, its states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
     """
     looked_up = signals is not None and not signals.is_a("SXFunction")
-    matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)
+    matrix = kind(reference.opaque or plant.equations.inverse_opaque or looked_up)
     t, of_cycle = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
     p = of_cycle if signals is None else signals(t + horizon.step / 2, of_cycle)
     motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.chains))] if previewed else []
@@ -122,7 +123,7 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
     """
     x, u, p = plant.symbols()
     y, column = ca.SX.sym("y", plant.output.size), ca.SX.sym("data", layout.size)
-    error = y - plant.output_function(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names)))
+    error = y - plant.equations.output(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names)))
     place, difference = layout.slice("reference"), ca.SX.zeros(layout.size)
     for k, element in enumerate(plant.output.elements):
         if not element.endswith("'"):

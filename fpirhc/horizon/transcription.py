@@ -130,7 +130,7 @@ def _transcribed(
         settings=settings,
         live_bounds=tuple(live_numbers(limits.inputs)),
         derive=derive,
-        inner=tuple(zip(plant.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
+        inner=tuple(zip(plant.equations.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
         runaway=lambda: spurious_growth(
             plant, horizon.discretisation, horizon.step, nodes[0][: plant.state.size, :-1], nodes[1]
         ),
@@ -300,7 +300,7 @@ def _view(
 def _outputs(plant: Plant, x: Expression, p: Expression) -> Named:
     """The model's outputs and their derivatives at a stage; the state without outputs."""
     still = ca.SX.zeros(plant.input.size), ca.SX.zeros(len(plant.names))  # neither reaches these derivatives
-    return Named(plant.output.elements, plant.output_function(x, still[0], p, still[1]), plant.output.name)
+    return Named(plant.output.elements, plant.equations.output(x, still[0], p, still[1]), plant.output.name)
 
 
 def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
@@ -362,7 +362,7 @@ def _nodes(
         bounds = nominal(limits).input_bounds(plant)
         states, inputs = nominal_motion(plant, reference, _advance(plant, horizon), first, bounds, data[0])
     else:
-        states = states[list(plant.known_by_outputs)]
+        states = states[list(plant.equations.known_by_outputs)]
     states = np.vstack([states, inputs[: extra[0]], np.zeros((extra[1], data.shape[1]))])
     return states, inputs[:, : horizon.stages], data
 

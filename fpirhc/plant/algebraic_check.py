@@ -64,7 +64,7 @@ def unsolved(plant: Motion, state: np.ndarray, command: np.ndarray, parameters: 
     if algebraic is None:
         return ""
     names = ", ".join(algebraic.names)
-    solution = np.asarray(plant.algebraic_function(state, command, parameters).full()).ravel()
+    solution = np.asarray(plant.equations.algebraic(state, command, parameters).full()).ravel()
     x, u, p = plant.symbols()
     z = ca.SX.sym("z", len(algebraic.names))
     slope = ca.jacobian(algebraic.residual(arguments_of(plant, x, u, p), z), z)

@@ -46,7 +46,7 @@ def input_reaches_at(plant: Plant, name: str, count: int) -> int | None:
 def _responses(plant: Plant, symbols: Symbols) -> Expression:
     """The highest derivatives of all coordinates; a map has none."""
     x, u, p, w = symbols
-    return w if plant.step is not None else plant.response_function(x, u, p) + w
+    return w if plant.step is not None else plant.equations.response(x, u, p) + w
 
 
 def _chain(plant: Plant, name: str, count: int, symbols: Symbols, responses: Expression) -> list[Expression]:
@@ -62,7 +62,7 @@ def _chain(plant: Plant, name: str, count: int, symbols: Symbols, responses: Exp
     if count >= order:
         chain.append(responses[place])
     if count > order:
-        rate = plant.forced_derivative_function(x, u, p, w)
+        rate = plant.equations.forced_rate(x, u, p, w)
         for _ in range(count - order):
             chain.append(ca.jtimes(chain[-1], x, rate))
     return chain
@@ -104,7 +104,7 @@ def differentiated_signals(plant: Plant) -> tuple[str, ...]:
     if not plant.outputs:
         return ()
     x, u, p = plant.symbols()
-    motion = plant.output_function(x, u, p, ca.SX.zeros(len(plant.names)))
-    differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if plant.output_orders.get(e, 1)]
+    motion = plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
+    differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if plant.equations.output_orders.get(e, 1)]
     places = {name: plant.parameter.elements.index(name) for name in outside_names(plant)}
     return tuple(name for name, place in places.items() if ca.depends_on(ca.vertcat(*differentiated), p[place]))

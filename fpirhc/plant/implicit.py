@@ -87,7 +87,7 @@ class RadauIIA(_Implicit):
 
 
 def _step(name: str, plant: Plant, period: float, counts: tuple[int, int], method: _Coefficients) -> ca.Function:
-    rate, (substeps, newton) = plant.forced_derivative_function, counts
+    rate, (substeps, newton) = plant.equations.forced_rate, counts
     x, u, p, w = (ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
     at, h = ca.SX.sym("at", x.numel()), period / substeps
     slope = ca.Function("fpirhc_slope", [at, u, p, w], [ca.densify(ca.jacobian(rate(at, u, p, w), at))])

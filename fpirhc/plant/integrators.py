@@ -15,6 +15,7 @@ import numpy as np
 
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Few
+from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 
@@ -72,7 +73,7 @@ class RungeKutta4(Integrator):
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
-        rate = plant.forced_derivative_function
+        rate = plant.equations.forced_rate
         x, u, p, w = _symbols(rate)
         h = period / self.substeps
         x_next = x
@@ -100,7 +101,7 @@ class Euler(Integrator):
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
-        rate = plant.forced_derivative_function
+        rate = plant.equations.forced_rate
         x, u, p, w = _symbols(rate)
         h, x_next = period / self.substeps, x
         for _ in range(self.substeps):
@@ -129,7 +130,7 @@ class Cvodes(Integrator):
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
-        rate = plant.forced_derivative_function
+        rate = plant.equations.forced_rate
         x, u, p, w = _symbols(rate)
         data = ca.vertcat(u, p, w)
         options = {"reltol": self.tolerance, "abstol": self.tolerance}
@@ -157,8 +158,8 @@ class MapSteps(Integrator):
         """Function (state, input, parameters, forcing) -> state after `period`, a whole number of the plant's cycles."""
         x, u, p = plant.symbols()
         w, after = ca.SX.sym("w", len(plant.names)), x
-        for _ in range(max(1, round(period / plant.sampling))):
-            after = plant.next_function(after, u, p, w)
+        for _ in range(max(1, round(period / sampling(plant)))):
+            after = plant.equations.next(after, u, p, w)
         return ca.Function("fpirhc_map", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
 
 

@@ -76,7 +76,7 @@ def _along(plant: Motion, value: Expression, symbols: Symbols) -> Expression:
     if plant.step is not None:
         return shifted(plant, value, symbols)
     x, u, p, w = symbols
-    return ca.jtimes(value, x, plant.forced_derivative_function(x, u, p, w))
+    return ca.jtimes(value, x, plant.equations.forced_rate(x, u, p, w))
 
 
 def output_order(plant: Motion, name: str) -> int | None:
@@ -134,7 +134,7 @@ def structural_order(plant: Motion, coordinate: str) -> int | None:
     coordinate through the states on which its derivatives depend.
     """
     x, u, p = plant.symbols()
-    rate = plant.derivative_function(x, u, p)
+    rate = plant.equations.rate(x, u, p)
     on_state = np.array(ca.DM(ca.jacobian_sparsity(rate, x), 1).full(), dtype=bool)
     on_input = np.array(ca.DM(ca.jacobian_sparsity(rate, u), 1).full(), dtype=bool).any(axis=1)
     reached: np.ndarray = np.zeros(plant.state.size, dtype=bool)

@@ -31,7 +31,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.kinds import finite_number
-from fpirhc.plant.motion import Motion
+from fpirhc.plant.motion import Motion, sampling
 from fpirhc.symbolic.layout import Expression, Named
 
 _Motion = TypeVar("_Motion", bound=Motion)
@@ -118,7 +118,7 @@ def shifted(plant: Motion, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX
         symbols: x, u, p and the forcing w; what the value has of u, p and w is held.
     """
     x, u, p, w = symbols
-    return (ca.substitute(ca.SX(value), x, plant.next_function(x, u, p, w)) - value) / plant.sampling
+    return (ca.substitute(ca.SX(value), x, plant.equations.next(x, u, p, w)) - value) / sampling(plant)
 
 
 def decay_rates(modes: np.ndarray, cycle: float) -> np.ndarray:
@@ -141,9 +141,9 @@ def step_of(plant: Motion, matrix: np.ndarray, cycle: float) -> np.ndarray:
     """Return the matrix by which x' = A x moves in one control cycle, or delta x = A x in that of a map."""
     from scipy.linalg import expm  # only here: the import takes longer than that of the whole package
 
-    return np.asarray(expm(matrix * cycle)) if plant.step is None else np.eye(len(matrix)) + plant.sampling * matrix
+    return np.asarray(expm(matrix * cycle)) if plant.step is None else np.eye(len(matrix)) + sampling(plant) * matrix
 
 
 def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
-    return np.real if plant.step is None else partial(decay_rates, cycle=plant.sampling)
+    return np.real if plant.step is None else partial(decay_rates, cycle=sampling(plant))

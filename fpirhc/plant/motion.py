@@ -14,13 +14,13 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
+from typing import TYPE_CHECKING, TypeVar
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotInvertible
-from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked import Checked, missing
 from fpirhc.fields.kinds import Few
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.algebraic import Algebraic
@@ -28,6 +28,8 @@ from fpirhc.plant.output import Output
 from fpirhc.plant.parameter import Parameter, with_exact_values
 from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
+
+_Motion = TypeVar("_Motion", bound="Motion")
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,17 +111,6 @@ class Motion(Checked):
         return names
 
     @cached_property
-    def time(self) -> Signal:
-        """The time's signal."""
-        return scalar("time", self.time_unit)
-
-    @cached_property
-    def response_units(self) -> tuple[str, ...]:
-        """Units of the highest derivative of every coordinate."""
-        units = zip(self.coordinates.values(), self.orders, strict=True)
-        return tuple(derivative_unit(unit, order, self.time_unit) for unit, order in units)
-
-    @cached_property
     def approximate(self) -> np.ndarray:
         """Parameters of the model, shape (np,)."""
         return np.array([p.approximate for p in self.parameters.values()], dtype=float)
@@ -129,93 +120,19 @@ class Motion(Checked):
         """Parameters of the plant, shape (np,)."""
         return np.array([p.exact for p in self.parameters.values()], dtype=float)
 
-    def with_exact(self, exact: np.ndarray) -> Self:
-        """Return the same with other exact parameters, shape (np,); both share the Functions derived from the symbols.
+    @cached_property
+    def equations(self) -> MotionEquations:
+        """The CasADi Functions of the motion."""
+        return MotionEquations(self)
 
-        Raises:
-            InvalidProblem: a parameter that is not finite or outside its bounds.
-        """
-        parameters = with_exact_values(self.parameters, exact)
-        other = copy(self)
-        # No other cached property depends on the exact values.
-        other.__dict__.pop("exact", None)
-        object.__setattr__(other, "parameters", parameters)
-        return other
+    if not TYPE_CHECKING:
 
-    @property
-    def sampling(self) -> float:
-        """Time from one state of a map to the next that a controller sees: the control cycle; NaN for differential equations."""
-        return math.nan if self.step is None else self.step * self.steps
+        def __getattr__(self, name: str) -> object:
+            raise missing(type(self), name)
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""
         return (ca.SX.sym("x", self.state.size), ca.SX.sym("u", len(self.inputs)), ca.SX.sym("p", len(self.parameters)))
-
-    @cached_property
-    def response_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
-        x, u, p = self.symbols()
-        if self.next is not None:
-            differences = (self.next_function(x, u, p, ca.SX.zeros(len(self.names))) - x) / self.sampling
-            return ca.Function("fpirhc_response", [x, u, p], [differences], ["x", "u", "p"], ["r"])
-        views = arguments_of(self, x, u, p)
-        if self.algebraic is not None:
-            views = (*views, self.algebraic.view(self.algebraic_function(x, u, p)))
-        responses = called(words(self)[1], self.response, *views)
-        column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
-        return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
-
-    @cached_property
-    def algebraic_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> algebraic states (nz); empty without any."""
-        x, u, p = self.symbols()
-        solution = ca.SX(0, 1)
-        if self.algebraic is not None:
-            solution = self.algebraic.solved(arguments_of(self, x, u, p), ca.vertcat(x, u, p))
-        return ca.Function("fpirhc_algebraic", [x, u, p], [ca.densify(solution)], ["x", "u", "p"], ["z"])
-
-    @cached_property
-    def forced_derivative_function(self) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> dx/dt; `forcing` (n) adds to the responses."""
-        x, u, p = self.symbols()
-        w = ca.SX.sym("w", len(self.names))
-        if self.next is not None:
-            differences = (self.next_function(x, u, p, w) - x) / self.sampling
-            return ca.Function("fpirhc_derivative", [x, u, p, w], [differences], ["x", "u", "p", "w"], ["xdot"])
-        responses = self.response_function(x, u, p) + w
-        rates = []
-        for element in self.state.elements:
-            higher = element + "'"
-            if higher in self.state.elements:
-                rates.append(x[self.state.elements.index(higher)])
-            else:
-                rates.append(responses[self.names.index(element.rstrip("'"))])
-        return ca.Function("fpirhc_derivative", [x, u, p, w], [ca.vertcat(*rates)], ["x", "u", "p", "w"], ["xdot"])
-
-    @cached_property
-    def derivative_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> dx/dt, undisturbed."""
-        x, u, p = self.symbols()
-        rate = self.forced_derivative_function(x, u, p, ca.SX.zeros(len(self.names)))
-        return ca.Function("fpirhc_free_derivative", [x, u, p], [rate], ["x", "u", "p"], ["xdot"])
-
-    @cached_property
-    def next_function(self) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state of a map one control cycle later.
-
-        In each of the cycle's steps x+ = f(x, u, p) + step * forcing: a forcing adds to the divided differences.
-        """
-        assert self.step is not None
-        x, u, p = self.symbols()
-        w = ca.SX.sym("w", len(self.names))
-        if self.next is None:
-            after = x + self.sampling * self.forced_derivative_function(x, u, p, w)
-            return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
-        one = ca.Function("fpirhc_step", [x, u, p], [_one_step(self, self.next, x, u, p)])
-        after = x
-        for _ in range(self.steps):
-            after = one(after, u, p) + self.step * w
-        return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
 
 
 def words(motion: Motion) -> tuple[str, str]:
@@ -233,6 +150,36 @@ def followed(motion: Motion) -> str:
 def followed_units(motion: Motion) -> dict[str, str]:
     """Return name -> unit of what may follow a reference: the outputs, or without any the coordinates."""
     return {name: one.unit for name, one in motion.outputs.items()} or dict(motion.coordinates)
+
+
+def time_signal(motion: Motion) -> Signal:
+    """Return the time's signal."""
+    return scalar("time", motion.time_unit)
+
+
+def forcing_units(motion: Motion) -> tuple[str, ...]:
+    """Return the units of the highest derivative of every coordinate, to which a forcing adds."""
+    units = zip(motion.coordinates.values(), motion.orders, strict=True)
+    return tuple(derivative_unit(unit, order, motion.time_unit) for unit, order in units)
+
+
+def sampling(motion: Motion) -> float:
+    """Return the time from one state of a map to the next that a controller sees, its cycle; NaN for differential equations."""
+    return math.nan if motion.step is None else motion.step * motion.steps
+
+
+def with_exact_parameters(motion: _Motion, exact: np.ndarray) -> _Motion:
+    """Return the same with other exact parameters, shape (np,); both share the Functions derived from the symbols.
+
+    Raises:
+        InvalidProblem: a parameter that is not finite or outside its bounds.
+    """
+    parameters = with_exact_values(motion.parameters, exact)
+    other = copy(motion)
+    # No other cached property depends on the exact values.
+    other.__dict__.pop("exact", None)
+    object.__setattr__(other, "parameters", parameters)
+    return other
 
 
 def outside_names(motion: Motion) -> tuple[str, ...]:
@@ -271,10 +218,83 @@ def by_name(motion: Motion, x: Expression, p: Expression) -> tuple[Named, ...]:
     return (*derivatives, Named(tuple(motion.parameters), p, "parameter"))
 
 
+class MotionEquations:
+    """The CasADi Functions of a motion, each made when it is asked for; other exact parameters do not change them."""
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+
+    @cached_property
+    def response(self) -> ca.Function:
+        """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
+        x, u, p = self.motion.symbols()
+        if self.motion.next is not None:
+            differences = (self.next(x, u, p, ca.SX.zeros(len(self.motion.names))) - x) / sampling(self.motion)
+            return ca.Function("fpirhc_response", [x, u, p], [differences], ["x", "u", "p"], ["r"])
+        views = arguments_of(self.motion, x, u, p)
+        if self.motion.algebraic is not None:
+            views = (*views, self.motion.algebraic.view(self.algebraic(x, u, p)))
+        responses = called(words(self.motion)[1], self.motion.response, *views)
+        column = ca.vertcat(*(ca.SX(responses[c]) for c in self.motion.names))
+        return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
+
+    @cached_property
+    def algebraic(self) -> ca.Function:
+        """Function (state, input, parameters) -> algebraic states (nz); empty without any."""
+        x, u, p = self.motion.symbols()
+        solution = ca.SX(0, 1)
+        if self.motion.algebraic is not None:
+            solution = self.motion.algebraic.solved(arguments_of(self.motion, x, u, p), ca.vertcat(x, u, p))
+        return ca.Function("fpirhc_algebraic", [x, u, p], [ca.densify(solution)], ["x", "u", "p"], ["z"])
+
+    @cached_property
+    def forced_rate(self) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> dx/dt; `forcing` (n) adds to the responses."""
+        x, u, p = self.motion.symbols()
+        w = ca.SX.sym("w", len(self.motion.names))
+        if self.motion.next is not None:
+            differences = (self.next(x, u, p, w) - x) / sampling(self.motion)
+            return ca.Function("fpirhc_derivative", [x, u, p, w], [differences], ["x", "u", "p", "w"], ["xdot"])
+        responses = self.response(x, u, p) + w
+        rates = []
+        for element in self.motion.state.elements:
+            higher = element + "'"
+            if higher in self.motion.state.elements:
+                rates.append(x[self.motion.state.elements.index(higher)])
+            else:
+                rates.append(responses[self.motion.names.index(element.rstrip("'"))])
+        return ca.Function("fpirhc_derivative", [x, u, p, w], [ca.vertcat(*rates)], ["x", "u", "p", "w"], ["xdot"])
+
+    @cached_property
+    def rate(self) -> ca.Function:
+        """Function (state, input, parameters) -> dx/dt, undisturbed."""
+        x, u, p = self.motion.symbols()
+        rate = self.forced_rate(x, u, p, ca.SX.zeros(len(self.motion.names)))
+        return ca.Function("fpirhc_free_derivative", [x, u, p], [rate], ["x", "u", "p"], ["xdot"])
+
+    @cached_property
+    def next(self) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> state of a map one control cycle later.
+
+        In each of the cycle's steps x+ = f(x, u, p) + step * forcing: a forcing adds to the divided differences.
+        """
+        assert self.motion.step is not None
+        x, u, p = self.motion.symbols()
+        w = ca.SX.sym("w", len(self.motion.names))
+        if self.motion.next is None:
+            after = x + sampling(self.motion) * self.forced_rate(x, u, p, w)
+            return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
+        one = ca.Function("fpirhc_step", [x, u, p], [_one_step(self.motion, self.motion.next, x, u, p)])
+        after = x
+        for _ in range(self.motion.steps):
+            after = one(after, u, p) + self.motion.step * w
+        return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
+
+
 def _one_step(motion: Motion, step: Callable[..., Mapping[str, Expression]], x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
     views = arguments_of(motion, x, u, p)
     if motion.algebraic is not None:
-        views = (*views, motion.algebraic.view(motion.algebraic_function(x, u, p)))
+        views = (*views, motion.algebraic.view(motion.equations.algebraic(x, u, p)))
     values = called("next", step, *views)
     symbols = (x, u, p)
     entries = [scalar_expression(f"next of '{name}'", values[name], of=step, symbols=symbols) for name in motion.names]

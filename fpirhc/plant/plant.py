@@ -19,21 +19,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
-import casadi as ca
-
 from fpirhc.errors import Mistakes
 from fpirhc.plant.algebraic import Algebraic
-from fpirhc.plant.inverse import affine, inverse_function
-from fpirhc.plant.lie_derivatives import (
-    believed_disturbance,
-    check_outputs,
-    lie_derivatives,
-    output_expression,
-    output_order,
-    structural_order,
-)
+from fpirhc.plant.equations import Equations
+from fpirhc.plant.lie_derivatives import check_outputs, structural_order
 from fpirhc.plant.maps import Differences, check_map
-from fpirhc.plant.motion import Motion, controlled_places, followed_units
+from fpirhc.plant.motion import Motion, followed_units
 from fpirhc.plant.output import Output
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
@@ -193,55 +184,24 @@ class Plant(Motion):
         return _plant_table(self)
 
     @cached_property
-    def chains(self) -> dict[str, int]:
-        """Length of the chain y, y', ... of every output, or coordinate, in `output`: its relative order, at least one."""
-        return {name: max(order, 1) for name, order in self.output_orders.items()}
+    def equations(self) -> Equations:
+        """The CasADi Functions of the motion, the outputs and the inverse."""
+        return Equations(self)
 
     @cached_property
-    def output_orders(self) -> dict[str, int]:
-        """Relative order of every output, or coordinate: the derivative that the command moves at once; 0 for the output itself.
-
-        An output that no input reaches has the order one.
-        """
-        if not self.outputs:
-            return dict(zip(self.names, self.orders, strict=True))
-        found = {name: output_order(self, name) for name in self.outputs}
-        return {name: 1 if order is None else order for name, order in found.items()}
+    def chains(self) -> dict[str, int]:
+        """Length of the chain y, y', ... of every output, or coordinate, in `output`: its relative order, at least one."""
+        return {name: max(order, 1) for name, order in self.equations.output_orders.items()}
 
     @cached_property
     def response_orders(self) -> dict[str, int]:
         """Those of the controlled ones."""
-        return {name: self.output_orders[name] for name in self.controlled_names}
+        return {name: self.equations.output_orders[name] for name in self.controlled_names}
 
     @cached_property
     def output(self) -> Signal:
         """The signal of what follows a reference: the state without outputs, else y, y', ... below each relative order."""
         return self._derivatives("output", followed_units(self), self.chains) if self.outputs else self.state
-
-    @cached_property
-    def output_function(self) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> y, y', ... of the outputs; without outputs the state."""
-        x, u, p = self.symbols()
-        w = ca.SX.sym("w", len(self.names))
-        chains = {
-            name: lie_derivatives(self, output_expression(self, name, x, u, p), order, (x, u, p, w))
-            for name, order in self.chains.items()
-            if self.outputs
-        }
-        entries = [chains[e.rstrip("'")][e.count("'")] for e in self.output.elements] if self.outputs else [x]
-        return ca.Function(
-            "fpirhc_outputs", [x, u, p, w], [ca.densify(ca.vertcat(*entries))], ["x", "u", "p", "w"], ["y"]
-        )
-
-    @cached_property
-    def known_by_outputs(self) -> tuple[int, ...]:
-        """For every entry of the state its place among y, y', ...; -1 where it is none of these, and so has no reference."""
-        x, u, p = self.symbols()
-        if not self.outputs:
-            return tuple(range(self.state.size))
-        entries = ca.vertsplit(self.output_function(x, u, p, ca.SX.zeros(len(self.names))))
-        equal = [[k for k, e in enumerate(entries) if ca.is_equal(e, x[i], 1)] for i in range(x.numel())]
-        return tuple(places[0] if places else -1 for places in equal)
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
@@ -252,51 +212,11 @@ class Plant(Motion):
         units, time = followed_units(self), self.time_unit
         return tuple([derivative_unit(units[n], order, time) for n, order in self.response_orders.items()])
 
-    @cached_property
-    def controlled_response_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> highest derivative of the controlled coordinates or outputs.
-
-        The response of an output of order 0 is the output.
-        """
-        x, u, p = self.symbols()
-        if self.outputs:
-            calm = ca.SX.zeros(len(self.names))
-            chains = {
-                name: lie_derivatives(self, output_expression(self, name, x, u, p), order, (x, u, p, calm))
-                for name, order in self.response_orders.items()
-            }
-            entries = (chain[-1] + believed_disturbance(self, name, p) for name, chain in chains.items())
-            responses = ca.densify(ca.vertcat(*entries))
-        else:
-            responses = self.response_function(x, u, p)[controlled_places(self)]
-        return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
-
-    @cached_property
-    def affine(self) -> bool:
-        """Whether the controlled response is affine in the inputs, decided from the symbols."""
-        return affine(self, self.controlled_response_function)
-
-    @property
-    def inverse_opaque(self) -> bool:
-        """Whether the inverse response needs a root finder, for which scalar expressions do not suffice."""
-        return self.inverse is None and not self.affine
-
-    @cached_property
-    def inverse_function(self) -> ca.Function:
-        """Function (state, response of the controlled coordinates, parameters) -> input.
-
-        An input that Newton's method does not find is NaN.
-
-        Raises:
-            NotInvertible: the inputs and the controlled coordinates differ in number.
-        """
-        return inverse_function(self, self.controlled_response_function)
-
 
 def plant_facts(plant: Plant) -> tuple[str, ...]:
     """Return what sums up a plant: its coordinates or outputs with their orders, its inputs, the number of its parameters."""
     if plant.outputs:
-        shown = ", ".join(f"{name} of relative order {order}" for name, order in plant.output_orders.items())
+        shown = ", ".join(f"{name} of relative order {order}" for name, order in plant.equations.output_orders.items())
         states = f"{plant.state.size} states"
         return f"outputs {shown}", states, f"inputs {', '.join(plant.inputs)}", f"{len(plant.parameters)} parameters"
     orders = ", ".join(f"{name} of order {order}" for name, order in zip(plant.names, plant.orders, strict=True))
@@ -310,7 +230,7 @@ def _plant_table(plant: Plant) -> str:
         for (name, unit), order in zip(plant.coordinates.items(), plant.orders, strict=True)
     ]
     for name, one in plant.outputs.items():
-        rows.append((name, f"output, relative order {plant.output_orders[name]}", one.unit, "", ""))
+        rows.append((name, f"output, relative order {plant.equations.output_orders[name]}", one.unit, "", ""))
     rows += [(name, "input", unit, "", "") for name, unit in plant.inputs.items()]
     rows += [
         (

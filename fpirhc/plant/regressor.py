@@ -104,7 +104,7 @@ class Regressor:
     def function(self) -> ca.Function:
         """Function (state, response, plant's parameters) -> (Y (n x m), Q0 (n)); covered parameters are not read."""
         x, r, p = self.symbols()
-        inverse, points = self.plant.inverse_function, self._points
+        inverse, points = self.plant.equations.inverse, self._points
         slope = ca.Function("fpirhc_slope", [x, r, p], [ca.jacobian(inverse(x, r, p), p)])
         slopes = [slope(x, r, self._placed(p, point))[:, list(self.covered)] for point in points]
         y = ca.mtimes(ca.horzcat(*slopes), ca.DM(np.linalg.pinv(self._slopes(points))))
@@ -246,7 +246,7 @@ def _check_plant(plant: Plant) -> None:
             f"a regressor needs a fully actuated plant: {len(plant.names)} coordinates but {len(plant.inputs)} input(s), "
             f"controlled: {', '.join(plant.controlled_names)}; use ComputedTorque, whose model needs no regressor"
         )
-    if plant.inverse_opaque:
+    if plant.equations.inverse_opaque:
         raise NotSupported(
             "a regressor needs an inverse response made of symbols, and this one needs a root finder; "
             "give Plant(inverse=...) that solves the response for the inputs"
@@ -259,7 +259,7 @@ def _check_linear(regressor: Regressor) -> None:
     worst, entering, tried = 0.0, np.zeros(len(regressor.names), dtype=bool), 0
     for _ in range(_TRIES):
         x, r, p = _point(plant, random)
-        wanted = plant.inverse_function(x, r, p).full()
+        wanted = plant.equations.inverse(x, r, p).full()
         y, rest = (m.full() for m in regressor.function(x, r, p))
         error = y @ regressor.theta_function(p).full() + rest - wanted
         if np.isfinite(error).all():
@@ -301,7 +301,7 @@ def _nonlinear_pairs(plant: Plant) -> np.ndarray:
     """Pairs of parameters by which the inverse dynamics has a second derivative, shape (np, np), tested at random points."""
     x, _, p = plant.symbols()
     r, count = ca.SX.sym("r", len(plant.names)), len(plant.parameters)
-    force = plant.inverse_function(x, r, p)
+    force = plant.equations.inverse(x, r, p)
     slope = ca.jacobian(force, p)
     second = ca.Function("fpirhc_second", [x, r, p], [force, slope, ca.jacobian(ca.vec(slope), p)])
     random, nonlinear = np.random.default_rng(2), np.zeros((count, count), dtype=bool)

@@ -65,11 +65,11 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
     if plant.step is not None:
         raise NotSupported(
             "output_chain differentiates with respect to time, which a map does not have; write an output, whose differences and "
-            "order are those of `Plant.output_orders` and `Plant.output_function`"
+            "order are those of `Plant.equations.output_orders` and `Plant.equations.output`"
         )
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
-    rate = plant.forced_derivative_function(x, u, p, w)
+    rate = plant.equations.forced_rate(x, u, p, w)
     command = u[plant.input.elements.index(name)]
     first = [x[plant.state.elements.index(coordinate)]] if coordinate in plant.coordinates else []
     derivatives = first or [output_expression(plant, coordinate, x, u, p)]

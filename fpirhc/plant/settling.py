@@ -29,7 +29,7 @@ def settled(
     """
     places = list(free)
     x, u, p = plant.symbols()
-    rate = plant.derivative_function(x, u, p)[places]
+    rate = plant.equations.rate(x, u, p)[places]
     step_of = ca.Function("fpirhc_settling", [x, u, p], [rate, ca.densify(ca.jacobian(rate, x)[:, places])])
     at, largest = np.array(state, dtype=float), 0.0
     for count in range(_STEPS):

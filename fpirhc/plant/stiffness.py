@@ -84,7 +84,7 @@ def poles(plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.n
 @lru_cache(maxsize=8)
 def _slope_of(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
-    return ca.Function("fpirhc_slope", [x, u, p], [ca.densify(ca.jacobian(plant.derivative_function(x, u, p), x))])
+    return ca.Function("fpirhc_slope", [x, u, p], [ca.densify(ca.jacobian(plant.equations.rate(x, u, p), x))])
 
 
 def _text(pole: complex) -> str:

@@ -104,7 +104,7 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
     """The plant without its lags, and the names of its drifts."""
     if model.step is not None or model.algebraic is not None:
         raise NotSupported("the estimated plant of a map, or of a plant with algebraic states, has no equations yet")
-    if model.inverse_opaque:
+    if model.equations.inverse_opaque:
         raise NotSupported("the estimated plant of a model that is not affine in its inputs has no equations yet")
     count = len(model.controlled_names)
     signals = tuple(f"drift_{name}" for name in model.controlled_names) if drifts else ()
@@ -116,11 +116,11 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
         *derivatives, u, p = arguments
         x = ca.vertcat(*(derivatives[e.count("'")][e.rstrip("'")] for e in model.state.elements))
         inputs, parameters = (ca.vertcat(*(one[n] for n in names)) for one, names in ((u, model.inputs), (p, known)))
-        answers = model.controlled_response_function(x, inputs, parameters)
+        answers = model.equations.controlled_response(x, inputs, parameters)
         matrix = ca.blockcat([[p[gain_name(i, j)] for j in range(count)] for i in range(count)])
         wanted = matrix @ answers + (ca.vertcat(*(p[name] for name in signals)) if signals else 0)
         if model.outputs:
-            inputs = model.inverse_function(x, wanted, parameters)
+            inputs = model.equations.inverse(x, wanted, parameters)
         own = Named(tuple(known), parameters, "parameter")
         moved = dict(model.response(*derivatives, Named(tuple(model.inputs), inputs, "input"), own))
         if not model.outputs:

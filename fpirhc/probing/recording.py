@@ -49,7 +49,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
     measured = np.column_stack(
         [columns[n] if n in columns else np.diff(columns[lower[n]], prepend=np.nan) / period for n in responses]
     )[1:]
-    modelled = np.array(plant.controlled_response_function(states[1:].T, commands[:-1].T, plant.approximate)).T
+    modelled = np.array(plant.equations.controlled_response(states[1:].T, commands[:-1].T, plant.approximate)).T
     usable = np.isfinite(measured).all(axis=1) & np.isfinite(modelled).all(axis=1)
     if usable.sum() < len(usable):
         measured, modelled = (np.where(np.isfinite(one), one, 0.0) for one in (measured, modelled))

@@ -67,7 +67,7 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
     axes = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
     times = np.arange(plan.problem.stages + 1) * plan.problem.step
     reference = plan.data[plan.problem.data.slice("reference")]
-    known = plant.known_by_outputs
+    known = plant.equations.known_by_outputs
     for k, (axis, name) in enumerate(zip(axes, names, strict=True)):
         is_state = k < plant.state.size
         if is_state and known[k] >= 0:

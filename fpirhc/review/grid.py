@@ -95,16 +95,16 @@ class ReviewGrid:
         """Inputs that the reference needs, per draw and point, shape (draws, m, nu); NaN where there is no inverse."""
         m, k = len(self.times), len(self.draws)
         states, responses = self.drawn_states.reshape(k * m, -1), np.tile(self.responses, (k, 1))
-        commands = each(self.problem.plant.inverse_function, states, responses, np.repeat(self.draws, m, axis=0))
+        commands = each(self.problem.plant.equations.inverse, states, responses, np.repeat(self.draws, m, axis=0))
         return commands.reshape(k, m, -1)
 
     def needed(self, parameters: np.ndarray) -> np.ndarray:
         """Inputs that the reference needs with these parameters, shape (m, nu)."""
-        return each(self.problem.plant.inverse_function, self.states, self.responses, self._rows(parameters))
+        return each(self.problem.plant.equations.inverse, self.states, self.responses, self._rows(parameters))
 
     def requests(self, believed: np.ndarray) -> np.ndarray:
         """Requests r* of a controller with the believed parameters along the reference, shape (m, n)."""
-        function = self.problem.plant.controlled_response_function
+        function = self.problem.plant.equations.controlled_response
         return each(function, self.states, self.commands[0], self._rows(believed))
 
     def _rows(self, parameters: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import scipy.linalg
 
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.maps import growth_of
+from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
@@ -90,7 +91,7 @@ def _transition(plant: Plant, rates: np.ndarray, time: float) -> np.ndarray:
     """The matrix by which x' = rates x moves in that time; of a map (1 + T rates)^n in n cycles."""
     if plant.step is None:
         return np.asarray(scipy.linalg.expm(time * rates))
-    return np.linalg.matrix_power(np.eye(len(rates)) + plant.sampling * rates, round(time / plant.sampling))
+    return np.linalg.matrix_power(np.eye(len(rates)) + sampling(plant) * rates, round(time / sampling(plant)))
 
 
 def _model(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:

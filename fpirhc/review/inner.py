@@ -87,14 +87,14 @@ def _cycle(problem: Problem, places: list[int]) -> ca.Function:
     """Function (inner states, time, parameters) -> inner states of a map one cycle later."""
     plant = problem.plant
     t, p, inner, state, command = _on_reference(problem, places)
-    after = plant.next_function(state, command, p, np.zeros(len(plant.names)))[places]
+    after = plant.equations.next(state, command, p, np.zeros(len(plant.names)))[places]
     return ca.Function("fpirhc_inner_cycle", [inner, t, p], [ca.densify(after)])
 
 
 def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Function:
     plant = problem.plant
     t, p, inner, state, command = _on_reference(problem, places)
-    rate = plant.forced_derivative_function(state, command, p, np.zeros(len(plant.names)))[places]
+    rate = plant.equations.forced_rate(state, command, p, np.zeros(len(plant.names)))[places]
     # Friction at a reversal is at rest until it is not: a step must not pass over the whole reversal.
     longest = max(problem.period, problem.duration / _SHORTEST)
     options = {
@@ -111,7 +111,7 @@ def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Fu
 def _on_reference(problem: Problem, places: list[int]) -> tuple[Expression, ...]:
     """Symbols of time, parameters and inner states, and the state and the command while the others are on the reference."""
     plant = problem.plant
-    matrix = kind(problem.reference.opaque or plant.inverse_opaque)
+    matrix = kind(problem.reference.opaque or plant.equations.inverse_opaque)
     t, p, inner = matrix.sym("t"), matrix.sym("p", plant.parameter.size), matrix.sym("z", len(places))
     nominal, response = problem.reference.function(plant)(t)
     rows = [inner[0]] * plant.state.size if plant.outputs else [nominal[k] for k in range(plant.state.size)]
@@ -122,7 +122,7 @@ def _on_reference(problem: Problem, places: list[int]) -> tuple[Expression, ...]
     if plant.outputs:
         decay = min(_DECAYS / problem.duration, _FASTEST / problem.period)
         wanted = wanted + output_feedback(plant, state, nominal, p, decay)
-    return t, p, inner, state, plant.inverse_function(state, wanted, p)
+    return t, p, inner, state, plant.equations.inverse(state, wanted, p)
 
 
 def _weighed(problem: Problem) -> set[int]:

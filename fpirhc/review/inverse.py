@@ -49,7 +49,7 @@ def _gains(grid: ReviewGrid) -> np.ndarray:
     """B at every draw and point, shape (draws + 1, m, n, n); the last one is the model's."""
     plant = grid.problem.plant
     x, u, p = plant.symbols()
-    slope = ca.densify(ca.jacobian(plant.controlled_response_function(x, u, p), u))
+    slope = ca.densify(ca.jacobian(plant.equations.controlled_response(x, u, p), u))
     function = ca.Function("fpirhc_input_gain", [x, u, p], [ca.vec(slope)])
     m, n = len(grid.times), len(plant.inputs)
     sets = np.vstack([grid.draws, plant.approximate])

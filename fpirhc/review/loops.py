@@ -159,7 +159,7 @@ class Points:
         if controller.deforms != "response" or controller.response(self.grid.problem) is not None:
             return None
         believed = controller.plant_model(self.grid.problem).parameters(plant)
-        return np.asarray(plant.controlled_response_function(state, command, believed).full()).ravel()
+        return np.asarray(plant.equations.controlled_response(state, command, believed).full()).ravel()
 
 
 def points_of(grid: ReviewGrid, controller: Controller) -> Points:

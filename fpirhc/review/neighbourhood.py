@@ -63,6 +63,6 @@ def _near(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def stacked_jacobian(plant: Plant) -> ca.Function:
     """Return the response Jacobian as one column."""
     function = response_jacobian(plant)
-    matrix = kind(plant.inverse_opaque)
+    matrix = kind(plant.equations.inverse_opaque)
     symbols = [matrix.sym(f"v{k}", function.size1_in(k)) for k in range(function.n_in())]
     return ca.Function("fpirhc_stacked_jacobian", symbols, [ca.vec(function(*symbols))])

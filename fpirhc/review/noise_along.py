@@ -115,7 +115,7 @@ def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.nda
     exact = np.tile(grid.draws[0], (len(places), 1))
     jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
     x, u, p = plant.symbols()
-    slope = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
+    slope = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
     gains = [np.asarray(slope(grid.states[k], grid.commands[0, k], believed).full()) for k in places]
     usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
     if not usable:

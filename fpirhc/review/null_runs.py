@@ -89,7 +89,7 @@ def _followed(problem: Problem, states: np.ndarray) -> np.ndarray:
         return states
     count = len(states)
     held = (np.zeros((count, plant.input.size)), np.tile(plant.exact, (count, 1)), np.zeros((count, len(plant.names))))
-    return each(plant.output_function, states, *held)
+    return each(plant.equations.output, states, *held)
 
 
 def _reference(problem: Problem, count: int) -> np.ndarray:

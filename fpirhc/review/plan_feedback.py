@@ -120,7 +120,7 @@ class PlanFeedback(Tracking):
 
         def step(s: Signals) -> dict[str, Expression]:
             deviation, planned = s.state - s._target, self._planned(plant, s)
-            response = plant.controlled_response_function(deviation, planned, s.parameters)
+            response = plant.equations.controlled_response(deviation, planned, s.parameters)
             besides = ca.mtimes(_gains(plant, s)[nu:, :], ca.vertcat(deviation, planned))
             return {"desired": s.nominal + response + besides}
 
@@ -206,7 +206,7 @@ def plan_gains(
         states = data[ocp.data.slice("reference")] if states_at is None else states_at(nodes).T
         wanted = np.asarray(function.map(horizon.stages)(clock[None, :])[1].full())[controlled]
         repeated = np.repeat(believed[:, None], horizon.stages, axis=1)
-        inputs = np.asarray(plant.inverse_function.map(horizon.stages)(states[:, :-1], wanted, repeated).full())
+        inputs = np.asarray(plant.equations.inverse.map(horizon.stages)(states[:, :-1], wanted, repeated).full())
         if ocp.state.size > nx:
             states = np.vstack([states, np.hstack([inputs[:, :1], inputs])])
         first = _first_gain(stages, states, inputs, data, np.eye(ocp.state.size)[:, ends])

@@ -99,7 +99,7 @@ def output_plan_gains(
         begin = state if start is None else start.state
         data = np.asarray(shifted(table, begin, y, believed).full())
         moves = [np.asarray(shifted(table, begin, y + e, believed).full()) - data for e in np.eye(len(y))]
-        motion = _motion(ocp, plant.inverse_function, begin, responses[controlled], data, believed)
+        motion = _motion(ocp, plant.equations.inverse, begin, responses[controlled], data, believed)
         gain = _gains(sweep, *motion, data, moves, plant.state.size)
         gains.append(replace(gain, start=start))
     return gains
@@ -111,12 +111,12 @@ def _starts(plant: Plant) -> Callable[[np.ndarray, np.ndarray, np.ndarray, np.nd
     found = consistent_state(plant)(x, y, p)
     moved = ca.Function("fpirhc_start", [x, y, p], [found, *(ca.densify(ca.jacobian(found, v)) for v in (x, y))])
     s, u, q = plant.symbols()
-    response = plant.controlled_response_function(s, u, q)
+    response = plant.equations.controlled_response(s, u, q)
     slopes = ca.Function("fpirhc_response_slopes", [s, u, q], [ca.densify(ca.jacobian(response, v)) for v in (s, u)])
 
     def start(state: np.ndarray, outputs: np.ndarray, wanted: np.ndarray, believed: np.ndarray) -> PlanStart:
         at, *ways = (np.asarray(m.full()) for m in moved(state, outputs, believed))
-        planned = plant.inverse_function(at, wanted, believed)
+        planned = plant.equations.inverse(at, wanted, believed)
         return PlanStart(at.ravel(), *ways, *(np.asarray(m.full()) for m in slopes(at, planned, believed)))
 
     return start

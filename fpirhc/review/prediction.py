@@ -143,7 +143,7 @@ def _answer_block(plant: Plant) -> Block:
 
     def step(s: Any) -> dict[str, Expression]:
         at = s.state_answered if before else s.state
-        realised = plant.controlled_response_function(at, s._command_before, s._exact)
+        realised = plant.equations.controlled_response(at, s._command_before, s._exact)
         return {"realised": realised, **({"state_answered_next": s.state} if before else {})}
 
     return Block("answer", Layout(reads), Layout((plant.response_signal("realised"),)), step, Layout(before))
@@ -151,7 +151,7 @@ def _answer_block(plant: Plant) -> Block:
 
 def _judge_block(plant: Plant) -> Block:
     """Block (states, command, desired, both parameter sets) -> response error and what acts on the deviation."""
-    respond, inverse = plant.controlled_response_function, plant.inverse_function
+    respond, inverse = plant.equations.controlled_response, plant.equations.inverse
     reads = (
         plant.state,
         like(plant.state, "_state_after"),
@@ -170,7 +170,7 @@ def _judge_block(plant: Plant) -> Block:
         of_model = 0.5 * (s.desired + respond(s._state_after, own, s.parameters))
         return {"response_error": first - s.desired, "response_force": 0.5 * (first + last) - of_model}
 
-    return Block("judge_response", Layout(reads), Layout(writes), step, opaque=plant.inverse_opaque)
+    return Block("judge_response", Layout(reads), Layout(writes), step, opaque=plant.equations.inverse_opaque)
 
 
 def known_exactly(plant: Plant) -> Plant:

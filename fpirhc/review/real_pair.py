@@ -106,7 +106,7 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     plant = reality.plant
     x, u, p = plant.symbols()
     calm = ca.SX.zeros(len(plant.names))
-    rate = plant.derivative_function(x, u, p)
+    rate = plant.equations.rate(x, u, p)
     response = reality.function(response_names(model))(x, u, p, calm)
     slopes = [ca.densify(ca.jacobian(v, w)) for v in (rate, response) for w in (x, u)]
     values = ca.Function("fpirhc_modes", [x, u, p], slopes)(point.real, point.command, plant.exact)
@@ -117,7 +117,7 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
     gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
     x, u, p = model.symbols()
-    by_input = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(model.controlled_response_function(x, u, p), u)])
+    by_input = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(model.equations.controlled_response(x, u, p), u)])
     assumed = np.asarray(by_input(grid.states[point.place], point.command, believed).full())
     return Extra(modes, np.linalg.eigvals(gain @ np.linalg.inv(assumed)))
 
@@ -130,7 +130,7 @@ def _settling(problem: Problem, free: list[int]) -> Settling:
     calm = ca.SX.zeros(len(plant.names))
     wanted = ca.SX.sym("wanted", len(model.controlled_names))
     response = reality.function(response_names(model))(x, u, p, calm)
-    rate = plant.derivative_function(x, u, p)
+    rate = plant.equations.rate(x, u, p)
     # One by one: an empty selection of a column with one entry is that entry.
     residual = ca.vertcat(*(rate[k] for k in free), response - wanted)
     unknown = ca.vertcat(*(x[k] for k in free), u)

@@ -62,8 +62,8 @@ def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
     states = grid.states_at(times).T
     responses = np.asarray(problem.reference.function(plant).map(_POINTS)(times[None, :])[1].full())
     exact, model = (np.repeat(p[:, None], _POINTS, axis=1) for p in (plant.exact, believed))
-    commands = plant.inverse_function.map(_POINTS)(states, responses[controlled_places(plant)], exact)
-    requests = np.asarray(plant.controlled_response_function.map(_POINTS)(states, commands, model).full())
+    commands = plant.equations.inverse.map(_POINTS)(states, responses[controlled_places(plant)], exact)
+    requests = np.asarray(plant.equations.controlled_response.map(_POINTS)(states, commands, model).full())
     speeds = np.linalg.norm(np.diff(requests, axis=1), axis=0) / (times[1] - times[0])
     return float(speeds[np.isfinite(speeds)].max(initial=0.0))
 
@@ -103,7 +103,7 @@ def effect(grid: ReviewGrid, name: str) -> float:
         return 0.0 if name in plant.outputs else 1.0
     unit = np.array([1.0 if i == name else 0.0 for i in plant.inputs])
     command = np.nan_to_num(grid.commands[0, 0])
-    respond = plant.controlled_response_function
+    respond = plant.equations.controlled_response
     change = respond(grid.states[0], command + unit, plant.exact) - respond(grid.states[0], command, plant.exact)
     return float(np.linalg.norm(change.full()))
 

@@ -29,8 +29,8 @@ def state_slopes(plant: Plant, state: np.ndarray, command: np.ndarray, parameter
 @lru_cache(maxsize=8)  # several questions of a review need it
 def _function(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
-    rates, responses = plant.derivative_function(x, u, p), plant.controlled_response_function(x, u, p)
-    shown = plant.output_function(x, u, p, ca.SX.zeros(len(plant.names)))
+    rates, responses = plant.equations.rate(x, u, p), plant.equations.controlled_response(x, u, p)
+    shown = plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
     below = [k for k, e in enumerate(plant.output.elements) if e.rstrip("'") in plant.controlled_names]
     chain = ca.vertcat(ca.SX(0, 1), *(shown[k] for k in below))
     pairs = ((rates, x), (rates, u), (responses, x), (responses, u), (chain, x))

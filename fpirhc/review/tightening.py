@@ -158,7 +158,7 @@ def _deviations(nominal: NominalRun, exact: np.ndarray) -> np.ndarray:
     errors = response_errors(nominal, exact=exact)
     believed, rows = (np.tile(p, (nominal.cycles, 1)) for p in (nominal.believed, exact))
     still = np.zeros((nominal.cycles, len(plant.names)))
-    own = each(plant.inverse_function, nominal.states[:-1], nominal.desired, believed)
+    own = each(plant.equations.inverse, nominal.states[:-1], nominal.desired, believed)
     states_next = each(advance, nominal.states[:-1], errors.command, rows, still)
     deviations = states_next - each(advance, nominal.states[:-1], own, believed, still)
     if not np.isfinite(deviations).all():

@@ -114,16 +114,16 @@ def quantities(plant: Plant) -> tuple[str, ...]:
 
 def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:
     """Return everything that a sensor may show as expressions of the state and the input that acted, by name."""
-    responses = ca.vertsplit(plant.controlled_response_function(x, u, p))
+    responses = ca.vertsplit(plant.equations.controlled_response(x, u, p))
     named = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
-    outputs = ca.vertsplit(plant.output_function(x, u, p, np.zeros(len(plant.names))))
+    outputs = ca.vertsplit(plant.equations.output(x, u, p, np.zeros(len(plant.names))))
     named = {**dict(zip(plant.output.elements, outputs, strict=True)), **named}
     return {**named, **dict(zip(response_names(plant), responses, strict=True))}
 
 
 def names_of_responses(plant: Plant, signal: Signal) -> tuple[str, ...]:
     """Names of the entries of a signal of responses: highest derivatives of coordinates, and others as they are."""
-    orders = plant.output_orders
+    orders = plant.equations.output_orders
     return tuple(e + "'" * orders.get(e, 0) for e in signal.elements)
 
 

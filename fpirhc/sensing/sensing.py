@@ -135,7 +135,7 @@ class Sensing(Checked):
         shown = self.estimator.known(plant, measures)
         if not plant.outputs:
             return shown
-        pairs = zip(elements, plant.known_by_outputs, strict=True)
+        pairs = zip(elements, plant.equations.known_by_outputs, strict=True)
         by_outputs = {e for e, place in pairs if place >= 0 and plant.output.elements[place] in shown}
         return tuple(e for e in elements if e in by_outputs or e in measures)
 

@@ -20,6 +20,7 @@ import casadi as ca
 
 from fpirhc.controllers.gap import AGAIN
 from fpirhc.errors import InvalidValue
+from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -68,12 +69,12 @@ def clock_block(problem: Problem) -> Block:
             ),
         }
 
-    return Block("clock", Layout((problem.plant.time,)), Layout((Signal(CLOCK),)), step, Layout((MEMORY,)))
+    return Block("clock", Layout((time_signal(problem.plant),)), Layout((Signal(CLOCK),)), step, Layout((MEMORY,)))
 
 
 def clock_status_block(problem: Problem, before: str, after: str) -> Block:
     """Return the block (time, believed time, status) -> status: BAD_TIME for a cycle skipped for a finite time."""
-    reads = Layout((problem.plant.time, Signal(CLOCK), scalar(before)))
+    reads = Layout((time_signal(problem.plant), Signal(CLOCK), scalar(before)))
 
     def step(s: Signals) -> dict[str, Expression]:
         refused = ca.logic_and(ca.fabs(s.time) <= FINITE, ca.logic_not(ca.fabs(getattr(s, CLOCK)) <= FINITE))

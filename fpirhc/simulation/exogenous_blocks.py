@@ -6,7 +6,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import like
 from fpirhc.controllers.contract import Controller
-from fpirhc.plant.motion import outside_names
+from fpirhc.plant.motion import outside_names, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -48,7 +48,7 @@ def _block(name: str, problem: Problem, plant: Plant, values: ca.Function, shown
         now = values(s.time + half, getattr(s, source))
         return {shown: now[places], **({target: now} if target else {})}
 
-    reads = Layout((plant.time, like(plant.parameter, source)))
+    reads = Layout((time_signal(plant), like(plant.parameter, source)))
     return Block(name, reads, Layout(writes), step, opaque=not values.is_a("SXFunction"))
 
 

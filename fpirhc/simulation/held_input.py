@@ -32,7 +32,7 @@ class HeldInput(Controller):
         responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
 
         def step(s: Signals) -> dict[str, Expression]:
-            response = plant.controlled_response_function(s.state, getattr(s, HELD_INPUT), s.parameters)
+            response = plant.equations.controlled_response(s.state, getattr(s, HELD_INPUT), s.parameters)
             return {"command_unclipped": getattr(s, HELD_INPUT), **{r.name: response for r in responses}}
 
         writes = Layout((*responses, like(plant.input, "command_unclipped")))

@@ -20,6 +20,7 @@ from fpirhc.controllers.online_reference import given_signals
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.response_jumps import response_jumps
 from fpirhc.controllers.sensing_chain import compose_seeing, seeing_blocks
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.exogenous_blocks import outside_blocks, real_name
 from fpirhc.simulation.path import (
@@ -65,7 +66,7 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     seeing = sensing_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
-    clock, actuating = _clock_block(problem.plant.time, problem.period), acting_blocks(problem, disturbed)
+    clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(problem, disturbed)
     jumps = response_jumps(task, acting.reads) if problem.foreign is not None else None
     gated = [acting.block()] if jumps is None else jumps.around(acting.block())
     around = [clock, *outside_blocks(problem, ready), *seeing, *gated, *judging, *actuating]

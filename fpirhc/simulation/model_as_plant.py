@@ -9,6 +9,7 @@ from dataclasses import replace
 from fpirhc.deformation.base import Deformation, Mirror
 from fpirhc.errors import NotSupported
 from fpirhc.plant.behind_actuators import behind_actuators
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.task.dead_time import DeadTime
@@ -67,7 +68,7 @@ class ModelAsPlant:
         self._runs: dict[Simulator, Run] = {}
         self._behind: dict[Mirror | None, ModelAsPlant] = {}
         plant, longest = self._own.plant, self._own.measure_from + CYCLES * self._own.period
-        own = replace(self._own, plant=plant.with_exact(plant.approximate))
+        own = replace(self._own, plant=with_exact_parameters(plant, plant.approximate))
         self.problem = replace(own, duration=min(own.duration, longest))
 
     def behind(self, deformation: Deformation) -> ModelAsPlant:

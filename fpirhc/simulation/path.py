@@ -18,6 +18,7 @@ from fpirhc.controllers.base import Response, error_signal, like, rename
 from fpirhc.controllers.online_reference import own_signals
 from fpirhc.controllers.sensing_chain import first_estimates, first_shown
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.motion import forcing_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import backward_difference, combine, response_names
 from fpirhc.simulation.exogenous_blocks import real_name
@@ -172,7 +173,7 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     def step(s: Signals) -> dict[str, Expression]:
         return {"true_error": function(s.time)[0][places] - getattr(s, motion.name)[own]}
 
-    return Block("truth", Layout((plant.time, motion)), writes, step, opaque=problem.reference.opaque)
+    return Block("truth", Layout((time_signal(plant), motion)), writes, step, opaque=problem.reference.opaque)
 
 
 def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response) -> Block:
@@ -225,7 +226,7 @@ def _real_signals(problem: Problem) -> tuple[Signal, ...]:
 
 def _forcing(plant: Plant, name: str) -> Signal:
     """Signal of what disturbances add to the response of every coordinate."""
-    return Signal(name, plant.names, plant.response_units)
+    return Signal(name, plant.names, forcing_units(plant))
 
 
 def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:

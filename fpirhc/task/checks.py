@@ -105,7 +105,7 @@ def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes
 
 def _instant(plant: Plant) -> tuple[str, ...]:
     """Controlled outputs that the command moves at once; their response is the output itself."""
-    return tuple(name for name in plant.controlled or plant.chains if not plant.output_orders[name])
+    return tuple(name for name in plant.controlled or plant.chains if not plant.equations.output_orders[name])
 
 
 def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:

@@ -16,6 +16,7 @@ from typing import cast
 import casadi as ca
 import numpy as np
 
+from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import exp, power
@@ -159,7 +160,7 @@ def _after_motion(phi: Sequence[Sequence[_Entry]], z: Expression, held: Expressi
 def chain_of(plant: Plant, rate: _Entry, z: Expression, held: Expression, order: int) -> Expression:
     """Return (y, y', ..., y^(m)) of a filter in the state z, for w = `held`; of a map the divided differences."""
     if plant.step is not None:
-        return ca.vertcat(*differences(rate, plant.sampling, z, held, order))
+        return ca.vertcat(*differences(rate, sampling(plant), z, held, order))
     return ca.vertcat(z, highest(rate, z, held, order))
 
 

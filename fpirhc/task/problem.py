@@ -205,7 +205,7 @@ class Problem(Checked):
     def disturbed_outputs(self) -> Mapping[str, int]:
         """Relative orders of the disturbed outputs by name; a name of a coordinate of the moving plant is none."""
         plant, moved = self.plant, self.real_plant.coordinates
-        orders = plant.output_orders
+        orders = plant.equations.output_orders
         return {n: orders[n] for n in self.disturbances if n in orders and n not in moved}
 
     @property
@@ -406,7 +406,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
         return
     x, u, p = plant.symbols()
-    response = plant.controlled_response_function(x, u, p)
+    response = plant.equations.controlled_response(x, u, p)
     gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
     for which, values in (("approximate", plant.approximate), *exact):
@@ -414,7 +414,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
         if not np.all(np.isfinite(free)):
             name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
             mistakes.add(f"the response of '{name}' ({which} parameters) is not finite at the start ({state})")
-        elif plant.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
+        elif plant.equations.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
             weakest = plant.input.elements[int(np.argmin(np.linalg.norm(gain, axis=0)))]
             mistakes.add(
                 f"the response ({which} parameters) is not invertible at the start ({state}): input '{weakest}' has no "
@@ -434,7 +434,7 @@ def _remedy(problem: Problem, gain_of: ca.Function, values: np.ndarray, weakest:
         if np.isfinite(gain).all() and np.linalg.matrix_rank(gain) == len(gain):
             return "; start elsewhere, or give Plant(inverse=...)"
     x, u, p = plant.symbols()
-    rates = ca.jacobian_sparsity(plant.derivative_function(x, u, p), u)
+    rates = ca.jacobian_sparsity(plant.equations.rate(x, u, p), u)
     column = np.asarray(ca.DM(rates, 1).full())[:, plant.input.elements.index(weakest)]
     moved = ", ".join(f"the rate of {e}" for e, moves in zip(plant.state.elements, column, strict=True) if moves)
     return f", nor near it. It moves {moved or 'nothing'} first: control what follows from that, or leave the input out"

@@ -24,7 +24,7 @@ from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.lie_derivatives import output_order, structural_order
-from fpirhc.plant.motion import followed_units
+from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
@@ -66,9 +66,9 @@ class Reality(Checked):
         """Return the reality with other exact parameters, shape (np,).
 
         Raises:
-            InvalidProblem: see `Plant.with_exact`.
+            InvalidProblem: see `with_exact_parameters`.
         """
-        return replace(self, plant=self.plant.with_exact(exact))
+        return replace(self, plant=with_exact_parameters(self.plant, exact))
 
     def check(self, model: Plant, needed: Collection[str] | None = None) -> None:
         """Raise if the reality cannot stand for what the model describes.
@@ -195,7 +195,7 @@ class Reality(Checked):
         why = unsolved(plant, start, command, plant.exact)
         if why:
             raise InvalidProblem(f"reality: algebraic states at the start: {why}")
-        rates = np.asarray(plant.derivative_function(start, command, plant.exact).full()).ravel()
+        rates = np.asarray(plant.equations.rate(start, command, plant.exact).full()).ravel()
         if not np.isfinite(rates).all():
             wrong = plant.state.elements[int(np.argmin(np.isfinite(rates)))]
             raise InvalidProblem(f"reality: the rate of its state '{wrong}' is not finite at the start")
@@ -312,7 +312,7 @@ def _check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes)
         return
     if units[name] != unit:
         mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
-    order = model.output_orders[name]
+    order = model.equations.output_orders[name]
     at_once = input_reaches_at(plant, name, order - 1) if order else None
     if at_once is not None:
         mistakes.add(

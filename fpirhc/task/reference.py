@@ -22,7 +22,7 @@ import numpy as np
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, named_results, scalar_expression
-from fpirhc.plant.motion import followed, followed_units
+from fpirhc.plant.motion import followed, followed_units, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import kind
@@ -56,7 +56,7 @@ class Reference(Checked, ABC):
         t = matrix.sym("t")
         motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
         _check(plant, motion, what)
-        by = _differentiate if plant.step is None else _differences(plant.sampling)
+        by = _differentiate if plant.step is None else _differences(sampling(plant))
         derivatives = {c: by(motion[c], t, r) for c, r in plant.chains.items()}
         state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.output.elements]
         response = [derivatives[c][r] for c, r in plant.chains.items()]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.plant.motion import followed_units
+from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, kind
@@ -72,7 +72,7 @@ class Shifted(Reference):
         def step(s: Signals) -> dict[str, Expression]:
             return {_OWN: ca.vertcat(*(getattr(s, signal.name) for signal in signals), s.time)}
 
-        return Block("target", Layout((plant.time, *signals)), Layout(self.own(plant, stages)), step)
+        return Block("target", Layout((time_signal(plant), *signals)), Layout(self.own(plant, stages)), step)
 
     def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
         """Function (t, own signal) -> (state, response), now or after some time with the shift held."""

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.plant.motion import followed_units
+from fpirhc.plant.motion import followed_units, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
@@ -179,13 +179,14 @@ def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
     """
     if plant.step is None or not gains:
         return
-    poles = 1 + plant.sampling * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
+    cycle = sampling(plant)
+    poles = 1 + cycle * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
     if np.abs(poles).max() >= 1:
         worst = complex(poles[int(np.abs(poles).argmax())])
         shown = f"{worst.real:.3g}" if abs(worst.imag) < 1e-6 * abs(worst) else f"{worst:.3g}"
         raise InvalidValue(
-            f"{law!r}: in the map's cycles of {plant.sampling:g} {plant.time_unit} a mode of the error has the pole z = {shown} "
-            f"and does not decay; use a rate below {2 / plant.sampling:g} 1/{plant.time_unit} ({1 / plant.sampling:g} is deadbeat)"
+            f"{law!r}: in the map's cycles of {cycle:g} {plant.time_unit} a mode of the error has the pole z = {shown} "
+            f"and does not decay; use a rate below {2 / cycle:g} 1/{plant.time_unit} ({1 / cycle:g} is deadbeat)"
         )
 
 

@@ -77,7 +77,7 @@ def test_a_frictionless_body_moves_as_the_textbook_says():
 
 def accelerations(state: np.ndarray, command: np.ndarray) -> np.ndarray:
     """The model's own response."""
-    return np.asarray(MODEL.response_function(state, command, MODEL.exact)).ravel()
+    return np.asarray(MODEL.equations.response(state, command, MODEL.exact)).ravel()
 
 
 def test_adaptation_pays_behind_dry_friction_and_a_tool_that_nobody_weighed():

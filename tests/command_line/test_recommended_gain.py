@@ -14,6 +14,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.cli.main import main
+from fpirhc.plant.motion import with_exact_parameters
 
 STEERING = (Path(abroad.__file__).parent / "vehicle_steering.py").read_text()
 TASK = abroad.load("vehicle_steering")
@@ -113,7 +114,7 @@ def test_the_gain_of_a_plain_form(folder, capsys, effective, verdict, recommende
 
 def test_the_limit_of_the_poles_is_where_a_loop_of_the_box_loses_them():
     """The plant is the model, an end of the box: below its limit the wheel comes to rest after the lane change, above it never."""
-    exact = TASK.problem.plant.with_exact(TASK.problem.plant.approximate)
+    exact = with_exact_parameters(TASK.problem.plant, TASK.problem.plant.approximate)
     problem = replace(TASK.problem, plant=exact, duration=16.0)
     sizes = []
     for effective in (1.6, 1.75):

@@ -234,7 +234,9 @@ class Telling(Controller):
         """The plant's, under the same name, where it reads responses of its own."""
         plant = problem.plant
         return (
-            Response(plant.response_signal("realised"), plant.controlled_response_function) if self.of_its_own else None
+            Response(plant.response_signal("realised"), plant.equations.controlled_response)
+            if self.of_its_own
+            else None
         )
 
     def notes(self, problem):

@@ -38,7 +38,7 @@ def modelled(problem: fp.Problem, run: fp.Run) -> np.ndarray:
     """The model's response at every state of a run to the command of the cycle before."""
     plant = problem.plant
     x, u = ca.SX.sym("x", plant.state.size), ca.SX.sym("u", plant.input.size)
-    response = ca.Function("f", [x, u], [plant.controlled_response_function(x, u, ca.DM(plant.approximate))])
+    response = ca.Function("f", [x, u], [plant.equations.controlled_response(x, u, ca.DM(plant.approximate))])
     before = np.vstack([np.zeros(plant.input.size), run["command"][:-1]])
     return np.asarray(response.map(len(before))(run["state"].T, before.T).full()).T
 
@@ -47,7 +47,7 @@ def commands(problem: fp.Problem, run: fp.Run, requests: np.ndarray) -> np.ndarr
     """The commands that the model needs for these requests at the states of a run."""
     plant = problem.plant
     x, r = ca.MX.sym("x", plant.state.size), ca.MX.sym("r", len(plant.controlled_names))
-    inverse = ca.Function("u", [x, r], [plant.inverse_function(x, r, plant.approximate)])
+    inverse = ca.Function("u", [x, r], [plant.equations.inverse(x, r, plant.approximate)])
     return np.asarray(inverse.map(len(requests))(run["state"].T, requests.T).full()).T
 
 

@@ -17,7 +17,7 @@ LIGHT = np.array([2.0, 0.6, 0.1, 1.5])  # mg/l
 
 
 def seen(plant: fp.Plant, x: Any, p: Any) -> np.ndarray:
-    return np.asarray(plant.output_function(x, 0, p, np.zeros(len(plant.names))).full()).ravel()
+    return np.asarray(plant.equations.output(x, 0, p, np.zeros(len(plant.names))).full()).ravel()
 
 
 def found(plant: fp.Plant, x: Any, y: Any, p: Any = ()) -> np.ndarray:
@@ -130,7 +130,7 @@ def test_outputs_of_order_zero_are_left_out() -> None:
             "now": fp.Output("1", lambda x, u, p: u.v + x.x),
         },
     )
-    assert both.output_orders["now"] == 0
+    assert both.equations.output_orders["now"] == 0
     y = np.zeros(both.output.size)
     y[both.output.elements.index("y")] = 1.0
     start = found(both, [0.4, 0.8], y)

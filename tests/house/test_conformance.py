@@ -33,6 +33,7 @@ from fpirhc.controllers.contract import Planner
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.members import FAMILIES, Example, examples, member_classes
 from fpirhc.optimisers.base import Optimiser
+from fpirhc.plant.equations import Equations
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Layout, Signal, scalar
@@ -448,15 +449,24 @@ def oscillator(response=None, inverse=None, cls=fp.Plant) -> fp.Plant:
     )
 
 
+class HastyEquations(Equations):
+    """Those of a motion that is twice as fast as its velocity says."""
+
+    @property
+    def forced_rate(self):
+        """Wrong."""
+        inner = super().forced_rate
+        symbols = inner.sx_in()
+        return ca.Function("hasty", symbols, [inner(*symbols) * ca.DM([2, 1])])
+
+
 class Hasty(fp.Plant):
     """A plant that moves twice as fast as its velocity says."""
 
     @property
-    def forced_derivative_function(self):
+    def equations(self):
         """Wrong."""
-        inner = super().forced_derivative_function
-        symbols = inner.sx_in()
-        return ca.Function("hasty", symbols, [inner(*symbols) * ca.DM([2, 1])])
+        return HastyEquations(self)
 
 
 def kinked(q, v, u, p):

@@ -159,7 +159,7 @@ def pairs(count: int, plant: fp.Plant, seed: int = 3):
     random = np.random.default_rng(seed)
     for _ in range(count):
         x, u = random.normal(size=2), random.normal(size=1)
-        f = plant.response_function(x, u, plant.exact).full().ravel()
+        f = plant.equations.response(x, u, plant.exact).full().ravel()
         yield x, u, f + 0.1 * random.normal(size=1)
 
 
@@ -167,7 +167,7 @@ def batch(plant, data, weights, prior):
     """The regularised weighted least squares of corrections of (k, b), by the normal equations."""
     scale = np.array([known.deviation for known in SPRING.values()])
     rows = np.array([[-x[0], u[0]] for x, u, _ in data]) * scale / NOISE["y"]
-    right = np.array([f[0] - plant.response_function(x, u, plant.approximate).full()[0, 0] for x, u, f in data])
+    right = np.array([f[0] - plant.equations.response(x, u, plant.approximate).full()[0, 0] for x, u, f in data])
     right = right / NOISE["y"]
     z = np.linalg.solve(prior * np.eye(2) + rows.T @ (weights[:, None] * rows), rows.T @ (weights * right))
     return scale * z, rows, right
@@ -279,9 +279,9 @@ def test_a_disturbed_plant():
         result = fp.disturbed(plant, ("y",))
         assert result.parameters["w_y"] == fp.Parameter(0.0, 0.0, "m/s^2")
         x, u, p = np.array([0.3, 0.1]), np.array([0.7]), np.array([2.0, 1.5, 0.4])
-        r = result.response_function(x, u, p)
+        r = result.equations.response(x, u, p)
         assert float(r) == pytest.approx(1.5 * 0.7 - 2.0 * 0.3 + 0.4)
-        assert float(result.inverse_function(x, r, p)) == pytest.approx(0.7)
+        assert float(result.equations.inverse(x, r, p)) == pytest.approx(0.7)
     with pytest.raises(InvalidProblem, match="parameter 'w_y' already"):
         fp.disturbed(result, ("y",))
     with pytest.raises(InvalidProblem, match=r"'z' is unknown.*Valid: y"):

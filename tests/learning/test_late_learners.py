@@ -237,7 +237,7 @@ def test_the_response_alone_is_a_low_pass_of_the_model_error():
     plant, states, commands = problem.plant, result["state"], result["command"]
     error = np.array(
         [
-            float(result["realised"][k, 0] - plant.response_function(states[k], commands[k - 1], plant.approximate))
+            float(result["realised"][k, 0] - plant.equations.response(states[k], commands[k - 1], plant.approximate))
             for k in range(1, result.cycles)
         ]
     )

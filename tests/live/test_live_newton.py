@@ -85,7 +85,7 @@ def test_a_policy_that_stops_keeps_its_settings_live():
 def test_an_input_that_newton_does_not_find_is_still_nan():
     """u^2 = r has no solution for r = -1, and two for r = 4 of which one is found."""
     square = replace(cubic(), response=lambda q, v, u, p: {"y": (u.u + 3) ** 2 - 9}, inverse=None)
-    found, lost = (float(square.inverse_function([0, 0], [r], [1.0])) for r in (7.0, -20.0))
+    found, lost = (float(square.equations.inverse([0, 0], [r], [1.0])) for r in (7.0, -20.0))
     assert found == pytest.approx(1.0, abs=1e-9)
     assert np.isnan(lost)
 

@@ -51,7 +51,7 @@ def open_loop() -> np.ndarray:
     for name, column in demands.items():
         values[:, plant.parameter.elements.index(name)] = column
     x, u, p = plant.symbols()
-    step = ca.Function("step", [x, u, p], [plant.next_function(x, u, p, ca.SX.zeros(len(plant.names)))])
+    step = ca.Function("step", [x, u, p], [plant.equations.next(x, u, p, ca.SX.zeros(len(plant.names)))])
     function = step.mapaccum(900)
     return np.asarray(function(problem.start_state, np.ones((1, 900)), values.T).full()).T
 
@@ -83,7 +83,7 @@ def test_cars_are_conserved() -> None:
 def test_the_density_at_the_merge_has_order_one() -> None:
     plant = task("freeway_metering").problem.plant
     assert tuple(plant.chains.values()) == (1,)
-    assert 0 not in plant.output_orders.values()
+    assert 0 not in plant.equations.output_orders.values()
 
 
 @pytest.mark.parametrize(("controller", "expected"), [("CTC", 0.79), ("CTC+FPI", 0.158)])
@@ -159,7 +159,7 @@ def test_the_static_map_is_that_of_settled_traffic(which: str) -> None:
     values = getattr(plant, which)
     p = dict(zip(plant.parameters, values, strict=True))
     for rate in np.linspace(0.0, 0.6, 13):
-        mapped = float(plant.controlled_response_function([50.0], rate, values))
+        mapped = float(plant.equations.controlled_response([50.0], rate, values))
         assert mapped == pytest.approx(settled_emission(2500.0, rate, p), rel=1e-9)
 
 
@@ -167,8 +167,8 @@ def test_every_target_has_a_rate() -> None:
     """Beyond the largest rate the map goes on as a line, and its inverse with it."""
     plant = task("freeway").problem.plant
     for target in (1900.0, 2000.0, 2140.0):
-        rate = float(plant.inverse_function([50.0], target, plant.approximate))
-        assert float(plant.controlled_response_function([50.0], rate, plant.approximate)) == pytest.approx(
+        rate = float(plant.equations.inverse([50.0], target, plant.approximate))
+        assert float(plant.equations.controlled_response([50.0], rate, plant.approximate)) == pytest.approx(
             target, rel=1e-7
         )
     assert rate > 0.6

@@ -93,7 +93,7 @@ def test_with_the_same_commands_the_states_are_the_same_at_the_samples() -> None
     period = 0.1
     problem = task(differential(period), period, integrator=fp.Cvodes(1e-12))
     run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=1.0)))
-    step = discretised(period).next_function
+    step = discretised(period).equations.next
     pairs = zip(run["state"], run["command"], strict=True)
     after = np.array([step(x, u, 1.0, np.zeros(2)).full().ravel() for x, u in pairs])
     assert np.abs(after[:-1] - run["state"][1:]).max() < 1e-9
@@ -161,7 +161,7 @@ def planned_by_hand(problem: fp.Problem, growth: float) -> float:
     """First input of the first plan: the sums of the cost written out, and minimised by scipy."""
     plant, steps = problem.plant, problem.plant.steps
     h = problem.horizon.step if problem.horizon else 0.0
-    motion, inverse = problem.reference.function(plant), plant.inverse_function
+    motion, inverse = problem.reference.function(plant), plant.equations.inverse
     times = h * np.arange(7)
     wanted = np.array([float(motion(t)[0]) for t in times])
     needed = np.array([float(inverse(motion(t)[0], motion(t)[1], growth)) for t in times])

@@ -74,13 +74,13 @@ def rms(problem: fp.Problem, controller: Controller) -> float:
 
 def test_the_order_is_found_from_the_symbols() -> None:
     plant = element()
-    assert plant.output_orders == {"power": 0}
+    assert plant.equations.output_orders == {"power": 0}
     assert "power of relative order 0" in repr(plant)
     named_only = fp.Plant.of_states(
         states={"a": "m"}, inputs={"u": "1"}, parameters={}, rates=lambda x, u, p: {"a": u.u},
         outputs={"y": fp.Output("m", lambda x, u, p: 2 * x.a + 0 * u.u)},
     )  # fmt: skip
-    assert named_only.output_orders == {"y": 1}
+    assert named_only.equations.output_orders == {"y": 1}
     assert set(named_only.chains.values()) == {1}
 
 

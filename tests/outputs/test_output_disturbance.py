@@ -49,10 +49,10 @@ def test_a_disturbed_output_is_the_output_with_the_disturbance_in_it(wave: Any, 
     # At the same states both measure the same y, y' and, under the same command, the same y''.
     x = np.column_stack([run["plant_state"], run.time])
     u, p, calm = run["command"], [4.0], np.zeros(3)
-    of = clock.plant.output_function.map(run.cycles)
+    of = clock.plant.equations.output.map(run.cycles)
     y = np.asarray(of(x.T, u.T, np.tile(p, (run.cycles, 1)).T, np.tile(calm, (run.cycles, 1)).T).full()).T
     assert np.allclose(run["output"], y, atol=1e-9)
-    second = clock.plant.controlled_response_function.map(run.cycles - 1)
+    second = clock.plant.equations.controlled_response.map(run.cycles - 1)
     r = np.asarray(second(x[1:].T, u[:-1].T, np.full((1, run.cycles - 1), 4.0)).full()).ravel()
     assert np.allclose(run["realised.depth"][1:], r, atol=1e-9)
     # The controller that does not know the wave follows nearly as well once it adapts.

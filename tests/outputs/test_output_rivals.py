@@ -12,6 +12,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem, NotSupported
+from fpirhc.plant.motion import with_exact_parameters
 
 RIVALS: dict[str, Controller] = {
     "PID": fp.PID({"q1": 80.0, "q2": 60.0}, {"q1": 30.0, "q2": 20.0}, {"q1": 20.0, "q2": 15.0}),
@@ -29,7 +30,7 @@ def test_outputs_that_are_coordinates_change_no_signal(name: str) -> None:
     """`ResolvedAccelerationRate` moves states by its model where outputs are measured, so its model is exact here."""
     short = replace(SHORT, duration=0.1, measure_from=0.0)
     if name == "rate":
-        plant = short.plant.with_exact(short.plant.approximate)
+        plant = with_exact_parameters(short.plant, short.plant.approximate)
         short = replace(short, plant=plant)
     plain, run = (simulated(p, RIVALS[name]) for p in (short, on_outputs(short)))
     for signal in ("state", "command", "desired"):
@@ -63,13 +64,13 @@ def test_an_increment_by_hand_on_the_hand_of_an_arm() -> None:
     problem = replace(circle(arm()), duration=0.1, measure_from=0.0)
     run = simulated(problem, fp.ResolvedAccelerationRate(rate=6.0))
     plant, k, p, size = problem.plant, 20, [1.4], 1e-6
-    respond, x, u = plant.controlled_response_function, run["state"][k], run["command"][k - 1]
-    moved = plant.derivative_function(x, u, p).full().ravel()
+    respond, x, u = plant.equations.controlled_response, run["state"][k], run["command"][k - 1]
+    moved = plant.equations.rate(x, u, p).full().ravel()
     ends = [respond(x + s * size * moved, u, p).full().ravel() for s in (1, -1)]
     drift = (ends[0] - ends[1]) / (2 * size)
     change = run["desired"][k] - run["realised"][k]
     request = respond(x, u, p).full().ravel() + change - problem.period * drift
-    assert np.allclose(run["command"][k], plant.inverse_function(x, request, p).full().ravel(), atol=1e-6)
+    assert np.allclose(run["command"][k], plant.equations.inverse(x, request, p).full().ravel(), atol=1e-6)
 
 
 @pytest.mark.parametrize("deformation", [fp.Identity(), fp.Affine(-1.0)])

@@ -127,12 +127,12 @@ def test_derivatives_of_outputs_are_those_of_the_motion() -> None:
     plant, h = arm(), 1e-3
     x, u, p, calm = np.array([0.4, 1.1, 0.7, -0.5]), np.array([0.3, -0.2]), plant.exact, np.zeros(2)
     back, ahead = (fp.RungeKutta4(substeps=4).step(plant, dt)(x, u, p, calm) for dt in (-h, h))
-    before, now, after = (plant.output_function(s, u, p, calm).full().ravel() for s in (back, x, ahead))
+    before, now, after = (plant.equations.output(s, u, p, calm).full().ravel() for s in (back, x, ahead))
     assert plant.output.elements == ("x", "y", "x'", "y'")
     assert np.allclose(now[2:], (after - before)[:2] / (2 * h), atol=1e-6)
-    response = plant.controlled_response_function(x, u, p).full().ravel()
+    response = plant.equations.controlled_response(x, u, p).full().ravel()
     assert np.allclose(response, (after - 2 * now + before)[:2] / h**2, atol=1e-5)
-    assert np.allclose(plant.inverse_function(x, response, p).full().ravel(), u)
+    assert np.allclose(plant.equations.inverse(x, response, p).full().ravel(), u)
 
 
 def circle(plant: fp.Plant, radius: float = 0.1, **settings: Any) -> fp.Problem:
@@ -478,7 +478,7 @@ def test_the_patients_kinetics_conserve_the_drug() -> None:
     clearance = 1.89 + 0.0456 * (weight - 77) - 0.0681 * (lean - 59) + 0.0264 * (height - 177)
     volumes = np.array([4.27, 18.9 - 0.391 * (age - 53), 238.0])
     plant, x = fp.load_problem("anaesthesia").problem.plant, np.array([3.0, 1.0, 0.4, 2.0])
-    rates = plant.derivative_function(x, 20.0, plant.exact).full().ravel()
+    rates = plant.equations.rate(x, 20.0, plant.exact).full().ravel()
     assert volumes @ rates[:3] == pytest.approx(20.0 - clearance * x[0], rel=1e-12)
 
 

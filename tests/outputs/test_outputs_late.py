@@ -77,7 +77,7 @@ def test_the_distance_of_a_wrong_model_moves_as_a_polynomial() -> None:
     plant = hill(5.5)
     shift = np.array([2.0, -0.3])
     x, later, tau = np.array([3.0, 2.0]), np.array([3.1, 2.1]), 0.25
-    own, ahead = (plant.output_function(s, 0.0, 5.5, np.zeros(2)).full().ravel() for s in (x, later))
+    own, ahead = (plant.equations.output(s, 0.0, 5.5, np.zeros(2)).full().ravel() for s in (x, later))
     y = output_ahead(plant)(own + shift, x, later, 5.5, tau).full().ravel()
     assert np.allclose(y, ahead + np.array([2.0 - 0.3 * tau, -0.3]))
 

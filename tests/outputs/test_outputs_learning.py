@@ -39,7 +39,7 @@ def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
     )
 
     plant, mass, period = problem.plant, 1.4, problem.period
-    rate = plant.forced_derivative_function
+    rate = plant.equations.forced_rate
 
     def moved(x: np.ndarray, u: np.ndarray, w: np.ndarray) -> np.ndarray:
         def f(s: np.ndarray) -> np.ndarray:
@@ -53,10 +53,10 @@ def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
     def shown(x: np.ndarray, u: np.ndarray, w: np.ndarray) -> np.ndarray:
         """The second w adds to the hand's acceleration alone."""
         forcing = np.array([w[0], 0.0])
-        y = plant.output_function(x, u, [mass], forcing).full().ravel()
+        y = plant.equations.output(x, u, [mass], forcing).full().ravel()
         step = 1e-4  # of a central difference of the hand's speed along the motion
         xdot = rate(x, u, [mass], forcing).full().ravel()
-        ends = tuple(plant.output_function(x + s * step * xdot, u, [mass], forcing).full().ravel()[2] for s in (1, -1))
+        ends = tuple(plant.equations.output(x + s * step * xdot, u, [mass], forcing).full().ravel()[2] for s in (1, -1))
         back = (ends[0] - ends[1]) / (2 * step)
         return np.array([x[0], x[1], y[0], y[3], back + w[1]])
 
@@ -66,7 +66,7 @@ def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
     # The operating point: the reference at t = 0 and the input that the model needs for its response there.
     first = problem.start_state
     response = np.asarray(problem.reference.function(plant)(0.0)[1].full()).ravel()
-    u0 = plant.inverse_function(first, response, [mass]).full().ravel()
+    u0 = plant.equations.inverse(first, response, [mass]).full().ravel()
     a_x = slopes(lambda x: moved(x, u0, np.zeros(2)), first)
     b_w = slopes(lambda w: moved(first, u0, w), np.zeros(2))
     a = np.block([[a_x, b_w[:, :1], np.zeros((4, 1))], [np.zeros((2, 4)), np.eye(2)]])
@@ -106,7 +106,7 @@ def test_a_disturbance_of_an_output_is_the_distance_of_the_curves() -> None:
     """At rest the estimate is the measured depth less that of the model."""
     problem = sedated(hill(5.5))
     run = simulated(problem, fp.Estimating(LAW, SHIFT))
-    model = problem.plant.output_function(run["state"][-1], run["command"][-1], [5.5], np.zeros(2)).full().ravel()
+    model = problem.plant.equations.output(run["state"][-1], run["command"][-1], [5.5], np.zeros(2)).full().ravel()
     assert run["estimate.w_depth"][-1] == pytest.approx(run["output.depth"][-1] - model[0], rel=0.01)
     assert abs(run["estimate.w_depth"][-1]) > 5
 
@@ -116,10 +116,10 @@ def test_a_plan_does_not_see_a_disturbance_of_the_response_and_the_inverse_does(
     run = simulated(problem, fp.Estimating(PLAN, ANSWER))
     plant, k = problem.plant, 30
     start = consistent_state(plant)(run["state"][k], run["output"][k], [5.5])
-    without = plant.controlled_response_function(start, run["planned"][k], [5.5]).full().ravel()
+    without = plant.equations.controlled_response(start, run["planned"][k], [5.5]).full().ravel()
     assert np.allclose(run["desired"][k], without)
     aimed = run["desired"][k] - run["estimate"][k]
-    assert np.allclose(run["command"][k], plant.inverse_function(run["state"][k], aimed, [5.5]).full().ravel())
+    assert np.allclose(run["command"][k], plant.equations.inverse(run["state"][k], aimed, [5.5]).full().ravel())
     assert abs(run["estimate"][k][0]) > 0.01
 
 
@@ -164,9 +164,7 @@ def test_a_disturbance_reaches_a_model_with_algebraic_states() -> None:
         ),
     )
     p = np.array([5.5, 0.7])  # the half, and the disturbance of C
-    one, other = (
-        disturbed(plant, ("C",)).derivative_function([2.0, 1.0], 3.0, p).full() for plant in (hill(5.5), through)
-    )
+    one, other = (disturbed(plant, ("C",)).equations.rate([2.0, 1.0], 3.0, p).full() for plant in (hill(5.5), through))
     assert np.allclose(one.ravel(), [3.0 - 2.0 + 0.7, 0.5])
     assert np.allclose(one, other)
 
@@ -176,21 +174,21 @@ def test_a_disturbance_of_a_map_adds_to_its_difference() -> None:
         states={"a": "m", "b": "m"}, inputs={"u": "N"}, parameters={}, step=0.1,
         next=lambda x, u, p: {"a": x.a + 0.2 * x.b, "b": 0.5 * x.b + u.u}, outputs={"y": fp.Output("m", lambda x, p: x.a)},
     )  # fmt: skip
-    after = disturbed(plant, ("b",)).next_function([1.0, 2.0], 3.0, [0.7], [0.0, 0.0]).full().ravel()
+    after = disturbed(plant, ("b",)).equations.next([1.0, 2.0], 3.0, [0.7], [0.0, 0.0]).full().ravel()
     assert np.allclose(after, [1.4, 4.0 + 0.1 * 0.7])
 
 
 def test_an_inverse_of_the_user_has_the_disturbance_of_the_response() -> None:
     plant = hill(5.5)
-    by_user = replace(plant, inverse=lambda x, r, p: {"u": plant.inverse_function(x.vector, r.depth, p.half)[0]})
+    by_user = replace(plant, inverse=lambda x, r, p: {"u": plant.equations.inverse(x.vector, r.depth, p.half)[0]})
     x, r, p = ca.DM([2.0, 1.5]), 3.0, ca.DM([5.5, 0.4])
-    one, other = (disturbed(one, ("depth''",)).inverse_function(x, r, p) for one in (plant, by_user))
+    one, other = (disturbed(one, ("depth''",)).equations.inverse(x, r, p) for one in (plant, by_user))
     assert float(one) == pytest.approx(float(other), rel=1e-9)
-    assert float(one) == pytest.approx(float(plant.inverse_function(x, r - 0.4, 5.5)), rel=1e-9)
+    assert float(one) == pytest.approx(float(plant.equations.inverse(x, r - 0.4, 5.5)), rel=1e-9)
     own = disturbed(
         by_user, ("C",)
-    ).inverse_function  # a state of which the output is an expression: the derived inverse
-    assert float(own(x, r, p)) == pytest.approx(float(disturbed(plant, ("C",)).inverse_function(x, r, p)), rel=1e-12)
+    ).equations.inverse  # a state of which the output is an expression: the derived inverse
+    assert float(own(x, r, p)) == pytest.approx(float(disturbed(plant, ("C",)).equations.inverse(x, r, p)), rel=1e-12)
 
 
 def test_the_exact_model_may_be_written_in_other_words() -> None:

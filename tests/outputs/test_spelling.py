@@ -150,14 +150,14 @@ def unequal(wrong: Sequence[float]) -> fp.Plant:
 def in_outputs(plant: fp.Plant) -> fp.Plant:
     """The plant with its outputs as coordinates: y^(r) = L_f^r h(x, u, p) at the x that has y, y', ..., y^(r-1)."""
     x, u, p = plant.symbols()
-    seen = plant.output_function(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(x.numel()))
+    seen = plant.equations.output(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(x.numel()))
     slope = ca.Function("slope", [p], [ca.jacobian(seen, x)])
 
     def response(*arguments: Any) -> Mapping[str, Any]:
         *derivatives, inputs, parameters = arguments
         z = ca.vertcat(*(derivatives[e.count("'")][e.rstrip("'")] for e in plant.output.elements))
         state = ca.solve(slope(parameters.vector), z)
-        values = plant.controlled_response_function(state, inputs.vector, parameters.vector)
+        values = plant.equations.controlled_response(state, inputs.vector, parameters.vector)
         return dict(zip(plant.outputs, ca.vertsplit(values), strict=True))
 
     with_arguments(response, [f"d{k}" for k in range(max(plant.chains.values()))] + ["u", "p"])
@@ -169,7 +169,7 @@ def both(plant: fp.Plant, start: Mapping[str, float] | None = None, **settings: 
     sizes = {"y": 1.0, "z": 1e3}
     weights, rate = {n: 1 / sizes[n] ** 2 for n in plant.outputs}, dict.fromkeys(plant.inputs, 1e-3)
     begin = dict.fromkeys(plant.state.elements, 0.0) | dict(start or {})
-    seen = plant.output_function(np.array(list(begin.values())), 0, plant.exact, np.zeros(len(begin)))
+    seen = plant.equations.output(np.array(list(begin.values())), 0, plant.exact, np.zeros(len(begin)))
     common: dict[str, Any] = {
         "reference": fp.Trajectory(lambda t: {n: sizes[n] * (1 - ca.cos(1.5 * t)) for n in plant.outputs}),
         "period": 0.02,

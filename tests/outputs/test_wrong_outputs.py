@@ -36,8 +36,8 @@ def judged_by(curve: np.ndarray, name: str) -> float:
     Their derivatives are those along the real motion: an observer that is right about everything but the curve.
     """
     x, u, p, real = (ca.SX.sym(n, s) for n, s in (("x", 4), ("u", 1), ("p", 4), ("real", 4)))
-    rate = PLANT.derivative_function(x, u, real)
-    chain = [PLANT.output_function(x, u, p, ca.SX.zeros(4))[0]]
+    rate = PLANT.equations.rate(x, u, real)
+    chain = [PLANT.equations.output(x, u, p, ca.SX.zeros(4))[0]]
     for _ in range(2):
         chain.append(ca.jtimes(chain[-1], x, rate))
     shown = ca.Function("shown", [x, u, p, real], [ca.vertcat(*chain)])

@@ -113,8 +113,8 @@ def test_affine_equations_equal_those_that_are_solved_by_hand():
     assert network.algebraic is not None
     solved = replace(network, algebraic=replace(network.algebraic, equations=node, guess={"node": 0.2}))
     hand = replace(network, algebraic=None, response=by_hand)
-    assert solved.affine
-    assert not network.affine
+    assert solved.equations.affine
+    assert not network.equations.affine
     horizon = {
         "horizon": fp.Horizon(stages=8, step=2e-4),
         "cost": fp.Quadratic(states={"v": 1e4}, deviation={"source": 1.0}),
@@ -130,11 +130,11 @@ def test_the_solution_solves_the_equations_from_a_far_guess_or_is_not_a_number()
     """Never a value in between: with too few steps the response is NaN."""
     plant, few = clipper(), clipper(steps=2, guess={"node": 2.0})
     for source in np.linspace(-2.0, 3.0, 26):
-        z = float(plant.algebraic_function([0.3], [source], plant.exact))
+        z = float(plant.equations.algebraic([0.3], [source], plant.exact))
         left = (source - z) / 100 - SATURATION * (np.exp(z / THERMAL) - 1) - (z - 0.3) / 1300
         assert abs(left) < 1e-12
-        assert np.isnan(float(few.algebraic_function([0.3], [source], few.exact)))
-        assert np.isnan(float(few.response_function([0.3], [source], few.exact)))
+        assert np.isnan(float(few.equations.algebraic([0.3], [source], few.exact)))
+        assert np.isnan(float(few.equations.response([0.3], [source], few.exact)))
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {

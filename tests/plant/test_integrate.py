@@ -37,7 +37,7 @@ def test_runge_kutta_agrees_with_cvodes():
 def test_forcing_adds_to_the_response():
     """A forcing w on a free double integrator moves it by w t^2 / 2."""
     plant = pendulum()
-    rate = plant.forced_derivative_function
+    rate = plant.equations.forced_rate
     free, forced = rate([0, 0], [0], plant.exact, [0]), rate([0, 0], [0], plant.exact, [2.5])
     np.testing.assert_allclose((forced - free).full().ravel(), [0.0, 2.5], equal_nan=False)
 

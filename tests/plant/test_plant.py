@@ -33,8 +33,8 @@ def test_inverse_undoes_response(plant):
     random = np.random.default_rng(1)
     for _ in range(20):
         x, r = random.normal(size=plant.state.size), random.normal(size=1)
-        u = plant.inverse_function(x, r, plant.approximate)
-        back = plant.controlled_response_function(x, u, plant.approximate)
+        u = plant.equations.inverse(x, r, plant.approximate)
+        back = plant.equations.controlled_response(x, u, plant.approximate)
         np.testing.assert_allclose(back.full().ravel(), r, rtol=1e-12, atol=1e-12, equal_nan=False)
 
 
@@ -59,10 +59,10 @@ def test_mixed_orders():
 def test_non_affine_response_is_inverted_numerically():
     """U + u^3 = r has one real root; Newton finds it, and a missing root is NaN, never a wrong number."""
     cubic = fp.Plant({"y": "1"}, {"u": "1"}, {}, lambda q, u, p: {"y": u.u + u.u**3 - q.y}, order=1)
-    assert not cubic.affine
-    assert float(cubic.inverse_function([0.0], [2.0], [])) == pytest.approx(1.0, abs=1e-9)
+    assert not cubic.equations.affine
+    assert float(cubic.equations.inverse([0.0], [2.0], [])) == pytest.approx(1.0, abs=1e-9)
     square = fp.Plant({"y": "1"}, {"u": "1"}, {}, lambda q, u, p: {"y": (u.u - 1) ** 2}, order=1)
-    assert np.isnan(float(square.inverse_function([0.0], [-1.0], [])))
+    assert np.isnan(float(square.equations.inverse([0.0], [-1.0], [])))
 
 
 def test_user_inverse_is_used():
@@ -75,7 +75,7 @@ def test_user_inverse_is_used():
         order=1,
         inverse=lambda q, r, p: {"u": ca.log(r.y)},
     )
-    assert float(plant.inverse_function([0.0], [np.e], [])) == pytest.approx(1.0)
+    assert float(plant.equations.inverse([0.0], [np.e], [])) == pytest.approx(1.0)
 
 
 def test_structural_order_of_the_far_mass_is_four():

@@ -55,7 +55,7 @@ def test_regressor_is_the_inverse_dynamics(name, values):
     """Y theta + Q0 = Q at any state, response and parameters, to rounding."""
     model, x, r, _, p, theta = drawn(values, name)
     y, rest = model.function(x, r, p)
-    wanted = model.plant.inverse_function(x, r, p).full().ravel()
+    wanted = model.plant.equations.inverse(x, r, p).full().ravel()
     np.testing.assert_allclose(
         (y @ theta + rest).full().ravel(), wanted, rtol=1e-8, atol=1e-8 * (1 + np.abs(wanted).max())
     )
@@ -73,7 +73,7 @@ def test_split_with_the_actual_velocity_is_the_inverse_dynamics(name, values):
         y, rest = model.split_function(x, velocity, r, p)
         return (y @ theta + rest).full().ravel()
 
-    wanted = model.plant.inverse_function(x, r, p).full().ravel()
+    wanted = model.plant.equations.inverse(x, r, p).full().ravel()
     scale = 1e-8 * (1 + np.abs(wanted).max())
     np.testing.assert_allclose(force(own), wanted, atol=scale)
     coriolis = model.coriolis_function(x, theta, p).full()
@@ -119,7 +119,7 @@ def test_published_inertia_and_gravity_load_of_the_puma():
     mass = model.mass_function(x, model.theta_function(p), p).full()
     np.testing.assert_allclose(np.diag(mass), [3.6594, 4.4137, 0.9378, 0.1925, 0.1713, 0.1941], atol=6e-5)
     np.testing.assert_allclose([mass[0, 1], mass[0, 2], mass[1, 2]], [-0.4044, 0.1006, 0.3509], atol=6e-5)
-    gravity = model.plant.inverse_function(x, np.zeros(6), p).full().ravel()
+    gravity = model.plant.equations.inverse(x, np.zeros(6), p).full().ravel()
     np.testing.assert_allclose(gravity, [0, 31.6399, 6.0351, 0, 0.0283, 0], atol=6e-5)
 
 

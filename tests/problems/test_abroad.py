@@ -12,7 +12,7 @@ from fpirhc.plant.plant import Plant
 
 def rates(plant: Plant, state: list[float], inputs: list[float]) -> np.ndarray:
     """The derivative of the state with the exact parameters; every coordinate is of order one."""
-    return np.asarray(plant.response_function(state, inputs, plant.exact).full()).ravel()
+    return np.asarray(plant.equations.response(state, inputs, plant.exact).full()).ravel()
 
 
 def test_reactor_is_that_of_do_mpc():
@@ -44,7 +44,7 @@ def test_tanks_rest_at_johanssons_levels(variant, voltage, levels):
 def test_servo_does_not_feel_its_mismatch():
     """The motor's response is the same with the model's and the plant's parameters; the load's is not."""
     problem = abroad.load("flexible_servo").problem
-    response, x, u = problem.plant.response_function, [0.1, 0.3, 1.0, -2.0], [12.0]
+    response, x, u = problem.plant.equations.response, [0.1, 0.3, 1.0, -2.0], [12.0]
     load, motor = (response(x, u, problem.plant.exact) - response(x, u, problem.plant.approximate)).full().ravel()
     assert motor == 0
     assert abs(load) > 1

@@ -51,7 +51,7 @@ def rms(name, controller):
 def rate_of(plant, command):
     """Right-hand side f(t, x) of the plant with its exact parameters under a constant command or a function of time."""
     values = command if callable(command) else lambda t: command
-    return lambda t, x: plant.derivative_function(x, values(t), plant.exact).full().ravel()
+    return lambda t, x: plant.equations.rate(x, values(t), plant.exact).full().ravel()
 
 
 # Hodgkin and Huxley
@@ -166,7 +166,7 @@ def test_sliding_friction_is_the_printed_curve():
             return rate_of(plant, 0.0)(0, [0.0, z, speed])[1]
 
         deflection = brentq(bristle, -1e-2, 1e-2, xtol=1e-16)
-        needed = plant.inverse_function([0.0, deflection, speed], 0.0, plant.exact)
+        needed = plant.equations.inverse([0.0, deflection, speed], 0.0, plant.exact)
         assert float(needed) == pytest.approx(curve, rel=1e-9), speed
 
 
@@ -234,7 +234,7 @@ def test_the_logarithm_is_drexlers_model():
 def test_a_dose_of_a_c_over_b_holds_the_tumour():
     """6.485 mg/kg a day keep any volume; without a drug 2 000 mm^3 become 4.4e5 in 20 days."""
     plant = task("tumour").problem.plant
-    hold = plant.inverse_function([np.log(500.0), 0.0], 0.0, plant.exact)
+    hold = plant.equations.inverse([np.log(500.0), 0.0], 0.0, plant.exact)
     assert float(hold) == pytest.approx(6.485, abs=1e-3)
     grown = solve_ivp(rate_of(plant, 0.0), (0, 20), [np.log(2000.0), 0.27], rtol=1e-9).y[0, -1]
     assert np.exp(grown) == pytest.approx(4.43e5, rel=5e-3)
@@ -266,9 +266,7 @@ def test_steady_thrust(throttle, small, large):
         root = np.roots([p["K_TT"], p["K_T"] + p["B_T"] * v, p["c"] + p["B_U"] * v]).max()
         assert root == pytest.approx(expected, abs=0.06)
         solution = solve_ivp(
-            lambda t, x, q=parameters: plant.derivative_function(x, throttle, q).full().ravel(),
-            (0, 30),
-            [0.95 * root, 0.0],
+            lambda t, x, q=parameters: plant.equations.rate(x, throttle, q).full().ravel(), (0, 30), [0.95 * root, 0.0]
         )
         assert solution.y[0, -1] == pytest.approx(root, rel=2e-3)
 
@@ -279,8 +277,8 @@ def test_the_throttle_is_found_for_every_thrust():
     for parameters in (plant.approximate, plant.exact):
         for _ in range(50):
             state, throttle = [random.uniform(20, 200), random.uniform(-20, 20)], random.uniform(0, 120)
-            response = plant.response_function(state, throttle, parameters)
-            assert float(plant.inverse_function(state, response, parameters)) == pytest.approx(throttle, abs=1e-9)
+            response = plant.equations.response(state, throttle, parameters)
+            assert float(plant.equations.inverse(state, response, parameters)) == pytest.approx(throttle, abs=1e-9)
 
 
 # What the tasks show

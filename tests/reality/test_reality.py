@@ -114,9 +114,9 @@ def test_model_as_what_moves_shows_its_own_outputs_and_responses(name):
     at = x, u, problem.real_parameters
     calm = np.zeros(len(plant.names))
     shown = problem.truth.function(plant.output.elements)(*at, calm)
-    np.testing.assert_array_equal(shown, plant.output_function(*at, calm))
+    np.testing.assert_array_equal(shown, plant.equations.output(*at, calm))
     answered = problem.truth.function(response_names(plant))(*at, calm)
-    np.testing.assert_array_equal(answered, plant.controlled_response_function(*at))
+    np.testing.assert_array_equal(answered, plant.equations.controlled_response(*at))
 
 
 def test_no_reality_is_no_setting():

@@ -299,8 +299,8 @@ def test_a_body_that_measures_states_and_outputs():
     problem = task(reality=None, sensing=fp.Sensing(), duration=2.0)
     plant = problem.plant
     x, u, p = plant.symbols()
-    outputs = plant.output_function(x, u, p, np.zeros(2))
-    shown = ca.Function("shown", [x, u, p], [ca.vertcat(x, outputs, plant.controlled_response_function(x, u, p))])
+    outputs = plant.equations.output(x, u, p, np.zeros(2))
+    shown = ca.Function("shown", [x, u, p], [ca.vertcat(x, outputs, plant.equations.controlled_response(x, u, p))])
     move = problem.integrator.step(plant, PERIOD)
 
     class Own:

@@ -48,7 +48,7 @@ def test_recursion_predicts_the_loop(which, form, gain):
     predicted = response_errors(nominal("two_mass", which), deformation=tested.deformation).error[3000:]
     plant = problem.plant
     exact = np.repeat(plant.exact[:, None], run.cycles, axis=1)
-    respond = plant.controlled_response_function.map(run.cycles)
+    respond = plant.equations.controlled_response.map(run.cycles)
     real = (respond(run["state"].T, run["command"].T, exact).full().T - run["desired"])[3000:]
     for size in (lambda e: np.abs(e).max(axis=0), lambda e: np.sqrt(np.mean(e**2, axis=0))):
         np.testing.assert_allclose(size(predicted), size(real), rtol=0.05)
@@ -80,7 +80,7 @@ def test_null_run_is_predicted(gain, form):
     exact = replace(problem, plant=replace(problem.plant, parameters=right))
     run, model = fp.simulate(exact, tested, seed=0), nominal("two_mass", "RHC")
     predicted = response_errors(model, deformation=tested.deformation, exact=model.believed).error[3000:]
-    respond = exact.plant.controlled_response_function.map(run.cycles)
+    respond = exact.plant.equations.controlled_response.map(run.cycles)
     believed = np.repeat(exact.plant.exact[:, None], run.cycles, axis=1)
     real = (respond(run["state"].T, run["command"].T, believed).full().T - run["desired"])[3000:]
     assert np.sqrt(np.mean(real**2)) > 0.05

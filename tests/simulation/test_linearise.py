@@ -9,6 +9,7 @@ import pytest
 from reviewed import about, answers, mass
 
 import fpirhc as fp
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
@@ -109,7 +110,9 @@ def test_other_parameters_are_another_memory_and_no_other_build():
     plant = task.problem.plant
     loop = asked("two_mass:CTC")
     own = loop.at(loop.run(loop.start(exact=plant.approximate), 50).memories[50])
-    rebuilt = AskedLoop(replace(task.problem, plant=plant.with_exact(plant.approximate)), task.controllers["CTC"])
+    rebuilt = AskedLoop(
+        replace(task.problem, plant=with_exact_parameters(plant, plant.approximate)), task.controllers["CTC"]
+    )
     other = rebuilt.at(rebuilt.run(rebuilt.start(), 50).memories[50])
     assert np.sort(np.abs(own.poles)) == pytest.approx(np.sort(np.abs(other.poles)), rel=1e-9, abs=1e-9)
 

@@ -23,7 +23,7 @@ def test_range_of_a_response_holds_what_the_model_can_do():
     boxes = [ranges[f"state.{name}"] for name in plant.state.elements]
     corners = product(*boxes, *(PROBLEM.limits.inputs[u] for u in plant.inputs))
     found = [
-        plant.controlled_response_function(c[:4], c[4:], plant.approximate).full().ravel()
+        plant.equations.controlled_response(c[:4], c[4:], plant.approximate).full().ravel()
         for c in map(np.array, corners)
     ]
     for k, name in enumerate(plant.controlled_names):

@@ -131,7 +131,7 @@ def test_the_largest_response_is_that_of_the_limits():
     for t in np.linspace(0.0, PROBLEM.duration, 100):
         x = np.asarray(reference(t)[0].full()).ravel()
         corners = [(a, b) for a in PROBLEM.limits.inputs["Fa"] for b in PROBLEM.limits.inputs["Fb"]]
-        sizes.append([np.asarray(PLANT.controlled_response_function(x, u, PLANT.approximate).full()) for u in corners])
+        sizes.append([np.asarray(PLANT.equations.controlled_response(x, u, PLANT.approximate).full()) for u in corners])
     # The two forces act on their own masses alone here, so the bound is attained to the spread of the samples.
     assert np.abs(sizes).max(axis=(0, 1)).ravel() == pytest.approx(np.array(largest), rel=0.05)
     assert (np.abs(sizes).max(axis=(0, 1)).ravel() <= np.array(largest) * (1 + 1e-9)).all()

@@ -80,7 +80,7 @@ def test_plant_that_is_not_affine_in_its_input():
     problem = fp.Problem(
         tank, fp.Trajectory(lambda t: {"level": 1 + 0.3 * ca.sin(t)}), {"level": 1.0}, 1e-2, 10.0, measure_from=5.0
     )
-    assert not tank.affine
+    assert not tank.equations.affine
     # rate x period = 0.02; the response error falls by about half per cycle
     controllers = [fp.ComputedTorque(fp.Exponential(2.0), d) for d in (fp.Identity(), fp.Sigmoid(gain=-1.0, scale=5.0))]
     plain, adaptive = (fp.measure(problem, fp.simulate(problem, c, seed=0)).rms_error["level"] for c in controllers)

@@ -76,7 +76,7 @@ def test_plans_are_those_of_opti_in_closed_loop():
 def test_a_force_by_the_square_of_its_current_is_inverted():
     """Newton's method begins where the current has an effect, which it has not at zero."""
     plant = magnet().problem.plant
-    current = float(plant.inverse_function([0.05, 0.0], -1.0, plant.approximate))
+    current = float(plant.equations.inverse([0.05, 0.0], -1.0, plant.approximate))
     assert current == pytest.approx(np.sqrt((9.81 + 1.0) * 0.1 * 2 * 0.05 * 4 / 0.01), rel=1e-9)
 
 

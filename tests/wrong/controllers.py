@@ -11,6 +11,7 @@ from fpirhc.controllers.base import Controller, closing_blocks, like, reference_
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.deformation import Deformation, Identity
 from fpirhc.errors import NotSupported
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Layout
 
@@ -114,7 +115,7 @@ class TellsAnotherModel(Gentle):
 
     def plant_model(self, problem):
         """Wrong."""
-        return PlantModel(problem.plant.with_exact(problem.plant.exact * 1.1), problem.signals)
+        return PlantModel(with_exact_parameters(problem.plant, problem.plant.exact * 1.1), problem.signals)
 
 
 class IsGivenTheExactParameters(Gentle):

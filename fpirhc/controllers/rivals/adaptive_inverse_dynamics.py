@@ -21,6 +21,7 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotSupported
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
@@ -138,7 +139,7 @@ class AdaptiveInverseDynamics(Controller):
         def then(s: Signals) -> Expression:
             return reference(ca.fmax(getattr(s, MEASURED_TIME) - pairs.late, 0))[0]
 
-        return then, (replace(plant.time, name=MEASURED_TIME),)
+        return then, (replace(time_signal(plant), name=MEASURED_TIME),)
 
     def lyapunov_row(self) -> np.ndarray:
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""

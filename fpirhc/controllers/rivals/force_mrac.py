@@ -104,7 +104,7 @@ class ForceMRAC(Controller):
     def _force_block(self, plant: Plant, warm_up_cycles: float) -> Block:
         """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""
         memory = self.deformation.memory(plant.input.elements)
-        inverse, response = plant.inverse_function, plant.controlled_response_function
+        inverse, response = plant.equations.inverse, plant.equations.controlled_response
 
         def step(s: Signals) -> dict[str, Expression]:
             remembered = {m: getattr(s, m) for m in memory.names}
@@ -129,7 +129,7 @@ class ForceMRAC(Controller):
         forces = [like(plant.input, n) for n in ("force_desired", "force_recalculated", "command_unclipped")]
         shown = [scalar(name) for name in self.deformation.shown()]
         writes = Layout((*forces, plant.response_signal("_deformed_unclipped"), *shown))
-        return Block("force", Layout(reads), writes, step, memory, opaque=plant.inverse_opaque)
+        return Block("force", Layout(reads), writes, step, memory, opaque=plant.equations.inverse_opaque)
 
 
 EXAMPLES = (Example(problem="mrac_pendulum", controller="force MRAC", changes={"duration": 3.0, "measure_from": 0.0}),)

@@ -139,7 +139,7 @@ def equation_function(regressor: Regressor) -> ca.Function:
 def _check_coordinates(problem: Problem) -> None:
     """Raise unless the coordinates of mechanics, of order 2, are what follows the reference."""
     plant = problem.plant
-    if plant.known_by_outputs != tuple(range(plant.state.size)):
+    if plant.equations.known_by_outputs != tuple(range(plant.state.size)):
         raise NotSupported(
             f"learning inverse dynamics is for mechanics in its own coordinates, whose inertia matrix it learns; "
             f"{', '.join(plant.controlled_names)} are other functions of the state; use ComputedTorque with a deformation"

@@ -126,7 +126,7 @@ class LyapunovMRAC(Controller):
         """Block (state, model, reference, gains) -> command, regressor, p z, and the gains in use."""
         seen = plant.output
         rows = [self.weights(order)[-1] for order in plant.response_orders.values()]
-        start, response, rate = _start_gains(plant), plant.controlled_response_function, self.rate
+        start, response, rate = _start_gains(plant), plant.equations.controlled_response, self.rate
 
         def pull(row: np.ndarray, chain: list[Expression]) -> Expression:
             return sum(w * power(rate, len(chain) - 1 - j) * e for j, (w, e) in enumerate(zip(row, chain, strict=True)))
@@ -167,7 +167,7 @@ class LyapunovMRAC(Controller):
             plant.response_signal("_deformed_unclipped"),
             *_adapted(plant),
         )
-        return Block("law", Layout((*reads, *before)), Layout(writes), step, opaque=plant.inverse_opaque)
+        return Block("law", Layout((*reads, *before)), Layout(writes), step, opaque=plant.equations.inverse_opaque)
 
     def _adapt_block(self, plant: Plant, period: float, sign: int) -> Block:
         """Block that steps the gains, except while the command is clipped."""
@@ -200,7 +200,7 @@ def _start_gains(plant: Plant) -> ca.Function:
     """Function (state, desired response, parameters) -> Theta_0: the model's inverse, linearised there."""
     x, r = ca.MX.sym("x", plant.state.size), ca.MX.sym("r", len(plant.controlled_names))
     p = ca.MX.sym("p", len(plant.parameters))
-    command = plant.inverse_function(x, r, p)
+    command = plant.equations.inverse(x, r, p)
     by_state, by_response = ca.densify(ca.jacobian(command, x)), ca.densify(ca.jacobian(command, r))
     bias = command - ca.mtimes(by_state, x) - ca.mtimes(by_response, r)
     return ca.Function("fpirhc_start_gains", [x, r, p], [ca.vec(ca.horzcat(by_state, by_response, bias))])
@@ -210,7 +210,7 @@ def _sign(problem: Problem) -> int:
     """Sign of the inputs' effect on the response by the model at the start; 0 where it is not definite."""
     plant = problem.plant
     x, u, p = plant.symbols()
-    effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
+    effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
     matrix = np.asarray(effect(problem.start_state, [0] * len(plant.inputs), plant.approximate).full())
     values = np.linalg.eigvalsh(matrix + matrix.T)
     return 1 if values.min() > 0 else -1 if values.max() < 0 else 0

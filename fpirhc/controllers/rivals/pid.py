@@ -92,7 +92,7 @@ class PID(Controller):
                 mistakes.add(f"proportional: controlled coordinate '{name}' has no gain; add '{name}': ...")
         mistakes.raise_if_any()
         x, u, p = plant.symbols()
-        effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
+        effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
         at_start = effect(problem.start_state, problem.inputs_before, plant.approximate)
         for k, (name, order) in enumerate(plant.response_orders.items()):
             gains = self.gains(name, order)
@@ -156,7 +156,7 @@ class PID(Controller):
                 "_target_error": ca.vertcat(*own),
                 "_integral_used": integral,
                 "command_unclipped": command,
-                "_deformed_unclipped": plant.controlled_response_function(s.state, command, s.parameters),
+                "_deformed_unclipped": plant.equations.controlled_response(s.state, command, s.parameters),
                 **remembered,
             }
 

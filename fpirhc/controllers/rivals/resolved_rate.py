@@ -40,7 +40,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
-from fpirhc.plant.motion import controlled_places
+from fpirhc.plant.motion import controlled_places, time_signal
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
@@ -130,7 +130,7 @@ def _nominal_block(problem: Problem) -> Block:
         later = function(s.time, *own_values(problem, s))[1][controlled]
         return {"nominal": s._reference_response, "_nominal_later": later}
 
-    reads = Layout((plant.time, plant.response_signal("_reference_response"), *own_signals(problem)))
+    reads = Layout((time_signal(plant), plant.response_signal("_reference_response"), *own_signals(problem)))
     writes = Layout((plant.response_signal("nominal"), plant.response_signal("_nominal_later")))
     return Block("nominal", reads, writes, step, opaque=problem.reference.opaque)
 
@@ -140,8 +140,8 @@ def _increment_block(problem: Problem) -> Block:
     plant, period, warm_up_cycles = problem.plant, problem.period, problem.warm_up_cycles
     x, u, p = plant.symbols()
     measured = ca.SX.sym("f", len(plant.controlled_names))
-    response = plant.controlled_response_function(x, u, p)
-    highest = plant.response_function(x, u, p)
+    response = plant.equations.controlled_response(x, u, p)
+    highest = plant.equations.response(x, u, p)
     # The measured responses move the state; the model's response does where nothing is measured, and where outputs are.
     for k, index in enumerate(() if plant.outputs else controlled_places(plant)):
         highest[index] = measured[k]

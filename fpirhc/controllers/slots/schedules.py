@@ -19,6 +19,7 @@ from fpirhc.controllers.slots.slot import Channel
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import finite_number
+from fpirhc.plant.motion import time_signal
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
@@ -176,4 +177,4 @@ def _timed(problem: Problem, channels: Sequence[Channel], starts: Sequence[tuple
             slot += (number - before) * (phase > start - 0.5)
         return {"slot": slot}
 
-    return Block("schedule", Layout((problem.plant.time,)), Layout((scalar("slot"),)), step)
+    return Block("schedule", Layout((time_signal(problem.plant),)), Layout((scalar("slot"),)), step)

@@ -22,6 +22,7 @@ from fpirhc.controllers.online_reference import motion_of, own_signals, own_valu
 from fpirhc.controllers.slots.slot import Channel, First
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status
 from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block
@@ -46,7 +47,7 @@ def reference_block(problem: Problem) -> Block:
         return {"reference": reference, "error": reference[places] - getattr(s, seen.name)[places]}
 
     writes = Layout((like(seen, "reference"), error_signal(problem, "error")))
-    reads = Layout((plant.time, seen, *own_signals(problem)))
+    reads = Layout((time_signal(plant), seen, *own_signals(problem)))
     return Block("reference", reads, writes, step, opaque=problem.reference.opaque)
 
 
@@ -83,7 +84,7 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     writes = [one.signal(n, elements) for n in ("state", "target")]
     writes += [one.signal(n) for n in ("nominal", "free", "gain", "good", "divisor")]
     motion, before = measured_signals(plant), like(plant.input, "_command_before")
-    reads = (plant.time, *motion, plant.parameter, before, *own_signals(problem))
+    reads = (time_signal(plant), *motion, plant.parameter, before, *own_signals(problem))
     return Block(
         f"slot_state_{one.number}", Layout(reads), Layout(tuple(writes)), step, opaque=problem.reference.opaque
     )

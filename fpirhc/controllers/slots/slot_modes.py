@@ -100,7 +100,7 @@ def _set_point(problem: Problem, parameters: np.ndarray) -> tuple[np.ndarray, np
         return f"the reference still moves at its end, t = {problem.duration:g} {problem.time_unit}"
     state = reference_states(problem, 2)[:, -1]
     x, u, p = plant.symbols()
-    rate = plant.derivative_function(x, u, p)
+    rate = plant.equations.rate(x, u, p)
     function = ca.Function("fpirhc_rate", [x, u, p], [rate, ca.densify(ca.jacobian(rate, u))])
     free, gain = (np.asarray(v.full()) for v in function(state, np.zeros(u.numel()), parameters))
     command = np.linalg.lstsq(gain, -free, rcond=None)[0].ravel()
@@ -116,7 +116,7 @@ def _mode(
     plant, law = problem.plant, one.slot.tracking.feedback(one.chain.order)
     assert law is not None
     x, u, p = plant.symbols()
-    rate, calm = plant.derivative_function(x, u, p), ca.SX.zeros(len(plant.names))
+    rate, calm = plant.equations.rate(x, u, p), ca.SX.zeros(len(plant.names))
     acting_input = u[plant.input.elements.index(one.chain.input)]
     realised = one.chain.response(x, u, p, calm)
     derivatives = [

@@ -145,7 +145,7 @@ class Cascade(Controller):
         start = tuple(map(float, problem.start_output[places]))
         own = self.deformation.memory(names)
         last = Signal("shift_last", names, units), Signal("target_last", names, units, start), scalar("shift_cycles")
-        response = plant.controlled_response_function
+        response = plant.equations.controlled_response
         memory = Layout((*last, *(pairing.memory(problem) if pairing else ()))) + own
 
         def step(s: Signals) -> dict[str, Expression]:

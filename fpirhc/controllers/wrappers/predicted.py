@@ -40,6 +40,7 @@ from fpirhc.members import Example
 from fpirhc.plant.chain import derivatives_function, measured_signals
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import response_age
+from fpirhc.plant.motion import forcing_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
@@ -129,7 +130,9 @@ class ByDesired(Predictor):
         Raises:
             NotSupported: the motion of a quantity that is not controlled, or of a state that is no output, needs a model.
         """
-        hidden = [e for e, place in zip(plant.state.elements, plant.known_by_outputs, strict=True) if place < 0]
+        hidden = [
+            e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0
+        ]
         free = [e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names]
         if hidden or free:
             raise NotSupported(
@@ -148,7 +151,7 @@ class ByDesired(Predictor):
         """Return Taylor's formula with the highest derivative held over the cycle, as a Function."""
         x, u, p = plant.symbols()
         d, w = ca.SX.sym("d", len(plant.controlled_names)), ca.SX.sym("w", len(plant.names))
-        seen = plant.output_function(x, 0 * u, p, 0 * w)
+        seen = plant.equations.output(x, 0 * u, p, 0 * w)
         elements, later = plant.output.elements, {}
         for k, name in enumerate(plant.controlled_names):
             chain = sorted((e for e in elements if e.rstrip("'") == name), key=len)
@@ -159,7 +162,7 @@ class ByDesired(Predictor):
                     series += factor * value
                     factor *= period / (j + 1)
                 later[element] = series
-        state_next = [later[elements[place]] for place in plant.known_by_outputs]
+        state_next = [later[elements[place]] for place in plant.equations.known_by_outputs]
         return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*state_next)])
 
 
@@ -245,9 +248,9 @@ class Predicted(Controller):
         if not self._length(problem):
             return self.controller.blocks(problem)
         inner = compose_controller(problem, self.controller, ahead=True)
-        ahead = {"time": like(plant.time, "time_ahead"), "state": like(plant.state, "state_ahead")}
+        ahead = {"time": like(time_signal(plant), "time_ahead"), "state": like(plant.state, "state_ahead")}
         ahead |= {s.name: like(s, f"{s.name}_ahead") for s in measured_signals(plant)[1:]}
-        feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: plant.time}
+        feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
         predict = _predict_block(problem, self, self._queue(problem), before, tuple(ahead.values()))
@@ -276,11 +279,11 @@ def _predict_block(
     # One value more than is on its way: the oldest acted while the response was realised.
     past = tuple(f"{e}@{k}" for k in range(1, queue.length + 1) for e in before.elements)
     sent = Signal("sent", past, start=by.sent_at_start(problem) * queue.length)
-    residual = Signal("residual", plant.names, plant.response_units)
+    residual = Signal("residual", plant.names, forcing_units(plant))
     advance, cycles = by.advance(plant, problem.period), cast(float, queue.cycles)
     corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
     responses = (plant.response_signal("realised"),) if corrected else ()
-    reads = (plant.time, *measured_signals(plant), *responses, plant.parameter, before)
+    reads = (time_signal(plant), *measured_signals(plant), *responses, plant.parameter, before)
     last = _answered_at(problem) if corrected else ()
     own = (sent, residual, *last) if corrected else (sent,)
     # An output that is the state is where the state is.
@@ -306,7 +309,7 @@ def _predict_block(
         return {**later, **{f"{signal.name}_next": getattr(s, signal.name) for signal in own[1:]}}
 
     time = tuple(w for w in writes if w.name == "time_ahead")
-    waits = Block("predict_waits", Layout((plant.time, before)), Layout(time), wait, Layout(own))
+    waits = Block("predict_waits", Layout((time_signal(plant), before)), Layout(time), wait, Layout(own))
     return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True, waits=waits)
 
 
@@ -328,7 +331,7 @@ def _residual(plant: Plant, time: float, period: float) -> ca.Function:
     )
     forced = derivatives_function(plant, list(plant.response_orders.items()))(x, u, p, w)
     effect = ca.substitute(ca.jacobian(forced, w), w, 0 * w)
-    missing = f - plant.controlled_response_function(x, u, p)
+    missing = f - plant.equations.controlled_response(x, u, p)
     residual_now = ca.mtimes(effect.T, ca.solve(ca.mtimes(effect, effect.T), missing))
     share = 1 - float(np.exp(-period / time))
     return ca.Function("fpirhc_residual", [old, x, u, f, p], [ca.densify(old + share * (residual_now - old))])
@@ -349,7 +352,7 @@ def output_ahead(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
     later, y, time = ca.SX.sym("later", x.numel()), ca.SX.sym("y", plant.output.size), ca.SX.sym("time")
     held = ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names))
-    distance, ahead = y - plant.output_function(x, *held), plant.output_function(later, *held)
+    distance, ahead = y - plant.equations.output(x, *held), plant.equations.output(later, *held)
     elements, entries = plant.output.elements, []
     for k, element in enumerate(elements):
         higher = [i for i, e in enumerate(elements) if e.startswith(element) and not e[len(element) :].strip("'")]

@@ -34,7 +34,7 @@ from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import Differences, response_age
-from fpirhc.plant.motion import controlled_places, followed_units
+from fpirhc.plant.motion import controlled_places, followed_units, forcing_units
 from fpirhc.plant.output import Output
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import quantities, response_names
@@ -233,11 +233,11 @@ class DisturbanceKalman(ParameterEstimator):
         if self.reads_outputs(model):
             calm = ca.DM.zeros(len(model.names))
             states = (
-                dict(zip(model.output.elements, ca.vertsplit(model.output_function(x, u, p, calm)), strict=True))
+                dict(zip(model.output.elements, ca.vertsplit(model.equations.output(x, u, p, calm)), strict=True))
                 | states
             )
         if self._responses(model):
-            responses = ca.vertsplit(model.controlled_response_function(x, u, p))
+            responses = ca.vertsplit(model.equations.controlled_response(x, u, p))
             states |= dict(zip(response_names(model), responses, strict=True))
         return ca.Function("fpirhc_shown", [x, u, p], [ca.densify(ca.vertcat(*(states[n] for n in self.measured)))])
 
@@ -313,7 +313,7 @@ def _rank(a: np.ndarray, c: np.ndarray) -> int:
 def _shown_by(plant: Plant, names: Sequence[str]) -> list[int]:
     """Places of the states on which these coordinates or outputs depend."""
     x, u, p = plant.symbols()
-    values = plant.output_function(x, u, p, ca.DM.zeros(len(plant.names)))
+    values = plant.equations.output(x, u, p, ca.DM.zeros(len(plant.names)))
     shown = values[[plant.output.elements.index(n) for n in names]]
     return sorted(set(ca.jacobian_sparsity(shown, x).get_triplet()[1]))
 
@@ -322,11 +322,11 @@ def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
     """State, input and parameters of the model on the reference at t = 0; states without a reference are those of the start."""
     plant = problem.plant
     seen, response = problem.reference.function(plant)(0.0)
-    known = zip(problem.start_state, plant.known_by_outputs, strict=True)
+    known = zip(problem.start_state, plant.equations.known_by_outputs, strict=True)
     state = ca.DM([value if place < 0 else float(seen[place]) for value, place in known])
     if plant.controlled is None and len(plant.inputs) != len(plant.chains):
         return state, ca.DM.zeros(len(plant.inputs)), plant.approximate
-    needed = plant.inverse_function(state, response[controlled_places(plant)], plant.approximate)
+    needed = plant.equations.inverse(state, response[controlled_places(plant)], plant.approximate)
     return state, needed, plant.approximate
 
 
@@ -357,7 +357,7 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
             mistakes.add(f"the plant has a parameter '{name}' already; rename it")
     mistakes.raise_if_any()
     coordinates = [n for n in names if n in plant.coordinates]
-    units = dict(followed_units(plant)) | dict(zip(plant.names, plant.response_units, strict=True))
+    units = dict(followed_units(plant)) | dict(zip(plant.names, forcing_units(plant), strict=True))
     if responses:
         units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
     added = {_disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
@@ -379,7 +379,7 @@ def _mixed(plant: Plant, coordinates: Sequence[str]) -> bool:
     """Whether a coordinate's disturbance is in the response of another quantity, so that a user's inverse does not know it."""
     x, u, p = plant.symbols()
     own = [_disturbance_name(n) for n in coordinates]
-    pattern = ca.jacobian_sparsity(plant.controlled_response_function(x, u, p), p)
+    pattern = ca.jacobian_sparsity(plant.equations.controlled_response(x, u, p), p)
     pairs = zip(*pattern.get_triplet(), strict=True)
     parameters, controlled = plant.parameter.elements, plant.controlled_names
     return any(parameters[k] in own and parameters[k] != _disturbance_name(controlled[i]) for i, k in pairs)

@@ -107,7 +107,7 @@ def residual_function(plant: Plant, parameters: Mapping[str, Uncertain], noise: 
     believed = ca.SX(p)
     for k, name in enumerate(parameters):
         believed[plant.parameter.elements.index(name)] += parameters[name].deviation * z[k]
-    error = (f - plant.controlled_response_function(x, u, believed)) / ca.DM(list(noise))
+    error = (f - plant.equations.controlled_response(x, u, believed)) / ca.DM(list(noise))
     return ca.Function("fpirhc_residual", [z, x, u, f, p], [ca.densify(error), ca.densify(-ca.jacobian(error, z))])
 
 

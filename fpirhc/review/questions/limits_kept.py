@@ -90,7 +90,7 @@ def _commands_before(grid: ReviewGrid) -> np.ndarray:
     earlier = np.maximum(grid.times - problem.horizon.step, 0.0)
     responses = np.asarray(problem.reference.function(plant).map(len(earlier))(earlier[None, :])[1].full())
     exact = np.tile(plant.exact, (len(earlier), 1))
-    return each(plant.inverse_function, grid.states_at(earlier), responses[controlled_places(plant)].T, exact)
+    return each(plant.equations.inverse, grid.states_at(earlier), responses[controlled_places(plant)].T, exact)
 
 
 QUESTION = ProblemQuestion(ask=reference_keeps_limits, order=30)

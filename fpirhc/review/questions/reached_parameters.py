@@ -59,7 +59,7 @@ def _missed(names: list[str], idle: list[str]) -> list[str]:
 def _without_task(grid: ReviewGrid, names: list[str]) -> list[str]:
     """Those of the parameters that are in the responses of simulated states alone, see `fpirhc.review.inner`."""
     plant = grid.problem.plant
-    pattern = np.asarray(ca.DM(plant.response_function.jac_sparsity(0, 2), 1).full()) != 0
+    pattern = np.asarray(ca.DM(plant.equations.response.jac_sparsity(0, 2), 1).full()) != 0
     inner = {plant.state.elements[k].rstrip("'") for k in grid.inner}
     of = {
         name: {c for c, row in zip(plant.names, pattern, strict=True) if row[k]}
@@ -70,7 +70,7 @@ def _without_task(grid: ReviewGrid, names: list[str]) -> list[str]:
 
 def _present(plant: Plant) -> list[bool]:
     """Whether each parameter is in the controlled response, from the pattern of the symbols."""
-    pattern = np.asarray(ca.DM(plant.controlled_response_function.jac_sparsity(0, 2), 1).full())
+    pattern = np.asarray(ca.DM(plant.equations.controlled_response.jac_sparsity(0, 2), 1).full())
     return [bool(column.any()) for column in pattern.T]
 
 
@@ -80,7 +80,7 @@ def _effect(grid: ReviewGrid, believed: np.ndarray, place: int) -> float:
     changed = plant.exact.copy()
     changed[place] = believed[place]
     rows = [np.tile(p, (len(grid.times), 1)) for p in (changed, plant.exact)]
-    with_it, without = (each(plant.controlled_response_function, grid.states, grid.commands[0], p) for p in rows)
+    with_it, without = (each(plant.equations.controlled_response, grid.states, grid.commands[0], p) for p in rows)
     change = np.linalg.norm(with_it - without, axis=1)
     return float(change[np.isfinite(change)].max(initial=0.0))
 

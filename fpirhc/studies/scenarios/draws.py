@@ -15,6 +15,7 @@ import numpy as np
 
 from fpirhc.errors import NotSupported
 from fpirhc.plant.mismatch import drawn
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
 
@@ -84,4 +85,4 @@ def with_exact(problem: Problem, exact: np.ndarray) -> Problem:
         )
     if problem.symbolic_reality is not None:
         return replace(problem, reality=problem.symbolic_reality.with_exact(exact))
-    return replace(problem, plant=problem.plant.with_exact(exact))
+    return replace(problem, plant=with_exact_parameters(problem.plant, exact))
