@@ -13,11 +13,9 @@ from plants import chain, pendulum
 
 import fpirhc as fp
 from fpirhc.controllers.base import compose_controller
-from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Evidence
 from fpirhc.plant.regressor import Combination, Regressor
-from fpirhc.symbolic.native import native
 
 FREE = (-np.inf, np.inf)
 
@@ -369,19 +367,6 @@ def test_puma_learns_its_load():
 
 
 # Every combination compiles, and runs compiled as it runs interpreted.
-
-
-@pytest.mark.parametrize("name", ["AID+FPI", "Slotine-Li", "Slotine-Li+FPI"])
-def test_compiled_as_interpreted(name):
-    """Scalar code throughout; the same numbers to rounding."""
-    problem = task(poor, 0.5)
-    step = compose_controller(problem, resolved(problem, CONTROLLERS[name]))
-    assert not step.opaque
-    backend = native(step.function)
-    values = [problem.start_state, [0.3], problem.plant.approximate]
-    arguments = [step.memory.start(), 0.1, *values]
-    for ours, theirs in zip(backend.function(*arguments), step.function(*arguments), strict=True):
-        np.testing.assert_allclose(ours.full(), theirs.full(), rtol=1e-12, atol=1e-12)
 
 
 # What does not fit is refused before the run.

@@ -12,12 +12,10 @@ import pytest
 from plants import chain, linear, pendulum
 
 import fpirhc as fp
-from fpirhc.controllers.base import compose_controller
 from fpirhc.errors import InvalidProblem
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
 from fpirhc.studies.comparison.compare import compare
-from fpirhc.symbolic.native import find_compiler
 
 RATE = 6.0
 TRACK = fp.Exponential(rate=RATE)
@@ -405,25 +403,6 @@ def test_settings_are_checked(build):
 
 
 # Every rival is one symbolic step
-
-
-@by_name
-def test_same_in_c_and_in_the_virtual_machine(rival):
-    """One step, also told the exact parameters; nothing of it needs the virtual machine."""
-    problem = swing(duration=0.05, measure_from=0.0)
-    assert not compose_controller(problem, rival).opaque
-    run = simulate(problem, rival)
-    compiled, virtual = (fp.Stepper(problem, rival, compiled=c) for c in (True, False))
-    assert compiled.compiled == (find_compiler() is not None)
-    memories = compiled.start(), virtual.start()
-    for k in range(run.cycles):
-        measured = run.time[k], run["state"][k], run["realised"][k]
-        (in_c, first), (in_vm, second) = (
-            s.step(*measured, m) for s, m in zip((compiled, virtual), memories, strict=True)
-        )
-        memories = first, second
-        np.testing.assert_allclose(in_c, in_vm, rtol=1e-9, atol=1e-9, equal_nan=False)
-        np.testing.assert_allclose(in_vm, run["command"][k], rtol=1e-9, atol=1e-9, equal_nan=False)
 
 
 @by_name

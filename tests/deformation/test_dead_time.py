@@ -244,13 +244,6 @@ def test_receding_horizon_starts_where_its_command_acts():
     assert errors["late"] > 5 * errors["predicted"]
 
 
-def test_compiled_equals_virtual_machine():
-    problem = replace(DUFFING.problem, duration=1.0, measure_from=0.0)
-    for controller in DUFFING.controllers.values():
-        runs = [fp.simulate(problem, controller, seed=0, compiled=c) for c in (True, False)]
-        np.testing.assert_allclose(runs[0]["state"], runs[1]["state"], rtol=1e-9, atol=1e-11)
-
-
 @pytest.mark.parametrize(
     ("dead_time", "sentence"),
     [

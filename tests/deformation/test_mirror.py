@@ -187,12 +187,3 @@ def test_short_lag_needs_no_mirror():
     """An honest loss: at 20 ms the form without a lag tracks better, .07 against 1.7 mrad."""
     problem, map = lagging(0.02), fp.Affine(gain=-0.4)
     assert through(problem, fp.ModelReferenced(map))[0] < 0.1 * through(problem, fp.ModelReferenced(map, lag=0.02))[0]
-
-
-def test_compiled_equals_virtual_machine():
-    problem = short(
-        replace(TWO_MASS, dead_time=WAITS[2], sensing=fp.Sensing(QUANTA, fp.StateVariableFilter(bandwidth=300.0)))
-    )
-    controller = fp.ComputedTorque(LAW, fp.ModelReferenced(SIGMOID, **told(problem), lag=(1e-3, 0.0)))
-    runs = [fp.simulate(problem, controller, seed=0, compiled=c) for c in (True, False)]
-    np.testing.assert_allclose(runs[0]["state"], runs[1]["state"], rtol=1e-9, atol=1e-11)

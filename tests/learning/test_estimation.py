@@ -18,7 +18,6 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.learning.estimators.base import Seen
 from fpirhc.symbolic.expression import expression
-from fpirhc.symbolic.native import find_compiler
 
 PERIOD = 1e-2
 
@@ -240,17 +239,6 @@ def test_bounds_are_kept(build):
     for _ in range(2000):
         fed(np.zeros(2), np.zeros(1), np.zeros(1))
     assert np.abs(np.asarray(fed.memory)).max() < 1e6
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-@pytest.mark.parametrize("name", ["Kalman", "RLS", "MHE"])
-def test_compiled_and_interpreted_runs_agree(name):
-    """Every estimator becomes C, and the C does the same."""
-    problem = task(spring(), duration=0.5)
-    controller = fp.Estimating(fp.ComputedTorque(fp.Exponential(rate=5.0)), learners(SPRING, "y")[name])
-    runs = [fp.simulate(problem, controller, seed=0, compiled=c) for c in (True, False)]
-    assert runs[0].compiled
-    np.testing.assert_allclose(runs[0]["estimate"], runs[1]["estimate"], rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["Kalman", "RLS", "MHE"])

@@ -209,34 +209,6 @@ def test_a_plan_on_a_wrong_model_is_cured_by_the_iteration() -> None:
 # Ways of running
 
 
-def test_compiled_code_and_a_stepper_give_the_run() -> None:
-    """The stepper is given the stock alone: the difference over the last cycle is its own."""
-    problem = replace(stock(), horizon=None, cost=None)
-    controller = fp.ComputedTorque(fp.ShiftPolynomial(0.5, step=0.1), FORMS["model-referenced"])
-    run = fp.simulate(problem, controller, seed=0)
-    assert np.abs(run["command"] - simulated(problem, controller)["command"]).max() < 1e-13
-    stepper = fp.Stepper(problem, controller)
-    assert stepper.measures == ("stock",)
-    memory, commands = stepper.start(), []
-    for t, sample in zip(run.time, run["measured"], strict=True):
-        command, memory = stepper.step_measured(t, sample, memory)
-        commands.append(command)
-    assert np.abs(np.array(commands) - run["command"]).max() < 1e-13
-
-
-def test_outputs_of_a_map_run_on_a_stepper() -> None:
-    problem = task(discretised(0.1), 0.1)
-    controller = fp.ComputedTorque(fp.ShiftPolynomial(0.5, step=0.1), FORMS["model-referenced"])
-    run = simulated(problem, controller)
-    stepper = fp.Stepper(problem, controller, compiled=False)
-    memory, commands = stepper.start(), []
-    samples = {"y": run["plant_state.y"], "v": run["plant_state.v"]}
-    for k, t in enumerate(run.time):
-        command, memory = stepper.step_measured(t, np.array([samples[n][k] for n in stepper.measures]), memory)
-        commands.append(command)
-    assert np.abs(np.array(commands) - run["command"]).max() < 1e-13
-
-
 def test_gains_and_poles_are_live() -> None:
     problem = replace(stock(), horizon=None, cost=None)
     controller = fp.ComputedTorque(fp.ShiftPolynomial(0.5, step=0.1), fp.ModelReferenced(fp.Affine(gain=-1.0)))

@@ -153,17 +153,6 @@ def test_a_disturbance_of_the_output_is_a_part_of_its_response() -> None:
     assert np.abs(run["error.power"]).max() > 19
 
 
-def test_a_stepper_does_what_the_loop_does() -> None:
-    problem, controller = heated(element(), duration=2.0, measure_from=0.0), fp.Cascade(STATIC, affine(0.4))
-    run = simulated(problem, controller)
-    stepper = fp.Stepper(problem, controller, compiled=False)
-    memory = stepper.start()
-    for k in range(run.cycles):
-        sample = run["state"][k], run["realised"][k]
-        command, memory = stepper.step(run.time[k], *sample, memory, output=run["output"][k])
-        assert np.array_equal(command, run["command"][k])
-
-
 def test_a_review_says_what_it_covers() -> None:
     """Order, inverse and commands are answered; the linear loop is named as not covered."""
     answers = fp.review(heated(element()), {"static": STATIC}, mismatch=0.0, seed=0)

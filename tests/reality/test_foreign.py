@@ -122,13 +122,6 @@ def test_positions_alone_are_enough_for_an_estimator():
     assert np.array_equal(other["foreign.y"], other["measured.y"])
 
 
-def test_compiled_step_agrees():
-    """The step of one cycle in C, called from Python, gives the commands of the virtual machine."""
-    problem = outside(task(duration=0.05))
-    results = [fp.simulate(problem, CONTROLLERS["plain form"], seed=0, compiled=c) for c in (True, False)]
-    assert np.abs(results[0]["command"] - results[1]["command"]).max() < 1e-10
-
-
 @pytest.mark.parametrize("kind", BAD)
 def test_bad_answer_ends_the_run_and_loses_nothing(kind):
     """A hundred good answers are kept; the reason names the method, what it did, and when."""

@@ -22,7 +22,6 @@ from fpirhc.sensing.observability import unobservable
 from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
-from fpirhc.symbolic.native import find_compiler
 
 CTC = fp.ComputedTorque(fp.Exponential(rate=0.5))
 FPI = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.Affine(gain=-0.5))
@@ -358,15 +357,6 @@ def test_a_stepper_believes_as_the_loop_does(name):
             assert np.array_equal(held, result["command"][k - 1])
         command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
         assert np.array_equal(command, result["command"][k])
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-@pytest.mark.parametrize("name", ["Kalman", "late servo"])
-def test_compiled_loops_believe_alike(name):
-    """C and the virtual machine agree to 1e-9 of the states' size."""
-    problem, controller = case(name)
-    virtual, compiled = run(problem, controller), run(problem, controller, compiled=True)
-    np.testing.assert_allclose(compiled["state"], virtual["state"], atol=1e-9 * np.abs(virtual["state"]).max())
 
 
 def test_a_model_referenced_form_passes_the_null_test_on_believed_states():

@@ -21,7 +21,6 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.sample import raw_measurements
-from fpirhc.symbolic.native import find_compiler
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=4.0))
 HALF: dict[str, Any] = {"measured": {"y": 1e-3}, "noise": {"y": 0.5}, "start": {"y": 1.0, "y'": 1.0}}
@@ -277,24 +276,6 @@ def test_without_bounds_the_horizon_goes_astray_too() -> None:
 
 
 # One step with the controller
-
-
-def test_a_stepper_believes_as_the_loop_does() -> None:
-    problem = batch(fp.MovingHorizonStates(**KNOWN, window=5, bounds=INSIDE))
-    result, stepper = run(problem, PRESSURE), fp.Stepper(problem, PRESSURE, compiled=False)
-    memory, measured = stepper.start(), raw_measurements(result)
-    for k in range(30):
-        command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
-        assert np.array_equal(command, result["command"][k])
-        assert np.array_equal(stepper.trace()["state"], result["state"][k])
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
-def test_compiled_loops_believe_alike() -> None:
-    """C and the virtual machine agree to 1e-9."""
-    problem = replace(swing(fp.MovingHorizonStates(**ANGLE, window=6, iterations=2)), duration=0.4)
-    virtual, compiled = run(problem), run(problem, compiled=True)
-    np.testing.assert_allclose(compiled["state"], virtual["state"], atol=1e-9)
 
 
 # What is refused

@@ -17,7 +17,6 @@ from fpirhc.controllers import contract
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive
 from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.layout import Signal
-from fpirhc.symbolic.native import find_compiler
 
 ESTIMATORS = (
     fp.Measured(),
@@ -152,18 +151,6 @@ def test_series_belong_to_the_seed_and_to_the_sensor():
     assert not np.allclose(third["measured.y'"] - third["plant_state.y'"], drawn)
 
 
-@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-def test_compiled_loop_is_the_same():
-    """Noise, quanta, lost samples, dead time and a window: C and the virtual machine agree to rounding."""
-    sensor = fp.Sensor(noise=fp.ColouredNoise(1e-3, 1e-2), quantum=1e-4, dropout=0.1)
-    sensing = fp.Sensing({"y": sensor}, fp.SavitzkyGolay(window=5, degree=3))
-    problem = swinging(sensing=sensing, dead_time=fp.DeadTime(measurement=2e-3), period=1e-2)
-    controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Filtered(fp.Affine(gain=-0.1), pole=0.5))
-    slow, fast = (run(problem, controller, compiled=c) for c in (False, True))
-    assert fast.compiled
-    np.testing.assert_allclose(fast.log, slow.log, rtol=1e-9, atol=1e-9)
-
-
 def test_order_of_sensor_dead_time_and_controller():
     """The controller is given what the sensor showed three cycles ago; the run is judged by the true error."""
     problem = swinging(sensing=fp.Sensing({"y": NOISE}), dead_time=fp.DeadTime(measurement=3e-3))
@@ -171,17 +158,6 @@ def test_order_of_sensor_dead_time_and_controller():
     assert np.array_equal(result["state.y"][3:], result["measured.y"][:-3])
     assert result["true_error.y"] == pytest.approx(result["reference.y"] - result["plant_state.y"])
     assert fp.measure(problem, result).max_error["y"] == np.abs(result["true_error.y"]).max()
-
-
-def test_stepper_replays_a_noisy_run():
-    """A controller stepped by hand with what the sensor showed computes the same commands, the wait at the start included."""
-    problem = swinging(sensing=fp.Sensing({"y": fp.Sensor(quantum=1e-6)}, fp.PositionDifference()))
-    result, stepper = run(problem), fp.Stepper(problem, ADAPTIVE, compiled=False)
-    memory = stepper.start()
-    for k in range(20):
-        command, memory = stepper.step_measured(result.time[k], result["measured"][k], memory)
-        # In the loop's expressions the difference of two multiples of the quantum is one multiple of it.
-        assert command == pytest.approx(result["command"][k], rel=0, abs=1e-11)
 
 
 # --- estimators ---

@@ -144,26 +144,6 @@ def test_noise_follows_the_seed():
     assert not np.array_equal(first.log, other.log)
 
 
-def test_compiled_and_virtual_machine_agree():
-    """One symbolic step: C and the virtual machine give the same run up to rounding."""
-    in_vm, in_c = run(swing()), run(swing(), compiled=True)
-    np.testing.assert_allclose(in_c.log, in_vm.log, rtol=1e-9, atol=1e-9, equal_nan=False)
-
-
-def test_stepping_by_hand_repeats_the_run():
-    """The controller's own Function, fed with the run's measurements, gives the run's commands."""
-    problem, controller = (
-        swing(duration=0.2, measure_from=0.0),
-        fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0)),
-    )
-    result = fp.simulate(problem, controller, seed=0, compiled=False)
-    stepper = fp.Stepper(problem, controller, compiled=False)
-    memory = stepper.start()
-    for k in range(result.cycles):
-        command, memory = stepper.step(result.time[k], result["state"][k], result["realised"][k], memory)
-        np.testing.assert_allclose(command, result["command"][k], rtol=1e-12, atol=1e-12, equal_nan=False)
-
-
 def test_nan_measurement_never_reaches_the_plant():
     """A measurement that is not finite holds the last command, and the controller recovers with the next good one."""
     problem = swing(limits=fp.Limits(inputs={"torque": (-50.0, 50.0)}))

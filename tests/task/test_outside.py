@@ -220,18 +220,6 @@ def test_unknown_weather_is_what_adaptation_is_for():
     assert errors["CTC+model-referenced"] < 0.5 * errors["CTC"]
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
-def test_a_stepper_is_told_what_the_loop_is_told(name):
-    """The values are a function of time inside the controller."""
-    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Known(NIGHT)})
-    logged = run(problem, CONTROLLERS[name])
-    stepper = fp.Stepper(problem, CONTROLLERS[name], compiled=False)
-    memory = stepper.start()
-    for k in range(40):
-        command, memory = stepper.step(logged["time"].ravel()[k], logged["state"][k], logged["realised"][k], memory)
-        assert np.array_equal(command, logged["command"][k])
-
-
 def test_a_reality_may_have_signals_that_the_model_does_not_have():
     """The sun shines on the reality alone; both have the weather."""
 

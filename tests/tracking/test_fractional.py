@@ -12,7 +12,6 @@ from plants import chain
 import fpirhc as fp
 from fpirhc.controllers.base import compose_controller
 from fpirhc.errors import InvalidValue
-from fpirhc.symbolic.native import find_compiler
 
 
 def problem(order=1, *, period=1e-3, duration=2.002, **settings):
@@ -132,16 +131,6 @@ def test_a_fresh_start_forgets():
     assert again == first
     assert running != first
     assert not after[stepper.memory.slice("decay_past")].any()
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-def test_compiled_and_virtual_machine_agree():
-    """Two coordinates of the seed problem, with deformation: the same signals to rounding."""
-    task = replace(fp.load_problem("two_mass").problem, duration=0.3, measure_from=0.1)
-    controller = fp.ComputedTorque(fp.Fractional(6.0, 0.7, memory=0.2), fp.Sigmoid(gain=-0.5, scale=20.0))
-    in_vm, in_c = (fp.simulate(task, controller, seed=0, compiled=c) for c in (False, True))
-    assert in_c.compiled
-    np.testing.assert_allclose(in_c["error"], in_vm["error"], rtol=1e-9, atol=1e-12)
 
 
 def test_deformation_serves_the_law():
