@@ -2,7 +2,8 @@
 
     python scripts/sbom.py dist/fpirhc.cdx.json
 
-It describes the installed versions: run it where the release was tested. Nothing in it depends on the time or the machine.
+It describes the installed versions: run it where the release was tested. Beside the packages stand what lies in the package itself
+(uPlot) and what the wheel is built with. Nothing in it depends on the time or the machine.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ from __future__ import annotations
 import json
 import re
 import sys
+import tomllib
 from collections.abc import Iterator
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
 ROOT = "fpirhc"
+PROJECT = Path(__file__).resolve().parents[1]
 _NAME = re.compile(r"^[A-Za-z0-9._-]+")
 
 
@@ -26,14 +29,39 @@ def bill() -> dict[str, object]:
         for package in packages.values()
     ]
     own = packages.pop(ROOT)
+    inside, builders = _uplot(), _builders()
+    graph[[p["ref"] for p in graph].index(_purl(own))]["dependsOn"].append(inside["bom-ref"])
+    graph += [{"ref": component["bom-ref"], "dependsOn": []} for component in (inside, *builders)]
     return {
         "bomFormat": "CycloneDX",
         "specVersion": "1.6",
         "version": 1,
         "metadata": {"component": {**_component(own), "type": "application"}},
-        "components": [_component(package) for package in packages.values()],
+        "components": [*(_component(package) for package in packages.values()), inside, *builders],
         "dependencies": graph,
     }
+
+
+def _uplot() -> dict[str, object]:
+    """The library that draws a report's charts, which lies in the package."""
+    text = (PROJECT / "fpirhc" / "report" / "assets" / "uPlot.iife.min.js").read_text(encoding="utf-8")
+    version = re.match(r"/\*! \S+ \(v([0-9.]+)\)", text)
+    if version is None:
+        raise ValueError("uPlot.iife.min.js: the first line names no version; expected '/*! ADDRESS (v1.2.3) */'")
+    return _listed("uPlot", version[1], f"pkg:npm/uplot@{version[1]}", license="MIT")
+
+
+def _builders() -> list[dict[str, object]]:
+    """What the wheel is built with, in the versions that pyproject.toml fixes."""
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text(encoding="utf-8"))
+    pairs = [requirement.split("==") for requirement in project["build-system"]["requires"]]
+    return [_listed(name, version, f"pkg:pypi/{name}@{version}", scope="excluded") for name, version in pairs]
+
+
+def _listed(name: str, version: str, purl: str, license: str = "", scope: str = "required") -> dict[str, object]:
+    facts: dict[str, object] = {"type": "library", "bom-ref": purl, "name": name, "version": version, "purl": purl}
+    facts["scope"] = scope
+    return {**facts, "licenses": [{"license": {"id": license}}]} if license else facts
 
 
 def _closure(root: str) -> dict[str, Distribution]:

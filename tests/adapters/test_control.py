@@ -26,7 +26,7 @@ def test_a_transfer_function_moves_as_python_control_says():
     run = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=3.0)), seed=0, compiled=False)
     assert run.stop is None
     held = control.c2d(control.ss(TRUE), 0.01)
-    answer = control.forced_response(held, inputs=run["command"][:, 0])
+    answer = control.forced_response(held, None, run["command"][:, 0])
     assert run["output"][:, 0] == pytest.approx(answer.outputs, abs=1e-8)
 
 

@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import subprocess
 import sys
+import tarfile
+import tomllib
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "sbom.py"
+ROOT = Path(__file__).parents[2]
+PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 
 
-def bill() -> Any:
-    spec = importlib.util.spec_from_file_location("sbom", SCRIPT)
+def script(name: str) -> Any:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.bill()
+    return module
+
+
+def bill() -> Any:
+    return script("sbom").bill()
 
 
 def test_bill_of_materials_names_what_is_needed():
@@ -43,6 +51,9 @@ def test_bill_of_materials_names_what_is_needed():
     ):
         assert versions[name] == distribution(name).version
     assert "sphinx" not in versions
+    inside = (ROOT / "fpirhc" / "report" / "assets" / "uPlot.iife.min.js").read_text(encoding="utf-8")
+    assert f"(v{versions['uplot']})" in inside.splitlines()[0]
+    assert [f"hatchling=={versions['hatchling']}"] == tomllib.loads(PROJECT)["build-system"]["requires"]
     references = {c["bom-ref"] for c in (*document["components"], document["metadata"]["component"])}
     assert len(references) == len(document["components"]) + 1
     assert {d["ref"] for d in document["dependencies"]} == references
@@ -50,7 +61,35 @@ def test_bill_of_materials_names_what_is_needed():
     assert json.dumps(bill()) == json.dumps(document)
 
 
-AUDIT = Path(__file__).parents[2] / "scripts" / "audit_answer.py"
+def test_the_oldest_versions_are_those_that_are_declared():
+    lines = script("oldest").oldest(PROJECT)
+    assert {"casadi==3.8.2", "numpy==1.26", "pytest==8"} <= set(lines)
+    with pytest.raises(ValueError, match="numpy: expected 'name>=version'"):
+        script("oldest").oldest(PROJECT.replace('"numpy>=1.26"', '"numpy"'))
+
+
+def test_the_conda_recipe_needs_what_the_package_needs():
+    """conda-forge has matplotlib without its graphical parts as matplotlib-base."""
+    project = tomllib.loads(PROJECT)["project"]
+    recipe = (ROOT / "scripts" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
+    assert f"  version: {project['version']}\n" in recipe
+    run = recipe.partition("  run:\n")[2].partition("\ntests:")[0]
+    needs = {"matplotlib" if n == "matplotlib-base" else n: v for n, v in re.findall(r"- (\S+) >=(\S+)", run)}
+    declared = dict(requirement.split(">=") for requirement in project["dependencies"])
+    assert needs == {"python": project["requires-python"].removeprefix(">="), **declared}
+    assert f"- {tomllib.loads(PROJECT)['build-system']['requires'][0].replace('==', ' ==')}\n" in recipe
+
+
+def test_a_source_distribution_carries_what_its_checks_need(tmp_path):
+    pytest.importorskip("hatchling", reason="the builder is in an environment of its own where it was not asked for")
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)], cwd=ROOT, check=True)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as contents:
+        names = {name.partition("/")[2] for name in contents.getnames()}
+    assert {"SECURITY.md", "CODE_OF_CONDUCT.md", ".ci/run", ".ci/gates", "scripts/setup.sh", "tests/lanes.txt"} <= names
+
+
+AUDIT = ROOT / "scripts" / "audit_answer.py"
 UNKNOWN = {"name": "casadi", "skip_reason": "Dependency not found on PyPI"}
 
 
