@@ -16,7 +16,9 @@ def oldest(text: str) -> list[str]:
     floors = {m["name"]: m["version"] for r in requirements if (m := _FLOOR.match(r))}
     missing = [r for r in requirements if not _FLOOR.match(r)]
     if missing:
-        raise ValueError(f"pyproject.toml: {', '.join(missing)}: expected 'name>=version', the oldest version that works")
+        raise ValueError(
+            f"pyproject.toml: {', '.join(missing)}: expected 'name>=version', the oldest version that works"
+        )
     return [f"{name}=={version}" for name, version in floors.items()]
 
 

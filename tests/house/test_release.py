@@ -82,7 +82,9 @@ def test_the_conda_recipe_needs_what_the_package_needs():
 
 def test_a_source_distribution_carries_what_its_checks_need(tmp_path):
     pytest.importorskip("hatchling", reason="the builder is in an environment of its own where it was not asked for")
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)], cwd=ROOT, check=True)
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)], cwd=ROOT, check=True
+    )
     (archive,) = tmp_path.glob("*.tar.gz")
     with tarfile.open(archive) as contents:
         names = {name.partition("/")[2] for name in contents.getnames()}
