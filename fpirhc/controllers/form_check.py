@@ -8,6 +8,7 @@ from fpirhc.controllers.mirror_path import NONE
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import NotSupported
+from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import every
 from fpirhc.task.problem import Problem
 
@@ -26,7 +27,7 @@ def check_outputs(problem: Problem, controller: _Controller) -> None:
         NotSupported: with the reason.
     """
     _check_order_zero(problem)
-    plant, mirror = problem.plant, controller.deformation.mirror
+    plant, mirror = problem.plant, nominal(controller.deformation).mirror
     late = 0.0 if mirror is None else mirror.measurement
     if plant.outputs and (late % 1 > NONE or (plant.step and late)):
         raise NotSupported(
@@ -43,7 +44,7 @@ def check_form(problem: Problem, controller: _Controller) -> None:
         NotSupported: the number of dead times or lags differs from the plant's number of channels; a wrapper changes what a
             model-referenced form inside it compares.
     """
-    deformation, plant = controller.deformation, problem.plant
+    deformation, plant = nominal(controller.deformation), problem.plant
     channels, controlled = deformation.iteration.channels, len(plant.controlled_names)
     if channels is not None and channels != controlled:
         raise NotSupported(

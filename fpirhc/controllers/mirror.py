@@ -50,7 +50,8 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
     if mirror is None:
         return [], []
     estimated = not problem.sensing.estimator.shows_response or mirror.measurement % 1 > NONE
-    path = Path(problem, mirror, estimated or max(every(mirror.cycles)) + mirror.measurement > 0)
+    late = max(every(mirror.cycles)) if mirror.longest is None else mirror.longest
+    path = Path(problem, mirror, estimated or late + mirror.measurement > 0)
     if problem.plant.step is not None:
         return [map_mirror(path)], []
     if not estimated:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -12,6 +11,7 @@ from fpirhc.controllers.exogenous_block import KnownSignals
 from fpirhc.deformation.base import Mirror
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import left_after, left_in_mean, numbers, stays
 from fpirhc.symbolic.layout import Expression, Signal, scalar
 from fpirhc.symbolic.queue import Queue, every
 from fpirhc.task.problem import Problem
@@ -68,14 +68,15 @@ class Path:
     def decays(self) -> tuple[float, ...]:
         """Share of an actuator's distance from its command that is left after one cycle; empty where none lags."""
         taus = every(self.mirror.lag)
-        return tuple(math.exp(-self.problem.period / t) if t else 0.0 for t in taus) if any(taus) else ()
+        lags = not all(stays(t, 0.0) for t in taus)
+        return tuple(left_after(self.problem.period, t) for t in taus) if lags else ()
 
     @property
     def queue(self) -> Queue:
         """Queue of the commands; the newest one is that of the last cycle."""
-        if isinstance(self.mirror.cycles, tuple):
-            return Queue(tuple(c + self.late for c in self.mirror.cycles))
-        return Queue(self.mirror.cycles + self.late)
+        cycles, longest = self.mirror.cycles, self.mirror.longest
+        delays = tuple(c + self.late for c in cycles) if isinstance(cycles, tuple) else cycles + self.late
+        return Queue(delays, longest=None if longest is None else longest + self.late)
 
     @property
     def memory(self) -> tuple[Signal, ...]:
@@ -110,13 +111,8 @@ class Path:
         arrived = self.queue.delayed(column, size)
         if not self.decays:
             return arrived, arrived, remembered
-        decay = ca.DM(self.decays) if len(self.decays) > 1 else self.decays[0]
-        share = ca.DM(_mean_shares(every(self.mirror.lag), self.problem.period))
+        decay = numbers(self.decays, arrived)
+        share = numbers([left_in_mean(self.problem.period, t) for t in every(self.mirror.lag)], arrived)
         away = s.mirror_actuators - arrived
         end = arrived + decay * away
         return end, arrived + share * away, {**remembered, "mirror_actuators_next": end}
-
-
-def _mean_shares(taus: Sequence[float], period: float) -> list[float]:
-    """Mean over one cycle of what is left of an actuator's distance from its command: (tau / T) (1 - e^(-T / tau))."""
-    return [t / period * -math.expm1(-period / t) if t else 0.0 for t in taus]

@@ -42,11 +42,13 @@ class Mirror:
         cycles: dead time of the inputs, control cycles; a tuple gives one per input.
         measurement: dead time of the measurement, cycles.
         lag: time constant of the actuators, s; a tuple gives one per input.
+        longest: longest dead time of the inputs that a run may set, cycles; None: it is not live.
     """
 
     cycles: float | tuple[float, ...] = 0.0
     measurement: float = 0.0
     lag: float | tuple[float, ...] = 0.0
+    longest: float | None = None
 
     @property
     def lags(self) -> bool:

@@ -22,7 +22,7 @@ import math
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
-from fpirhc.symbolic.functions import between, smaller, sqrt
+from fpirhc.symbolic.functions import between, ceil, larger, largest, positive, smaller, sqrt
 from fpirhc.symbolic.queue import MOST, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
@@ -68,22 +68,20 @@ def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: floa
     """Return the pole of a leaky pairing: `pole` itself, or for None the one that follows from the gain and the uncertainty."""
     if pole is not None:
         return pole
-    error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
-    if not error:
-        return 0.0
+    error = default_uncertainty(largest(every(cycles))) if uncertainty is None else uncertainty
     return default_pole(between(abs(gain), 1.0, _LARGEST_PRODUCT), error)
 
 
-def default_uncertainty(cycles: float) -> int:
+def default_uncertainty(cycles: float) -> float:
     """A tenth of the dead time, at least one cycle; 0 without dead time."""
-    return max(1, math.ceil(0.1 * cycles - 1e-9)) if cycles > 0 else 0
+    return positive(cycles) * larger(ceil(0.1 * cycles - 1e-9), 1)
 
 
 def default_pole(product: float, uncertainty: float) -> float:
     """The pole of the theorem and a little more, below one; 0 where the dead time is certain."""
     least = _least_pole(product, uncertainty)
     factor, amount = _BEYOND
-    return smaller(factor * least + amount, 0.5 * (1 + least)) if uncertainty else 0.0
+    return positive(uncertainty) * smaller(factor * least + amount, 0.5 * (1 + least))
 
 
 def check_pole(owner: str, pole: float) -> None:

@@ -22,19 +22,21 @@ f^ reaches the iteration the way f does: after the same dead time, through the s
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing
-from fpirhc.deformation.leaky import check_cycles, check_pole, check_uncertainty, chosen_pole
+from fpirhc.deformation.leaky import check_cycles, check_longest, check_pole, check_uncertainty, chosen_pole
 from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.expression import is_finite
+from fpirhc.symbolic.functions import stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
-from fpirhc.symbolic.queue import Cycles, Queue, every, several
+from fpirhc.symbolic.queue import Cycles, Queue, every, room, several
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class ModelReferenced(Wrapper):
             nearly harmless, too short a lag is not, and no lag is worst.
         uncertainty: by how many cycles the sum of the dead times may be wrong; None: the default of `Increment`.
         pole: of the leak, in [0, 1); None: from the uncertainty, as in `Increment`.
+        longest: longest dead time of the inputs that a run may set, `live=["deformation.cycles"]`; None: twice the dead time.
 
     Raises:
         InvalidValue: a dead time, lag, uncertainty or pole out of range.
@@ -60,8 +63,10 @@ class ModelReferenced(Wrapper):
     lag: float | tuple[float, ...] = 0.0
     uncertainty: int | None = None
     pole: float | None = None
+    longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
+        check_longest("ModelReferenced", self.longest, self.cycles)
         check_cycles("ModelReferenced", self.cycles)
         check_cycles("ModelReferenced", self.measurement, "measurement")
         check_cycles("ModelReferenced", self._delays)
@@ -78,12 +83,17 @@ class ModelReferenced(Wrapper):
     @property
     def mirror(self) -> Mirror:
         """The believed dead times and lag between a command and its response."""
-        return Mirror(self.cycles, self.measurement, self.lag)
+        return Mirror(self.cycles, self.measurement, self.lag, self.longest)
+
+    def opened(self, paths: tuple[str, ...]) -> Self:
+        """Return it with queues of twice the dead time where that becomes live and no longest one is stated."""
+        live = any(path.startswith("cycles") for path in paths)
+        return replace(self, longest=max(1.0, room(max(every(self.cycles))))) if live and self.longest is None else self
 
     @property
     def iteration(self) -> Iteration:
         """That of the map, on deformations that leak and are paired; the desired response is added after it."""
-        longest, several_channels = max(every(self._delays)), isinstance(self.cycles, tuple)
+        longest, several_channels = max(every(nominal(self._delays))), isinstance(self.cycles, tuple)
         return replace(
             self.map.iteration,
             slows_desired=False,
@@ -111,7 +121,7 @@ class ModelReferenced(Wrapper):
         undeformed = request - queue.delayed(past, size)
         next_request, next_memory = self.map.step(request, response, undeformed, discrete(self, memory, size))
         deformation = next_request - undeformed
-        if nominal(pole):
+        if not stays(pole, 0.0):
             deformation = pole * before + (1 - pole) * deformation
         # A deformation that is not a number must not be remembered.
         remembered = ca.if_else(is_finite(deformation), deformation, before)
@@ -125,7 +135,7 @@ class ModelReferenced(Wrapper):
 
     @property
     def _queue(self) -> Queue:
-        return Queue(self._delays)
+        return Queue(self._delays, longest=None if self.longest is None else self.longest + self.measurement)
 
 
 def require_own_requests(owner: str, deformation: Deformation) -> None:

@@ -238,7 +238,7 @@ INLINE int direct(Search* s, const Plan* plan, In data, In lower, In upper) {
     for (j = 0; j < NS; ++j)
       for (m = 0; m < NS; ++m) p[j * NS + m] = 0.5 * (q[j * NS + m] + q[m * NS + j]);
   }
-  arg[0] = wanted, res[0] = s->v;
+  arg[0] = wanted, arg[1] = data, res[0] = s->v;
   return deformed(arg, res, s->iw, s->w, 0);
 }
 

@@ -68,8 +68,8 @@ class FixedPoint(Optimiser):
 
     @property
     def in_data(self) -> tuple[str, ...]:
-        """Tolerance and damping; with limits of states they are in the code."""
-        return "tolerance", "damping"
+        """Tolerance, damping and map; with limits of states they are in the code."""
+        return "tolerance", "damping", "map"
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if plans cannot be rolled out, the tolerance cannot be met, or the cost is not convex where the Hessian needs that.

@@ -99,7 +99,7 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings) -> Driver:
         **stage,
         "hessian": hessian_stage(ocp, settings.hessian),
         "end": hessian_end(ocp),
-        "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
+        "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages, ocp),
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]

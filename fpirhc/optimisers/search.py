@@ -13,10 +13,10 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import backward_sweep, in_reverse
-from fpirhc.horizon.stage_data import STEEPEST
+from fpirhc.horizon.stage_data import STEEPEST, settings_in
 from fpirhc.optimisers.base import clip
 from fpirhc.symbolic.expression import is_finite
-from fpirhc.symbolic.live import Number
+from fpirhc.symbolic.live import PREFIX, Number
 
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is required
 ARMIJO = 1e-2  # share of the first-order decrease that is required of a short step
@@ -169,15 +169,23 @@ def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, dam
     bounds = ca.repmat(lower, 1, n), ca.repmat(upper, 1, n)
     damped = [ocp.number_in(damping, data) / ocp.scale_in(data)] if ocp.settings else []
     move, gains = backward_sweep(ocp, damping)(*stacked, *hessians, inputs, *bounds, value, slope, *damped)
-    results = [ca.reshape(deformed_move(map, nu * n)(ca.vec(move)), nu, n), gains]
+    deform = deformed_move(map, nu * n, ocp)
+    deformed = deform(*(ca.vec(move), data[:, 0])[: deform.n_in()])
+    results = [ca.reshape(deformed, nu, n), gains]
     return ca.Function("fpirhc_direction", [inputs, states, *stacked, costates, data, lower, upper], results)
 
 
-def deformed_move(map: Deformation, size: int) -> ca.Function:
-    """Function v -> G(0, -v, 0): the deformed feedforward."""
+def deformed_move(map: Deformation, size: int, ocp: OptimalControl | None = None) -> ca.Function:
+    """Function v -> G(0, -v, 0): the deformed feedforward; (v, data of a stage) where settings of the map are live."""
     column = ca.SX.sym("v", size)
     deformed, _ = map.step(ca.SX.zeros(size), -column, ca.SX.zeros(size), {})
-    return ca.Function("fpirhc_deformed_move", [column], [ca.densify(deformed)])
+    symbols = settings_in([deformed], column)
+    if not symbols or ocp is None:
+        return ca.Function("fpirhc_deformed_move", [column], [ca.densify(deformed)])
+    theta, first = ca.SX.sym("theta", ocp.data.size), ocp.data.slice("settings").start
+    entries = [theta[first + ocp.settings.index(s.name().removeprefix(PREFIX))] for s in symbols]
+    (deformed,) = ca.substitute([deformed], symbols, entries)
+    return ca.Function("fpirhc_deformed_move", [column, theta], [ca.densify(deformed)])
 
 
 def _stage_shapes(ns: int, nu: int) -> tuple[tuple[int, int], ...]:

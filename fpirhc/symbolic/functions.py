@@ -7,7 +7,8 @@ functions here: a power is a product, because the pow of Python and that of CasA
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
 from typing import TypeVar, cast
 
 import casadi as ca
@@ -17,6 +18,7 @@ from fpirhc.symbolic.live import LiveNumber, expressed, is_live
 
 SMOOTHING = 1e-6  # half width, in the unit of the argument, within which the power is rounded off around zero
 T = TypeVar("T")
+_Two = Callable[..., object]
 
 
 def signed_power(d: Expression, exponent: Expression | float) -> Expression:
@@ -40,6 +42,11 @@ def tanh(x: float) -> float:
 def atanh(x: float) -> float:
     """Return atanh of a number, live or not."""
     return x.called(math.atanh, ca.atanh) if isinstance(x, LiveNumber) else math.atanh(x)
+
+
+def asin(x: float) -> float:
+    """Return asin of a number, live or not."""
+    return x.called(math.asin, ca.asin) if isinstance(x, LiveNumber) else math.asin(x)
 
 
 def exp(x: float) -> float:
@@ -84,11 +91,46 @@ def between(x: float, low: float, high: float) -> float:
 
 def smaller(x: float, y: float) -> float:
     """Return the smaller of two numbers, live or not."""
-    if not isinstance(x, LiveNumber) and not isinstance(y, LiveNumber):
-        return min(x, y)
-    paths = tuple(dict.fromkeys(path for one in (x, y) if isinstance(one, LiveNumber) for path in one.paths))
-    both = lambda kind: tuple(one.of(kind) if isinstance(one, LiveNumber) else one for one in (x, y))  # noqa: E731
-    return LiveNumber(paths, lambda kind: min(both(kind)) if kind is float else ca.fmin(*both(kind)))
+    return _of_both(x, y, min, ca.fmin)
+
+
+def larger(x: float, y: float) -> float:
+    """Return the larger of two numbers, live or not."""
+    return _of_both(x, y, max, ca.fmax)
+
+
+def largest(values: Iterable[float]) -> float:
+    """Return the largest of some numbers, live or not."""
+    return reduce(larger, values)
+
+
+def positive(x: float) -> float:
+    """Return 1 for a positive number, live or not, and 0 for another one."""
+    return x.called(lambda v: float(v > 0), lambda v: v > 0) if isinstance(x, LiveNumber) else float(x > 0)
+
+
+def stays(x: float, value: float) -> bool:
+    """Return whether a number is a certain one in every run of the loop; a live one may become another."""
+    return not isinstance(x, LiveNumber) and x == value
+
+
+def left_after(period: float, time: float) -> float:
+    """Return e^(-T / tau), the share of a distance that is left after a period; 0 for the time constant 0, which may be live."""
+    if isinstance(time, LiveNumber):
+        return time.called(
+            lambda t: left_after(period, t), lambda t: ca.if_else(t == 0, 0, ca.exp(-period / ca.if_else(t == 0, 1, t)))
+        )
+    return math.exp(-period / time) if time else 0.0
+
+
+def left_in_mean(period: float, time: float) -> float:
+    """Return the mean of what is left over a period, (tau / T) (1 - e^(-T / tau)); 0 for tau = 0, which may be live."""
+    if isinstance(time, LiveNumber):
+        return time.called(
+            lambda t: left_in_mean(period, t),
+            lambda t: ca.if_else(t == 0, 0, t / period * -ca.expm1(-period / ca.if_else(t == 0, 1, t))),
+        )
+    return time / period * -math.expm1(-period / time) if time else 0.0
 
 
 def sqrt(x: float) -> float:
@@ -104,6 +146,14 @@ def ceil(x: float) -> float:
 def rounded(x: float) -> float:
     """Return the nearest whole number to a number, live or not; the even one of two."""
     return x.called(round, _nearest_even) if isinstance(x, LiveNumber) else round(x)
+
+
+def _of_both(x: float, y: float, number: _Two, expression: _Two) -> float:
+    if not isinstance(x, LiveNumber) and not isinstance(y, LiveNumber):
+        return cast(float, number(x, y))
+    paths = tuple(dict.fromkeys(path for one in (x, y) if isinstance(one, LiveNumber) for path in one.paths))
+    both = lambda kind: tuple(one.of(kind) if isinstance(one, LiveNumber) else one for one in (x, y))  # noqa: E731
+    return LiveNumber(paths, lambda kind: (number if kind is float else expression)(*both(kind)))
 
 
 def _nearest_even(x: Expression) -> Expression:

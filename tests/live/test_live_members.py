@@ -112,13 +112,25 @@ def test_numbers_that_follow_from_settings_follow():
         (fp.ModelReferenced(SIGMOID, cycles=2.5), ["map.gain"]),
         (fp.ModelReferenced(fp.Affine(gain=-2.6), cycles=3, uncertainty=2), ["map.gain"]),
         (fp.ModelReferenced(SIGMOID, cycles=2.5, pole=0.4), ["pole"]),
+        (fp.ModelReferenced(SIGMOID, cycles=(3.0, 2.0), lag=(0.02, 0.0)), ["cycles.0", "cycles.1", "lag.0"]),
+        (fp.ModelReferenced(SIGMOID, cycles=20.0, lag=0.02), ["cycles", "lag", "map.gain"]),
     ],
-    ids=["Increment", "Increment of a pole", "ModelReferenced", "gain above one", "ModelReferenced of a pole"],
+    ids=["Increment", "of a pole", "ModelReferenced", "gain above one", "with a pole", "dead times", "lag"],
 )
 def test_the_leak_follows_the_gain(deformation, paths):
-    """The pole of a leaky pairing is chosen from the gain, or given: both may change in a run, and the pole with them."""
+    """The pole of a leaky pairing is chosen from gain and dead time, or given: all may change in a run, and the pole with them."""
     controller = fp.ComputedTorque(TRACKING, deformation)
     tried = check_live(two_masses(), controller, paths=[f"deformation.{path}" for path in paths], cycles=40)
+    assert all(t.factor for t in tried), tried
+
+
+@pytest.mark.parametrize("compiled", [False, True], ids=["VM", "C"])
+def test_the_map_of_a_plan_is_live(compiled):
+    """Gain, scale and shift of the deformation that makes the next plan, in both forms of the solver."""
+    optimiser = fp.FixedPoint(iterations=2, tolerance=1e-3, map=fp.Sigmoid(gain=-1.5, scale=30.0))
+    controller = fp.RecedingHorizon(optimiser, cost=fp.Quadratic(**WEIGHTS))
+    paths = [f"optimiser.map.{name}" for name in ("gain", "scale", "shift")]
+    tried = check_live(two_masses(), controller, paths=paths, cycles=30, compiled=compiled)
     assert all(t.factor for t in tried), tried
 
 

@@ -34,8 +34,8 @@ from fpirhc.deformation.base import Deformation, Iteration, Pairing
 from fpirhc.deformation.leaky import check_cycles, check_longest, check_pole, check_uncertainty, chosen_pole
 from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.functions import largest, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import MOST, Cycles, Queue, every, room, several
 
 __all__ = ["MOST", "Increment", "Paired"]
@@ -68,14 +68,14 @@ class _Queued(Wrapper):
     @property
     def iteration(self) -> Iteration:
         """That of the map, on the pairs of the believed dead time, the longest of several."""
-        pairing = Pairing(max(every(self.cycles)), channels=several(self.cycles))
+        pairing = Pairing(largest(every(self.cycles)), channels=several(self.cycles))
         channels = len(every(self.cycles)) if several(self.cycles) else self.map.iteration.channels
         return replace(self.map.iteration, pairing=pairing, channels=channels)
 
     def opened(self, paths: tuple[str, ...]) -> Self:
         """Return it with queues of twice the dead time where that becomes live and no longest one is stated."""
         live = any(path.startswith("cycles") for path in paths)
-        return replace(self, longest=room(max(every(self.cycles)))) if live and self.longest is None else self
+        return replace(self, longest=max(1.0, room(max(every(self.cycles))))) if live and self.longest is None else self
 
     @property
     @abstractmethod
@@ -158,7 +158,7 @@ class Paired(_Queued):
     def iteration(self) -> Iteration:
         """With the width of the mean."""
         return replace(
-            super().iteration, pairing=Pairing(max(every(self.cycles)), self.uncertainty, several(self.cycles))
+            super().iteration, pairing=Pairing(largest(every(self.cycles)), self.uncertainty, several(self.cycles))
         )
 
     @property
@@ -220,7 +220,7 @@ class Increment(_Queued):
         undeformed, request = self._queue.delayed(past.desired, size), self._queue.delayed(past.requests, size)
         next_request, next_memory = self.map.step(request, response, undeformed, memory)
         deformation = next_request - undeformed
-        if nominal(pole):
+        if not stays(pole, 0.0):
             deformation = pole * (past.requests[:size] - past.desired[:size]) + (1 - pole) * deformation
         return desired + deformation, next_memory
 

@@ -33,6 +33,7 @@ import casadi as ca
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, discrete, growing_in_a_row, returning_in_a_row
 from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.functions import asin, power, sqrt
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _RATE = 0.02  # gamma
@@ -103,7 +104,7 @@ class Tuned(Wrapper):
 
     def _tuned(self, factor: Expression, error: Expression, before: Expression) -> Expression:
         """The factor after one step towards the target."""
-        product, target_sign = ca.dot(error, before), expected_sign(self.target, error.numel())
+        product, target_sign = ca.dot(error, before), _mean_sign(self.target, error.numel())
         # Without a sign (a zero error, or one that is not a number) the factor stays.
         rise = ca.if_else(product > 0, 1 - target_sign, ca.if_else(product < 0, -1 - target_sign, 0))
         floor = ca.if_else(factor < 1, _SMALLEST, 1)
@@ -144,13 +145,19 @@ def expected_sign(product: float, components: int) -> float:
         raise InvalidValue(
             f"expected_sign(product={product!r}, components={components!r}): expected a product from 0 to 2, at least one component"
         )
+    return _mean_sign(product, components)
+
+
+def _mean_sign(product: float, components: int) -> float:
+    """The formula of `expected_sign`; the product may be live."""
     correlation = -0.5 * product
     # Integration by parts: the mean for m + 2 components is the mean for m plus one term.
     size = 1 if components % 2 else 2
-    mean = 2 / math.pi * math.asin(correlation) if size == 1 else correlation
+    mean = 2 / math.pi * asin(correlation) if size == 1 else correlation
     whole = math.pi / 2 if size == 1 else 1.0  # int_0^1 (1 - x^2)^(m/2-1) dx
     while size < components:
-        mean += correlation * (1 - correlation**2) ** (size / 2) / (size * whole)
+        spread = power(1 - correlation * correlation, size // 2)
+        mean += correlation * (spread * sqrt(1 - correlation * correlation) if size % 2 else spread) / (size * whole)
         whole *= size / (size + 1)
         size += 2
     return mean
