@@ -19,8 +19,7 @@ from .controllers.slots.chosen_schedules import ByError, ByLookAhead
 from .controllers.slots.schedules import FixedSchedule, Periodic
 from .controllers.slots.slot import Slot
 from .controllers.slots.slotted import Slotted
-from .controllers.target_pairing import ThroughModel
-from .controllers.wrappers.cascade import Cascade
+from .controllers.wrappers.cascade import Cascade, ThroughModel
 from .controllers.wrappers.estimating import Estimating
 from .controllers.wrappers.exact_model import ExactModel
 from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted

@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.controllers.slots.floquet import floquet_radius
+from fpirhc.controllers.slots.slotted import floquet_radius
 
 task = fp.load_problem("crane_slots")
 controller = task.controllers["slots+FPI"]

@@ -15,8 +15,8 @@ from plants import pendulum
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.slots.floquet import floquet_radius
 from fpirhc.controllers.slots.schedules import Schedule
+from fpirhc.controllers.slots.slotted import floquet_radius
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.plant.relative_order import output_chain
 from fpirhc.status import Status

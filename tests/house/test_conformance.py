@@ -33,7 +33,7 @@ from fpirhc.controllers.contract import Planner
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.members import FAMILIES, Example, examples, member_classes
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.plant.equations import Equations
+from fpirhc.plant.plant import Equations
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Layout, Signal, scalar
