@@ -79,21 +79,34 @@ class LinearLoop:
         )
         return (neutral & no_error) | (lasting & nothing)
 
-    def carried(self, deviation: np.ndarray, cycles: int, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Return states (cycles, nx, ...) and arriving commands (cycles, nu, ...) after a deviation z (n, ...).
-
-        Args:
-            deviation: at the first of them.
-            cycles: number of cycles.
-            first: number of the cycle in its period at which the deviation is.
-        """
+    def carried(self, deviation: np.ndarray, cycles: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return states (cycles, nx, ...) and arriving commands (cycles, nu, ...) after a deviation z (n, ...) at the first cycle."""
         z, states, commands = deviation, [], []
         for k in range(cycles):
-            one = self.cycles[(first + k) % len(self.cycles)]
+            one = self.cycles[k % len(self.cycles)]
             states.append(one.state @ z)
             commands.append(one.arriving @ z)
             z = one.dynamics @ z
         return np.array(states), np.array(commands)
+
+    def impulses(self, entering: np.ndarray, cycles: int) -> np.ndarray:
+        """Return the states (count, cycles, nx, m) that follow when commands (nu, m) enter in one of the `count` cycles of a period."""
+        count, width = len(self.cycles), entering.shape[1]
+        shown, own = self._shown, np.zeros((count, count, len(self.placed.T), width))
+        after = []  # of each cycle of entry: z at the next period's first cycle
+        for k, one in enumerate(self.cycles):
+            z = one.entry @ entering
+            for place in range(k + 1, count):
+                own[k, place] = self.cycles[place].state @ z
+                z = self.cycles[place].dynamics @ z
+            after.append(z)
+        z, periods = np.hstack(after), [own]
+        for _ in range(-(-cycles // count)):
+            states = (shown @ z).reshape(count, -1, count, width)
+            periods.append(np.moveaxis(states, 2, 0))
+            z = self.dynamics @ z
+        whole = np.concatenate(periods, axis=1)
+        return np.stack([whole[k, k + 1 : k + 1 + cycles] for k in range(count)])
 
     def spread(self, covariance: np.ndarray) -> np.ndarray:
         """Return the covariance (n, n) of z at the first cycle where w is white noise with a covariance (nu, nu) in every cycle.
@@ -104,6 +117,15 @@ class LinearLoop:
         for one in self.cycles:
             added = one.dynamics @ added @ one.dynamics.T + one.entry @ covariance @ one.entry.T
         return np.asarray(scipy.linalg.solve_discrete_lyapunov(self.dynamics, added))
+
+    @property
+    def _shown(self) -> np.ndarray:
+        """The states of a whole period, one cycle after the other (count nx, n), that z at its first cycle leads to."""
+        rows, moved = [], np.eye(len(self.dynamics))
+        for one in self.cycles:
+            rows.append(one.state @ moved)
+            moved = one.dynamics @ moved
+        return np.vstack(rows)
 
     @property
     def _everything(self) -> np.ndarray:
