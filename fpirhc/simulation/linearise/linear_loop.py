@@ -80,7 +80,7 @@ class LinearLoop:
         return (neutral & no_error) | (lasting & nothing)
 
     def carried(self, deviation: np.ndarray, cycles: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return states (cycles, nx, ...) and arriving commands (cycles, nu, ...) after a deviation z (n, ...) at the first cycle."""
+        """Return states (cycles, nx, ...) and arriving commands (cycles, nu, ...) after a deviation z (n, ...) at the start."""
         z, states, commands = deviation, [], []
         for k in range(cycles):
             one = self.cycles[k % len(self.cycles)]
@@ -90,7 +90,7 @@ class LinearLoop:
         return np.array(states), np.array(commands)
 
     def impulses(self, entering: np.ndarray, cycles: int) -> np.ndarray:
-        """Return the states (count, cycles, nx, m) that follow when commands (nu, m) enter in one of the `count` cycles of a period."""
+        """Return the states (count, cycles, nx, m) after commands (nu, m) that enter in one of the `count` cycles."""
         count, width = len(self.cycles), entering.shape[1]
         shown, own = self._shown, np.zeros((count, count, len(self.placed.T), width))
         after = []  # of each cycle of entry: z at the next period's first cycle
