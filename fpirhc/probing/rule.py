@@ -8,7 +8,7 @@ stands for everything slow. Of the safe settings within a tenth of the least err
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -35,7 +35,7 @@ from fpirhc.task.problem import Problem
 SHARES = (0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
 _RINGING = (4.0, 1.0)  # g / (1 - pole) of the filters
 _FIRST, _LONG = 0.2, 0.2  # shares with which forms are compared, and of the candidate with a long lag
-_FORMS = 3  # that are searched in full
+_FORMS = 2  # model-referenced ones that are searched in full, beside the plain one
 _LARGEST_PRODUCT = 1.99
 _DRAWS, _QUANTILE = 400, 0.025
 _DRAWN = 1  # of the draws, at every corner
@@ -182,8 +182,11 @@ class Rule:
 
     def shortlist(self) -> dict[str, Predicted]:
         """Return the candidates by name, cautious first; none where nothing safe makes the error clearly less."""
-        forms = sorted((self._predicted(form) for form in self._forms()), key=lambda one: one.error)[:_FORMS]
-        found = [self._predicted(s) for one in forms for s in _around(one.setting)]
+        forms = sorted((self._predicted(form) for form in self._forms()), key=lambda one: one.error)
+        # A small gain delays the desired response in the plain form: it is searched whatever its error is there.
+        mirrored, plain = ([one for one in forms if one.setting.referenced is kind] for kind in (True, False))
+        searched = mirrored[:_FORMS] + plain[:1]
+        found = [self._predicted(s) for one in searched for s in _around(one.setting)]
         calm = sorted((one for one in found if one.steps <= 1 and one.error < _WORTH), key=lambda one: one.error)
         safe: list[Predicted] = []
         for one in calm:
@@ -192,9 +195,12 @@ class Rule:
             if self._safe(one):
                 safe.append(one)
         chosen = {
-            "cautious": next((one for one in calm if self._safe(one) and self._safe(one, rough=True)), None),
-            "mirrored": next(
-                (one for one in calm if one.setting.lags == tuple(self.estimates.lag[2]) and self._safe(one)), None
+            "cautious": next(
+                (one for one in _one_filter_each(calm) if self._safe(one, rough=True) and self._safe(one)), None
+            ),
+            "mirrored": next(filter(self._safe, _one_filter_each(filter(self._mirrors, calm))), None),
+            "plain": next(
+                filter(self._safe, _one_filter_each(one for one in calm if not one.setting.referenced)), None
             ),
             "long lag": self._long(),
             "bold": min(safe, key=lambda one: one.steps, default=None),
@@ -204,6 +210,10 @@ class Rule:
             if candidate is not None and all(candidate.deformation != one.deformation for one in kept.values()):
                 kept[name] = candidate
         return kept
+
+    def _mirrors(self, one: Predicted) -> bool:
+        """Whether the model is late and lags as the plant at most does."""
+        return one.setting.referenced and one.setting.lags == tuple(self.estimates.lag[2])
 
     def _forms(self) -> Iterator[Setting]:
         """Forms, dead times and lags, with the share in which they are compared."""
@@ -275,8 +285,8 @@ class Rule:
     def _near(self) -> tuple[tuple[Corner, tuple[float, ...]], ...]:
         """Dead times and lags of the corners, and factors of the gains there: the gain margin is that of a review."""
         dead, lag = self.estimates.dead, self.estimates.lag
-        corners = {Corner(tuple(dead[i]), tuple(lag[j])) for i in (0, 2) for j in (0, 2)}
-        return (Corner(tuple(dead[2] + 1), tuple(lag[1])), (1.0,)), *((one, (1.4, 1.0, 0.6)) for one in corners)
+        corners = dict.fromkeys(Corner(tuple(dead[i]), tuple(lag[j])) for i in (2, 0) for j in (0, 2))
+        return (Corner(tuple(dead[2] + 1), tuple(lag[1])), (1.0,)), *((one, (1.4, 0.6)) for one in corners)
 
     @cached_property
     def _far(self) -> tuple[tuple[Corner, tuple[float, ...]], ...]:
@@ -343,6 +353,16 @@ def _around(form: Setting) -> Iterator[Setting]:
     for share in SHARES:
         for pole in {0.0, *(max(1 - share / ringing, 0.0) for ringing in _RINGING)}:
             yield replace(form, share=share, pole=pole)
+
+
+def _one_filter_each(found: Iterable[Predicted]) -> Iterator[Predicted]:
+    """The first of those that differ in their filter alone: the best one, where they are in the order of their errors."""
+    passed = set()
+    for one in found:
+        form = replace(one.setting, pole=0.0)
+        if form not in passed:
+            passed.add(form)
+            yield one
 
 
 def _steps(run: Run) -> np.ndarray:

@@ -39,6 +39,7 @@ class Answer(FoundByName):
     def __post_init__(self) -> None:
         object.__setattr__(self, "evidence", numbers_written_out(self.evidence))
         object.__setattr__(self, "change", numbers_written_out(self.change))
+        super().__post_init__()
 
     @property
     def advice(self) -> str:

@@ -91,6 +91,27 @@ def test_adaptation_pays_behind_dry_friction_and_a_tool_that_nobody_weighed():
         assert error["adapted"][joint] < 0.1 * error["alone"][joint]
 
 
+def test_a_probe_finds_the_coupling_and_a_setting_at_least_as_good_as_one_by_hand():
+    """The tool makes the forearm's inertia many times larger, so its gain is far below 1; nothing is late and nothing lags."""
+    task, law = problem(REAL, 3.0), fp.ComputedTorque(fp.Exponential(rate=8.0))
+    found = fp.probe(task, law, cycles=300, seed=3)
+    assert [one.high for one in found.dead_time.values()] == [0, 0]
+    assert max(one.high for one in found.lag.values()) < 0.5 * PERIOD
+    assert found.gain["elbow"]["elbow"].high < 0.2 < 0.7 < found.gain["shoulder"]["shoulder"].low
+    assert found.deformation is not None
+    errors = []
+    for deformation in (
+        found.deformation,
+        fp.Affine(gain=-0.6),
+        fp.Affine(gain=-1.6),
+        fp.ModelReferenced(fp.Affine(gain=-1.6)),
+    ):
+        run = fp.simulate(task, law.with_deformation(deformation), seed=0, compiled=False)
+        errors.append([fp.measure(task, run).rms_error[joint] for joint in MODEL.coordinates])
+    for joint in (0, 1):
+        assert errors[0][joint] <= 1.2 * min(one[joint] for one in errors[1:])
+
+
 def test_names_may_differ():
     turned = fp.Plant(
         {"a": "rad", "b": "rad"},
