@@ -90,7 +90,9 @@ def _impulses(loop: LinearLoop, gain: np.ndarray, cycles: int) -> np.ndarray:
     """|h_j| (j, nx, n): the motion of the states after a unit of the responses over one cycle."""
     if loop.radius >= 1:
         raise NotSupported("no tube: the loop does not converge even with the right model")
-    sizes = np.abs(loop.impulses(np.linalg.inv(gain), cycles)).max(axis=0)  # of all cycles of a period in which the unit may come
+    sizes = np.abs(loop.impulses(np.linalg.inv(gain), cycles)).max(
+        axis=0
+    )  # of all cycles of a period in which the unit may come
     lasting = sizes.max(axis=(1, 2)) >= _GONE * sizes.max()
     return np.asarray(sizes[: int(np.flatnonzero(lasting).max(initial=0)) + len(loop.cycles)])
 
