@@ -7,7 +7,6 @@ held since t_{k-1}; the controller turns them into a command; the plant moves on
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -21,16 +20,8 @@ from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.response_jumps import response_jumps
 from fpirhc.controllers.sensing_chain import compose_seeing, seeing_blocks
 from fpirhc.plant.motion import time_signal
-from fpirhc.plant.plant import Plant
-from fpirhc.simulation.exogenous_blocks import outside_blocks, real_name
-from fpirhc.simulation.path import (
-    SENT,
-    acting_blocks,
-    disturbance_signals,
-    foreign_signals,
-    motion_delays,
-    sensing_blocks,
-)
+from fpirhc.simulation.exogenous_blocks import outside_blocks
+from fpirhc.simulation.path import acting_blocks, disturbance_signals, moving, sensing_blocks
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -59,7 +50,8 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     ready = checked(problem, controller)
     task = nominal(problem)
     # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
-    plausible = plausible_range(task) if problem.foreign is not None else {}
+    mover = moving(problem)
+    plausible = plausible_range(task) if mover.doubted else {}
     inner, gap = across_gaps(compose_seeing(problem, ready)), gap_of(task, BRIDGED)
     acting = Gate(task, inner, trusted=("time", "memory"), plausible=plausible, gap=gap)
     disturbed = disturbance_signals(problem)
@@ -67,13 +59,12 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(problem, disturbed)
-    jumps = response_jumps(task, acting.reads) if problem.foreign is not None else None
+    jumps = response_jumps(task, acting.reads) if mover.doubted else None
     gated = [acting.block()] if jumps is None else jumps.around(acting.block())
     around = [clock, *outside_blocks(problem, ready), *seeing, *gated, *judging, *actuating]
     constants = live.held(around) if live is not None else []
-    reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *foreign_signals(problem)))
-    sent = () if problem.foreign is None else (SENT,)
-    return compose("loop", reads, around, [*_plant_delays(problem, ready), *constants], outputs=sent)
+    reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *mover.reads))
+    return compose("loop", reads, around, [*_plant_delays(problem, ready), *constants], outputs=mover.sent)
 
 
 def start_memory(
@@ -113,17 +104,13 @@ def _first_estimates(loop: Composite, problem: Problem, starts: Mapping[str, np.
 
 
 def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
-    plant, model = problem.real_plant, controller.plant_model(problem)
-    believed = _held("parameters", model.plant, model.parameters(model.plant))
-    if problem.foreign is not None:
-        return [believed]
-    exact = replace(_held("_exact", plant, problem.real_parameters), source=real_name(problem))
-    return [*motion_delays(problem), believed, exact]
-
-
-def _held(name: str, plant: Plant, values: np.ndarray) -> Delay:
-    """Parameters that stay what they are during a run."""
-    return Delay(Signal(name, plant.parameter.elements, plant.parameter.units, tuple(map(float, values))), name)
+    """What moves carries from cycle to cycle, and the parameters that the model has during a run."""
+    model = controller.plant_model(problem)
+    values, parameter = tuple(map(float, model.parameters(model.plant))), model.plant.parameter
+    return [
+        *moving(problem).delays,
+        Delay(Signal("parameters", parameter.elements, parameter.units, values), "parameters"),
+    ]
 
 
 def _clock_block(time: Signal, period: float) -> Block:

@@ -7,9 +7,10 @@ What moves is a reality, the model itself with its exact parameters, or a body o
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -27,6 +28,7 @@ from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.dead_time import MEASUREMENT, delay_block
+from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, logged_signal
 from fpirhc.task.problem import Problem
 
@@ -41,7 +43,7 @@ def sensing_blocks(problem: Problem, other: Response | None, *, predicts: bool) 
     """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
     plant, response = problem.plant, other or true_response(problem)
     if problem.sees_plant:
-        sense = [_sense_block(problem, measured_signals(plant), response)]
+        sense = [moving(problem).sense(measured_signals(plant), response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
     true, shown = _true_blocks(problem, response)
     if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
@@ -52,43 +54,19 @@ def sensing_blocks(problem: Problem, other: Response | None, *, predicts: bool) 
 def acting_blocks(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
     if not set(problem.plant.inputs) & set(problem.dead_time.queued):
-        return [_advance_block(problem, disturbed, problem.plant.input)]
+        return [moving(problem).advance(disturbed, problem.plant.input)]
     plant, waits = problem.plant, [problem.dead_time.wait(name, problem.period) for name in problem.plant.inputs]
     arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
     return [
         delay_block("send_command", problem.plant.input, arriving, waits),
-        _advance_block(problem, disturbed, arriving),
+        moving(problem).advance(disturbed, arriving),
     ]
-
-
-def true_motion(problem: Problem) -> tuple[Signal, ...]:
-    """Return the signals of state and outputs, with the states that what moves has; without any, no state."""
-    plant, foreign = problem.plant, problem.foreign
-    state, *outputs = measured_signals(plant)
-    shown = problem.truth.shown(plant)
-    if foreign is not None and plant.outputs:
-        shown = tuple(e for e in state.elements if e in foreign.measures)
-    if shown == state.elements:
-        return (state, *outputs)
-    units = dict(zip(state.elements, state.entry_units, strict=True))
-    return (*([replace(state, elements=shown, units=tuple(units[e] for e in shown))] if shown else []), *outputs)
 
 
 def true_response(problem: Problem) -> Response:
     """The response of what the controller controls, of the plant that moves."""
     plant = problem.plant
     return Response(plant.response_signal("realised"), problem.truth.function(response_names(plant)))
-
-
-def motion_delays(problem: Problem) -> list[Delay]:
-    """What a plant that moves carries from cycle to cycle: state, acting input, and forcing."""
-    plant, start = problem.real_plant, tuple(map(float, problem.real_start))
-    acting = tuple(map(float, problem.inputs_before))
-    return [
-        Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
-        Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
-        Delay(_forcing(plant, "_forcing_before"), "_forcing"),
-    ]
 
 
 def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
@@ -98,22 +76,210 @@ def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
     return (disturbance_signal(problem),)
 
 
-def foreign_signals(problem: Problem) -> tuple[Signal, ...]:
-    """Return the signals that a loop reads from a foreign reality: its answer, and whether this is the last good one held."""
-    if problem.foreign is None:
+class Mover(ABC):
+    """What a run moves, as the loop meets it."""
+
+    doubted: ClassVar[bool]
+    """Whether what it shows may be wrong, so that the loop looks for what is not plausible."""
+    sent: ClassVar[tuple[str, ...]]
+    """Signals that the step returns to it."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+
+    @property
+    @abstractmethod
+    def states(self) -> tuple[str, ...]:
+        """Elements of the model's state that it has."""
+
+    @property
+    def motion(self) -> tuple[Signal, ...]:
+        """Signals of state and outputs, with the states that it has; without any, no state."""
+        state, *outputs = measured_signals(self.problem.plant)
+        shown = self.states
+        if shown == state.elements:
+            return (state, *outputs)
+        units = dict(zip(state.elements, state.entry_units, strict=True))
+        own = [replace(state, elements=shown, units=tuple(units[e] for e in shown))] if shown else []
+        return (*own, *outputs)
+
+    @property
+    @abstractmethod
+    def shows_truth(self) -> bool:
+        """Whether it shows everything that is judged: the model's whole state or outputs, and their responses."""
+
+    @property
+    @abstractmethod
+    def reads(self) -> tuple[Signal, ...]:
+        """Signals that the step reads from it."""
+
+    @property
+    @abstractmethod
+    def delays(self) -> list[Delay]:
+        """What it carries from cycle to cycle inside the loop."""
+
+    @abstractmethod
+    def sense(self, motion: Sequence[Signal], response: Response) -> Block:
+        """Block -> its state and outputs, and its response just before this cycle's command."""
+
+    @abstractmethod
+    def advance(self, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
+        """Block of its motion over one period with the arriving command held."""
+
+
+def moving(problem: Problem) -> Mover:
+    """Return what the run of a problem moves."""
+    return Equations(problem) if problem.foreign is None else Body(problem, problem.foreign)
+
+
+class Equations(Mover):
+    """A plant of equations inside the loop: the reality, or the model itself with its exact parameters."""
+
+    doubted, sent = False, ()
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Those of the same names, or seen in their place."""
+        return self.problem.truth.shown(self.problem.plant)
+
+    @property
+    def shows_truth(self) -> bool:
+        """Everything that is judged."""
+        return True
+
+    @property
+    def reads(self) -> tuple[Signal, ...]:
+        """Nothing: it is a part of the step."""
         return ()
-    measures = problem.foreign.measures
-    return vector(_RAW, tuple(measures), tuple(measures.values())), scalar(_HELD)
+
+    @property
+    def delays(self) -> list[Delay]:
+        """State, acting input and forcing of the last cycle, and the exact parameters."""
+        problem, plant = self.problem, self.problem.real_plant
+        start, acting = (tuple(map(float, v)) for v in (problem.real_start, problem.inputs_before))
+        exact = tuple(map(float, problem.real_parameters))
+        return [
+            Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
+            Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
+            Delay(_forcing(plant, "_forcing_before"), "_forcing"),
+            Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), real_name(problem)),
+        ]
+
+    def sense(self, motion: Sequence[Signal], response: Response) -> Block:
+        """Block -> state and outputs, and the response just before this cycle's command; with a reality also its state.
+
+        The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
+        Runge-Kutta evaluation of this cycle. Outputs are those of the moving plant, with its exact parameters.
+        """
+        problem, truth = self.problem, self.problem.truth
+        reads, writes = _real_signals(problem), (*motion, response.signal)
+        own = () if problem.reality is None else (like(truth.plant.state, REALITY_STATE),)
+        shown = {signal.name: truth.function(signal.elements) for signal in motion}
+        shifts = bool(problem.disturbed_outputs)
+        if shifts:
+            reads, writes = (*reads, disturbance_signal(problem)), (*writes, logged_signal(problem))
+
+        def step(s: Signals) -> dict[str, Expression]:
+            now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
+            values = {response.signal.name: response.function(*now)}
+            values |= {name: function(*now) for name, function in shown.items()}
+            if shifts:
+                below, answered = added(problem, s.disturbance)
+                sums = {response.signal.name: answered, motion[-1].name: below}
+                values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
+            return {**values, **{signal.name: s._state_before for signal in own}}
+
+        return Block("sense", Layout(reads), Layout((*writes, *own)), step)
+
+    def advance(self, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
+        """Block of the plant that moves over one period with the arriving command held."""
+        problem, plant = self.problem, self.problem.real_plant
+        advance = problem.real_integrator.step(plant, problem.period)
+        state, exact = like(plant.state, "_state_before"), like(plant.parameter, real_name(problem))
+        reads = (state, arriving, exact, *disturbed)
+        writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
+
+        def step(s: Signals) -> dict[str, Expression]:
+            u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
+            if disturbed:
+                adds = dict(zip(disturbed[0].elements, ca.vertsplit(s.disturbance), strict=True))
+                u = u + ca.vertcat(*(adds.get(name, 0) for name in plant.inputs))
+                w = ca.vertcat(*(adds.get(name, 0) for name in plant.names))
+            return {"_state_after": advance(s._state_before, u, getattr(s, exact.name), w), "_acting": u, "_forcing": w}
+
+        return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)
+
+
+class Body(Mover):
+    """A body outside, which is sent inputs and answers with measurements."""
+
+    doubted, sent = True, (SENT,)
+
+    def __init__(self, problem: Problem, body: ExternalPlant) -> None:
+        super().__init__(problem)
+        self.measures = body.measures
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Those that it measures beside outputs; of a plant without outputs the sensors say what is needed."""
+        state, *outputs = measured_signals(self.problem.plant)
+        return tuple(e for e in state.elements if e in self.measures) if outputs else state.elements
+
+    @property
+    def shows_truth(self) -> bool:
+        """Whether it measures everything that is judged."""
+        plant = self.problem.plant
+        return {*plant.output.elements, *response_names(plant)} <= set(self.measures)
+
+    @property
+    def reads(self) -> tuple[Signal, ...]:
+        """Its answer, and whether this is the last good one held."""
+        return vector(_RAW, tuple(self.measures), tuple(self.measures.values())), scalar(_HELD)
+
+    @property
+    def delays(self) -> list[Delay]:
+        """Nothing: it remembers by itself."""
+        return []
+
+    def sense(self, motion: Sequence[Signal], response: Response) -> Block:
+        """Block (answer) -> motion and response in the model's order, and the answer as it came; what is not measured is zero."""
+        names, answered = list(self.measures), response_names(self.problem.plant)
+        wanted = {**{signal.name: signal.elements for signal in motion}, response.signal.name: answered}
+
+        def step(s: Signals) -> dict[str, Expression]:
+            answer = s._foreign
+            shown = {
+                signal: ca.vertcat(*(answer[names.index(n)] if n in names else 0 for n in elements))
+                for signal, elements in wanted.items()
+            }
+            return {**shown, "foreign": answer, "foreign_held": s._foreign_held}
+
+        writes = (*motion, response.signal, like(self.reads[0], "foreign"), scalar("foreign_held"))
+        return Block("sense", Layout(self.reads), Layout(writes), step)
+
+    def advance(self, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
+        """Block (arriving command, disturbances of inputs) -> the inputs that it is sent."""
+        problem, plant = self.problem, self.problem.plant
+
+        def step(s: Signals) -> dict[str, Expression]:
+            u = getattr(s, arriving.name)
+            if disturbed:
+                added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
+                u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
+            return {SENT: u}
+
+        return Block("send", Layout((arriving, *disturbed)), Layout((like(plant.input, SENT),)), step)
 
 
 def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Shown]:
     """Blocks of the true motion, response and error; and the signals that sensors see."""
-    motion = true_motion(problem)
+    mover = moving(problem)
+    motion = mover.motion
     hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response.signal, "_seen")
-    if problem.foreign is not None and not shows_truth(problem):
-        return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
+    if not mover.shows_truth:
+        return [mover.sense(hidden[0], Response(hidden[1], response.function))], hidden
     true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
-    sense = _sense_block(problem, true[0], Response(true[1], response.function))
+    sense = mover.sense(true[0], Response(true[1], response.function))
     if problem.sensing.estimator.of_steps:
         sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
@@ -176,34 +342,6 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     return Block("truth", Layout((time_signal(plant), motion)), writes, step, opaque=problem.reference.opaque)
 
 
-def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response) -> Block:
-    """Block -> the true state and outputs, and the true response just before this cycle's command; with a reality also its state.
-
-    The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
-    Runge-Kutta evaluation of this cycle. Outputs are those of the moving plant, with its exact parameters.
-    """
-    if problem.foreign is not None:
-        return foreign_block(problem, motion, response.signal)
-    reads, writes, truth = _real_signals(problem), (*motion, response.signal), problem.truth
-    own = () if problem.symbolic_reality is None else (like(truth.plant.state, REALITY_STATE),)
-    shown = {signal.name: truth.function(signal.elements) for signal in motion}
-    shifts = bool(problem.disturbed_outputs)
-    if shifts:
-        reads, writes = (*reads, disturbance_signal(problem)), (*writes, logged_signal(problem))
-
-    def step(s: Signals) -> dict[str, Expression]:
-        now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
-        values = {response.signal.name: response.function(*now)}
-        values |= {name: function(*now) for name, function in shown.items()}
-        if shifts:
-            below, answered = added(problem, s.disturbance)
-            sums = {response.signal.name: answered, motion[-1].name: below}
-            values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
-        return {**values, **{signal.name: s._state_before for signal in own}}
-
-    return Block("sense", Layout(reads), Layout((*writes, *own)), step)
-
-
 def _seen_block(problem: Problem, shown: Shown) -> Block:
     """Block -> the state and the response that are measured in place of the true ones."""
     state = problem.truth.function(shown[0][0].elements, seen=True)
@@ -227,75 +365,6 @@ def _real_signals(problem: Problem) -> tuple[Signal, ...]:
 def _forcing(plant: Plant, name: str) -> Signal:
     """Signal of what disturbances add to the response of every coordinate."""
     return Signal(name, plant.names, forcing_units(plant))
-
-
-def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
-    """Block of the plant that moves over one period with the arriving command held; a foreign reality is sent its inputs."""
-    if problem.foreign is not None:
-        return sending_block(problem, disturbed, arriving)
-    plant = problem.real_plant
-    advance = problem.real_integrator.step(plant, problem.period)
-    state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
-    if problem.symbolic_reality is not None:  # its state is none of the model's
-        state = like(plant.state, REALITY_STATE)
-    exact = like(plant.parameter, real_name(problem))
-    reads = (state, arriving, exact, *disturbed)
-    writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
-
-    def step(s: Signals) -> dict[str, Expression]:
-        u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
-        if disturbed:
-            adds = dict(zip(disturbed[0].elements, ca.vertsplit(s.disturbance), strict=True))
-            u = u + ca.vertcat(*(adds.get(name, 0) for name in plant.inputs))
-            w = ca.vertcat(*(adds.get(name, 0) for name in plant.names))
-        return {
-            "_state_after": advance(getattr(s, state.name), u, getattr(s, exact.name), w),
-            "_acting": u,
-            "_forcing": w,
-        }
-
-    return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)
-
-
-def shows_truth(problem: Problem) -> bool:
-    """Whether a foreign reality measures everything that is judged: the model's whole state or outputs, and their responses."""
-    if problem.foreign is None:
-        return False
-    plant = problem.plant
-    return {*plant.output.elements, *response_names(plant)} <= set(problem.foreign.measures)
-
-
-def foreign_block(problem: Problem, motion: Sequence[Signal], response: Signal) -> Block:
-    """Block (answer) -> motion and response in the model's order, and the answer as it came; what is not measured is zero."""
-    assert problem.foreign is not None
-    names, answered = list(problem.foreign.measures), response_names(problem.plant)
-    raw, held = foreign_signals(problem)
-    wanted = {**{signal.name: signal.elements for signal in motion}, response.name: answered}
-
-    def step(s: Signals) -> dict[str, Expression]:
-        answer = s._foreign
-        shown = {
-            signal: ca.vertcat(*(answer[names.index(n)] if n in names else 0 for n in elements))
-            for signal, elements in wanted.items()
-        }
-        return {**shown, "foreign": answer, "foreign_held": s._foreign_held}
-
-    writes = (*motion, response, like(raw, "foreign"), scalar("foreign_held"))
-    return Block("sense", Layout((raw, held)), Layout(writes), step)
-
-
-def sending_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
-    """Block (arriving command, disturbances of inputs) -> the inputs that the reality is sent."""
-    plant = problem.plant
-
-    def step(s: Signals) -> dict[str, Expression]:
-        u = getattr(s, arriving.name)
-        if disturbed:
-            added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
-            u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
-        return {SENT: u}
-
-    return Block("send", Layout((arriving, *disturbed)), Layout((like(plant.input, SENT),)), step)
 
 
 def with_true_response(problem: Problem, sense: Block, motion: Signal, response: Signal) -> Block:
