@@ -52,7 +52,7 @@ def test_too_few_iterations_are_found_and_the_named_number_suffices():
     assert answer.numbers["unsolved"] == pytest.approx(share(problem, few), abs=1e-12)
     times = int(answer.change.partition("Give the optimiser ")[2].partition(" times")[0])
     changed = (
-        f"FixedPoint(iterations={times}, tolerance=1e-06, most_iterations={100 * times})"  # no other setting is printed
+        f"FixedPoint(iterations={times}, tolerance=1e-6, most_iterations={100 * times})"  # no other setting is printed
     )
     assert answer.change == f"Give the optimiser {times} times the iterations: {changed}."
     mended = replace(few, iterations=times)
