@@ -28,10 +28,11 @@ from fpirhc.review.neighbourhood import eigenvalues_near
 from fpirhc.review.planned import is_planned
 from fpirhc.review.stages import stiff_advice
 from fpirhc.review.wording import per_cycle
-from fpirhc.review.zero_dynamics import zero_dynamics_modes
+from fpirhc.review.zero_dynamics import of_zero_dynamics, zero_dynamics_modes
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 QUESTION = "Does the deformation converge?"
+_OF_THE_PLANT = "The slowest mode is that of the zero dynamics, which no gain changes: see there."
 _SURE = math.log(100)
 _NEAR = 0.1  # distance from a mode of the zero dynamics, as a share of its own distance from 1
 
@@ -52,7 +53,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     worst = float(radii.max())
     text = f"the slowest mode of the linear loop {per_cycle(worst, grid.problem)}"
     if left_out:
-        text += f", beside those of the states that decay by themselves, {float(loops.radii.max()):.6g}"
+        text += f", beside those of the states that move by themselves, {float(loops.radii.max()):.6g}"
     numbers = {"radius": worst, "smallest_radius": float(radii.min())}
     deformation = controller.deformation
     if not deformation.iteration.constant or loops.learns:
@@ -68,8 +69,9 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
             QUESTION, Verdict.NO, f"{text}: it grows all along the reference", _mend(grid, controller, loops), numbers
         )
     if growth.max() > -_SURE:
-        where = f"between {radii.min():.6g} and {worst:.6g} along the reference"
-        return Answer(QUESTION, Verdict.UNKNOWN, f"{text} ({where})", _mend(grid, controller, loops), numbers)
+        ends = [f"{end:.6g}" for end in (radii.min(), worst)]
+        text += f" (between {' and '.join(ends)} along the reference)" if ends[0] != ends[1] else ""
+        return Answer(QUESTION, Verdict.UNKNOWN, text, _mend(grid, controller, loops), numbers)
     against = [*([] if controller.deforms == "target" else _steep(grid, controller)), *doubts]
     if against:
         return Answer(
@@ -78,7 +80,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     return Answer(QUESTION, Verdict.YES, text, "", numbers)
 
 
-def box_converges(loops: Loops) -> Answer:
+def box_converges(grid: ReviewGrid, loops: Loops) -> Answer:
     """Return in how many draws of the parameters the linear loop converges; unknown where it is not all of them."""
     question = "Does it converge all over the box of parameters?"
     if not loops.loops:
@@ -90,10 +92,14 @@ def box_converges(loops: Loops) -> Answer:
     numbers = {"share": share, "radius": worst}
     if share == 1:
         return Answer(question, Verdict.YES, text, "", numbers)
-    return Answer(question, Verdict.UNKNOWN, text, "Lower the gain, or narrow the box of the parameters.", numbers)
+    change = _OF_THE_PLANT if of_zero_dynamics(grid, worst) else "Lower the gain, or narrow the box of the parameters."
+    return Answer(question, Verdict.UNKNOWN, text, change, numbers)
 
 
 def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
+    growing = max(float(loops.radii.max()), loops.ideal.radius if loops.ideal is not None else 0.0)
+    if growing >= 1 and of_zero_dynamics(grid, growing):
+        return _OF_THE_PLANT
     if loops.ideal is not None and loops.ideal.radius >= 1:
         advised = not grid.problem.plant.outputs  # its stages are looked at along references of states
         believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)

@@ -15,8 +15,11 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops, Points, points_of, thinned
-from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearCycle, LinearLoop
 
+LITTLE = 0.1  # growth over the run, as a share, that it does not show
+_ROUNDING = 1e-5  # of the radius of a neutral mode
+_SHARES = (0.1, 0.5, 1.0, 2.0)  # of the map's own gain, at which a mode that no gain changes is looked for
 _LOWER = 0.9  # the lower gain, as a share of the map's own
 
 Pair: TypeAlias = tuple[LinearLoop, LinearLoop]
@@ -29,11 +32,13 @@ class LoopsByGain:
         points: of the loop.
         own: points and draws that are looked at.
         gain: effective gain of the map.
+        cycles: of the run.
     """
 
-    def __init__(self, points: Points, own: Loops, gain: float) -> None:
+    def __init__(self, points: Points, own: Loops, gain: float, cycles: int) -> None:
         self._points, self._own, self.gains = points, own, (_LOWER * gain, gain)
-        self._pair = cache(self._between)
+        self._most = (1 + LITTLE) ** (1 / cycles)
+        self._pair, self._floor = cache(self._between), cache(self._least)
 
     def along(self, most: int) -> list[Pair]:
         """Return (lower, own) at no more than so many points of the reference, with the exact parameters."""
@@ -54,6 +59,14 @@ class LoopsByGain:
         cycles = (_mixed(one, other, share) for one, other in zip(own.cycles, low.cycles, strict=True))
         return replace(own, cycles=tuple(cycles))
 
+    def stable(self, gain: float, pair: Pair) -> bool:
+        """Whether no mode grows with an effective gain but one that grows with all of them, too little to show in the run."""
+        radius = self.at(gain, pair).radius
+        return radius < 1 + NEUTRAL or radius < min(self._most, self._floor(pair) + _ROUNDING)
+
+    def _least(self, pair: Pair) -> float:
+        return min(self.at(share * self.gains[1], pair).radius for share in _SHARES)
+
     def _between(self, place: int, draw: int, held: bool) -> Pair:
         low, own = self._points.between(place, draw, self.gains, held=held)
         return low, own
@@ -63,7 +76,7 @@ def loops_by_gain(grid: ReviewGrid, controller: Controller, own: Loops) -> Loops
     """Return the loops for every gain; None without loops, and for a map that changes or has no gain to set."""
     if not controller.deformation.adapts or not controller.deformation.iteration.constant or not own.places:
         return None
-    loops = LoopsByGain(points_of(grid, controller), own, controller.deformation.effective_gain())
+    loops = LoopsByGain(points_of(grid, controller), own, controller.deformation.effective_gain(), grid.problem.cycles)
     try:
         loops.along(1)
     except (FpirhcError, np.linalg.LinAlgError):

@@ -33,6 +33,7 @@ _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 _DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
 _STEPS = 60
+_LAST = ", the zero dynamics, and the convergence of the deformation."
 SLOWER = "Let it learn more slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
 
 
@@ -56,7 +57,9 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         text += f"; no margins of a loop of {len(first.dynamics)} states"
         return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
     if radius >= 1:  # there is no margin to lose
-        change = SLOWER if learner else "See the rates, the zero dynamics, and the convergence of a deformation."
+        change = (
+            SLOWER if learner else f"See the rates{_LAST if adapts else ' and the zero dynamics; or mend the model.'}"
+        )
         return replace(_outside(loops.radii, text, {"radius": radius}, learns=loops.learns), change=change)
     # Loops of plans are few, and differ more.
     places = range(len(loops.loops)) if len(first.cycles) > 1 else sorted({0, int(np.argmax(loops.radii))})

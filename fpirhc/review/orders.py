@@ -16,9 +16,9 @@ def relative_orders(grid: ReviewGrid) -> Answer:
     structural = declared if plant.outputs else {c: structural_order(plant, c) for c in plant.controlled_names}
     text = ", ".join(f"{c} {r}" for c, r in structural.items())
     inside = plant.state.size - sum(declared.values())
-    text += (
-        f"; {inside} of {plant.state.size} states move by themselves" if inside else "; they make up the whole state"
-    )
+    alone = "moves by itself" if inside == 1 else "move by themselves"
+    whole = "; the controlled coordinates and their derivatives make up the whole state"
+    text += f"; {inside} of {plant.state.size} states {alone}" if inside else whole
     numbers = {**{f"order_{c}": float(r or 0) for c, r in structural.items()}, "internal_states": float(inside)}
     if structural != declared:
         return Answer(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.review.answer import Answer, Verdict
@@ -12,10 +10,9 @@ from fpirhc.review.loops import Loops
 from fpirhc.review.maps import dead_cycles
 from fpirhc.review.planned import is_planned
 from fpirhc.review.stages import stiff_advice
-from fpirhc.review.zero_dynamics import zero_dynamics_rate
+from fpirhc.review.zero_dynamics import of_zero_dynamics
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL
 
-_BESIDE = 1.1  # the growth of the zero dynamics is that of the plant, and the nominal loop is that of the model
 QUESTION = "Is the sampling fast enough for the tracking law?"
 
 
@@ -34,7 +31,7 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
     text += f"; in the nominal loop, plant = model, the slowest mode is multiplied by {radius:.6g} per cycle"
     if radius < 1:
         return Answer(QUESTION, Verdict.YES, text, "", numbers)
-    if _of_zero_dynamics(grid, radius):
+    if of_zero_dynamics(grid, radius):
         change = "It is the mode of the zero dynamics, which no rate and no period changes: see there."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
@@ -45,15 +42,6 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
         change = "A mode neither grows nor decays: weigh the state or the input in which it is."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     return Answer(QUESTION, Verdict.NO, text, change, numbers)
-
-
-def _of_zero_dynamics(grid: ReviewGrid, radius: float) -> bool:
-    """Whether the loop grows no faster than the states that the controlled coordinates leave to themselves."""
-    rate, period = zero_dynamics_rate(grid), grid.problem.period
-    if rate is None or not rate > 0:
-        return False
-    grown = rate * period if grid.problem.plant.step is not None else math.expm1(rate * period)
-    return radius - 1 <= _BESIDE * grown
 
 
 def _rate(controller: Controller) -> float | None:

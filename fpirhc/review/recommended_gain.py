@@ -26,7 +26,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.loops_by_gain import LoopsByGain
 from fpirhc.review.margins import LEAST_GAIN, LEAST_PHASE, margins
-from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 MARGIN = 2.0
 SECANT, TWO_CYCLE = "the map's steepest secant", "a two-cycle of the whole loop"
@@ -130,7 +130,7 @@ def _pole_limit(loops: LoopsByGain, sign: float, most: float) -> float | None:
 
 
 def _stable(loops: LoopsByGain, gain: float) -> bool:
-    return all(loops.at(gain, pair).radius < 1 + NEUTRAL for pair in (*loops.along(_ALONG), *loops.over_box(_DRAWN)))
+    return all(loops.stable(gain, pair) for pair in (*loops.along(_ALONG), *loops.over_box(_DRAWN)))
 
 
 def _with_margins(loops: LoopsByGain, gain: float) -> float:

@@ -177,7 +177,7 @@ def _of_target(case: Case, general: list[Answer]) -> list[Answer]:
     doubtful = _doubtful(case)
     verdict = converges(case.grid, case.controller, case.loops, _doubts(doubtful))
     null = _asked(leaves_right_model_alone, case)
-    return [verdict, box_converges(case.loops), covered, *doubtful, *([] if null is None else [null])]
+    return [verdict, box_converges(case.grid, case.loops), covered, *doubtful, *([] if null is None else [null])]
 
 
 def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
@@ -193,7 +193,7 @@ def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
     suited = [*_speed_and_range(grid, controller, loops), *_doubtful(case)]
     answers = (
         _asked(converges, grid, controller, loops, _doubts([*general, *suited, two_cycles])),
-        _asked(box_converges, loops),
+        _asked(box_converges, grid, loops),
         _asked(one_sign, own, boxed),
         _asked(gain_admissible, deformation, own, boxed, limit, gain_advice(case, boxed, null)),
         *suited,

@@ -6,6 +6,7 @@ the derivatives below them at zero move by themselves.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,14 +16,15 @@ from fpirhc.plant.maps import growth_of
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
+from fpirhc.review.loops_by_gain import LITTLE
 from fpirhc.review.state_slopes import StateSlopes, state_slopes
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 
 QUESTION = "Are the zero dynamics stable?"
+_BESIDE = 1.1  # the growth of the zero dynamics is that of the plant, and the nominal loop is that of the model
 _STILL = 1e-4  # growth over the run, as a share, below which a mode is neutral
-_LITTLE = 0.1  # below which the run does not show it
 
 
 def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
@@ -37,6 +39,15 @@ def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
     modes = zero_dynamics_modes(grid, [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()])
     growth = growth_of(plant)
     return max((float(growth(one).max()) for one in modes), default=float("nan"))
+
+
+def of_zero_dynamics(grid: ReviewGrid, radius: float) -> bool:
+    """Whether the loop grows no faster than the states that the controlled coordinates leave to themselves."""
+    rate, period = zero_dynamics_rate(grid), grid.problem.period
+    if rate is None or not rate > 0:
+        return False
+    grown = rate * period if grid.problem.plant.step is not None else math.expm1(rate * period)
+    return radius - 1 <= _BESIDE * grown
 
 
 def zero_dynamics_modes(grid: ReviewGrid, places: Sequence[int]) -> list[np.ndarray]:
@@ -72,12 +83,12 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
         if radius < 1:
             held = text.replace("unstable: ", "unstable by themselves and held by the plan: ", 1)
             return Answer(QUESTION, Verdict.YES, held, "", numbers)
-        little = radius < 1 + NEUTRAL or min(rate * problem.duration, radius**problem.cycles - 1) < _LITTLE
+        little = radius < 1 + NEUTRAL or min(rate * problem.duration, radius**problem.cycles - 1) < LITTLE
         verdict = Verdict.UNKNOWN if loops.learns or neutral or little else Verdict.NO
         return Answer(QUESTION, verdict, text, "Weigh the other states in the cost, or lengthen the horizon.", numbers)
     if rate < 0 and not neutral:
         return Answer(QUESTION, Verdict.YES, text, "", numbers)
-    if rate * problem.duration > _LITTLE and not planned:
+    if rate * problem.duration > LITTLE and not planned:
         change = "Let a plan carry those states in its cost, use time slots, or control another coordinate."
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
     change = "Run it and look at the coordinates that are not controlled."
@@ -93,9 +104,9 @@ def _text(problem: Problem, rate: float) -> str:
     if not np.isfinite(rate):
         return "their rate is not known: the reference has no finite command"
     if abs(rate) * problem.duration <= _STILL:
-        return "they neither grow nor decay"
+        return "the slowest of them neither grows nor decays"
     if rate > 0:
         grown = rate * problem.duration
-        over = f", by {in_percent(grown)} over the run" if grown <= _LITTLE else ""
+        over = f", by {in_percent(grown)} over the run" if grown <= LITTLE else ""
         return f"unstable: while the reference is followed they grow at up to {rate:.3g} {unit}{over}"
     return f"stable: while the reference is followed they decay at {-rate:.3g} {unit} or faster"

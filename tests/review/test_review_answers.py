@@ -168,13 +168,13 @@ def test_doubts_and_steep_maps_speak_against_convergence(grid):
         ((), "yes", "in 100 % of 1 draws; the worst mode is multiplied by 0.25 per cycle"),
     ],
 )
-def test_share_of_the_box_that_converges(drawn, verdict, text):
+def test_share_of_the_box_that_converges(grid, drawn, verdict, text):
     """Of the draws; without draws of the loops along the reference."""
-    one = box_converges(loops(0.25, drawn=tuple(map(loop, drawn))))
+    one = box_converges(grid, loops(0.25, drawn=tuple(map(loop, drawn))))
     radii = drawn or (0.25,)
     assert (one.verdict, one.evidence, bool(one.change)) == (verdict, text, verdict == "unknown")
     assert one.numbers == {"share": pytest.approx(np.mean(np.array(radii) < 1)), "radius": max(radii)}
-    assert box_converges(Loops((), (), None, reason="none")).evidence == "no linear loop: none"
+    assert box_converges(grid, Loops((), (), None, reason="none")).evidence == "no linear loop: none"
 
 
 # The gain

@@ -54,8 +54,8 @@ def answer(problem: fp.Problem, controller: Controller, words: str) -> fp.Answer
         (309.0, LAW, "no", "unstable: while the reference is followed they grow at up to 309 1/s"),
         (-32.9, PLAN, "yes", "stable: while the reference is followed they decay at 32.9 1/s"),
         (19.0, PLAN, "no", "unstable: while the reference is followed they grow at up to 19 1/s"),
-        (0.0, LAW, "yes", "they neither grow nor decay"),
-        (0.0, PLAN, "yes", "they neither grow nor decay"),
+        (0.0, LAW, "yes", "the slowest of them neither grows nor decays"),
+        (0.0, PLAN, "yes", "the slowest of them neither grows nor decays"),
     ],
 )
 def test_zero_dynamics_have_a_rate_and_a_sign(rate, controller, verdict, begin):

@@ -22,6 +22,7 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem
 from fpirhc.review.answer import Verdict
 from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.summary import written_out
 
 QUICK = ("cruise", "conical_tank", "magnet", "masses")
 INVERTED = [
@@ -40,7 +41,7 @@ def test_errors_and_verdict_are_those_of_an_independent_integration(name):
     assert comparison.outcome is Outcome.BETTER
     for quantity, least in adaptive.items():
         assert least < plain[quantity] / 5
-        assert f"{quantity} from {plain[quantity]:.3g} to {least:.3g}" in comparison.verdict[0]
+        assert f"{quantity} from {written_out(plain[quantity])} to {written_out(least)}" in comparison.verdict[0]
     null = comparison.null
     assert null is not None
     assert not null.harmful
@@ -122,3 +123,34 @@ def test_a_plan_is_not_refused_for_growth_that_the_run_does_not_show(plant, ques
     assert answer.verdict is Verdict.UNKNOWN
     assert said in answer.evidence
     assert answer.change.startswith(change)
+
+
+@pytest.mark.parametrize("plant", [rocket, masses])
+def test_growth_that_no_gain_changes_is_not_blamed_on_the_gain(plant):
+    """The zero dynamics are the slowest mode: neither the tracking rate nor the gain is advised to change."""
+    one = plant()
+    answers = {
+        a.question: a for a in fp.review(one.problem, one.controllers, mismatch=10.0, seed=0).controllers["CTC+FPI"]
+    }
+    for question in ("Does the deformation converge?", "Does it converge all over the box of parameters?"):
+        assert answers[question].verdict is Verdict.UNKNOWN
+        assert answers[question].change.startswith(
+            "The slowest mode is that of the zero dynamics, which no gain changes"
+        )
+
+
+@pytest.mark.parametrize("plant", [magnet, rocket, masses])
+def test_a_gain_is_recommended_beside_modes_that_no_gain_changes(plant):
+    """Neutral modes, and zero dynamics that the run does not show, set no limit; a run speaks for the named gain."""
+    one = plant()
+    answers = {
+        a.question: a for a in fp.review(one.problem, one.controllers, mismatch=10.0, seed=0).controllers["CTC+FPI"]
+    }
+    advice = answers["Is the map's gain admissible?"].numbers["recommended"]
+    assert advice < -0.5
+    law = one.controllers["CTC"]
+    without, recommended = (
+        fp.measure(one.problem, fp.simulate(one.problem, c, seed=0, compiled=False)).rms_error
+        for c in (law, law.with_deformation(fp.ModelReferenced(fp.Affine(gain=advice))))
+    )
+    assert all(recommended[name] < without[name] / 4 for name in without)
