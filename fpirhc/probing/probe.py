@@ -17,10 +17,11 @@ from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count, Seed
+from fpirhc.probing.estimates import Estimates
 from fpirhc.probing.excitation import Record, excited
 from fpirhc.probing.identification import Interval, identify
 from fpirhc.probing.recording import read_recording
-from fpirhc.probing.rule import Estimates, Rule
+from fpirhc.probing.rule import Rule
 from fpirhc.probing.trials import Trial, best, tried
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem

@@ -8,9 +8,8 @@ stands for everything slow. Of the safe settings within a tenth of the least err
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -23,12 +22,12 @@ from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import FpirhcError
-from fpirhc.probing.estimated_plant import estimated_problem, gain_name
-from fpirhc.probing.identification import Channel
+from fpirhc.probing.estimated_plant import estimated_problem
+from fpirhc.probing.estimates import Estimates
+from fpirhc.probing.margins import Margins
 from fpirhc.simulation.error_pair import errors_of
-from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import simulator
+from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.trials import weighed
 from fpirhc.task.problem import Problem
 
@@ -37,11 +36,8 @@ _RINGING = (4.0, 1.0)  # g / (1 - pole) of the filters
 _FIRST, _LONG = 0.2, 0.2  # shares with which forms are compared, and of the candidate with a long lag
 _FORMS = 2  # model-referenced ones that are searched in full, beside the plain one
 _LARGEST_PRODUCT = 1.99
-_DRAWS, _QUANTILE = 400, 0.025
-_DRAWN = 1  # of the draws, at every corner
 _STEPS, _OF_RANGE = 1.5, 0.02  # largest step of a command: times that of the controller alone, or of the input's range
 _NEAR, _WORTH = 1.1, 0.95  # errors that count as equal, and one that is worth an adaptation
-_STABLE = 1 - 1e-7
 
 
 @dataclass(frozen=True)
@@ -70,16 +66,29 @@ class Setting:
         Args:
             largest: eigenvalue of Lambda.
         """
-        size = self.share / largest
-        chosen: Deformation = Affine(gain=_rounded(-2 * size))
+        chosen: Deformation = Affine(gain=self.gain(largest))
         if self.pole:
             chosen = Filtered(chosen, pole=_rounded(self.pole))
         cycles, lag = _one(self.cycles), _one(tuple(_rounded(tau) for tau in self.lags))
         late = max(self.cycles) > 0
         if not self.referenced:
             return Paired(chosen, cycles=cycles) if late else chosen
-        leak = default_pole(min(max(self.share, size, 1.0), _LARGEST_PRODUCT), self.wrong) if late else None
+        leak = default_pole(min(max(1 / largest, 1.0), _LARGEST_PRODUCT), self.wrong) if late else None
         return ModelReferenced(chosen, cycles=cycles, lag=lag, pole=None if leak is None else _rounded(float(leak)))
+
+    def gain(self, largest: float) -> float:
+        """Return A_c = -2 a of the map, where a is the share of the inverse of the largest eigenvalue."""
+        return _rounded(-2 * self.share / largest)
+
+    @property
+    def paths(self) -> tuple[str, str]:
+        """Where gain and filter pole stand in a controller with this deformation."""
+        wrapped = self.referenced or max(self.cycles) > 0
+        return (
+            ("deformation.map.map.gain", "deformation.map.pole")
+            if wrapped
+            else ("deformation.map.gain", "deformation.pole")
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,58 +104,6 @@ class Predicted:
     deformation: Deformation
     error: float
     steps: float
-
-
-class Estimates:
-    """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them."""
-
-    def __init__(self, channels: Sequence[Channel], seed: int) -> None:
-        """Take the channels and the seed of the draws."""
-        self.channels = tuple(channels)
-        self.gains = np.array([[g.value for g in one.gains] for one in channels])
-        self._deviations = np.array([[(g.high - g.low) / 4 for g in one.gains] for one in channels])
-        random = np.random.default_rng(seed)
-        self.draws = self.gains + self._deviations * random.standard_normal((_DRAWS, *self.gains.shape))
-        values = np.linalg.eigvals(self.draws)
-        real, size = values.real.min(axis=1), np.abs(values) ** 2 / np.maximum(np.abs(values.real), 1e-300)
-        self.smallest = float(np.quantile(real, _QUANTILE))
-        self.largest_real = float(np.quantile(values.real.max(axis=1), 1 - _QUANTILE))
-        self.largest = float(np.quantile(size.max(axis=1), 1 - _QUANTILE))
-
-    @property
-    def refused(self) -> str:
-        """Why nothing may be adapted; empty where something may."""
-        edges = [one.edge for one in self.channels if one.edge]
-        if self.largest_real <= 0:
-            return "the sign of the gain is wrong: the plant answers against its model; turn the sign of an input in the model"
-        if np.linalg.eigvals(self.gains).real.min() <= 0:
-            return "an eigenvalue of the gains has the wrong sign: an input of the model has, or is paired with the wrong output"
-        if self.smallest <= 0:
-            return "the sign of a gain is not certain: excite more or longer (amplitude=, cycles=)"
-        return f"the record is too short for the {edges[0]}: take more cycles" if edges else ""
-
-    @cached_property
-    def dead(self) -> np.ndarray:
-        """Least, estimated, and greatest dead time of every input, shape (3, n)."""
-        return np.array([(one.dead_time.low, one.dead_time.value, one.dead_time.high) for one in self.channels]).T
-
-    @cached_property
-    def lag(self) -> np.ndarray:
-        """Least, estimated, and greatest lag of every input, shape (3, n)."""
-        return np.array([(one.lag.low, one.lag.value, one.lag.high) for one in self.channels]).T
-
-    @property
-    def drift(self) -> np.ndarray:
-        """By cycle, shape (cycles, n)."""
-        return np.column_stack([one.drift for one in self.channels])
-
-
-@dataclass(frozen=True)
-class Corner:
-    """A dead time and a lag of every input."""
-
-    cycles: tuple[float, ...]
-    lags: tuple[float, ...]
 
 
 class Rule:
@@ -170,13 +127,12 @@ class Rule:
             weighed(problem, controller),
         )
         self._given = problem
-        self._problems: dict[Corner, Problem] = {}
-        self._loops: dict[tuple[Corner, Deformation | None], _Loop] = {}
-        self._judged: dict[tuple[Deformation, bool], bool] = {}
+        self._margins = Margins(problem, self.bare, estimates)
+        self._simulators: dict[Setting, Simulator] = {}
         noise = [one.noise for one in estimates.channels]
         middle = estimates.dead[1], estimates.lag[1]
         self.problem = estimated_problem(problem, estimates.gains, *middle, estimates.drift, noise)
-        self._alone = self._run(self.bare)
+        self._alone = simulator(self.problem, self.bare, compiled=False).run(seed=0)
         self._room = self._allowed(chatter)
         self.stable = self._alone.stop is None
 
@@ -196,7 +152,12 @@ class Rule:
                 safe.append(one)
         chosen = {
             "cautious": next(
-                (one for one in _one_filter_each(calm) if self._safe(one, rough=True) and self._safe(one)), None
+                (
+                    one
+                    for one in _one_filter_each(calm)
+                    if self._margins.safe(one.deformation, rough=True) and self._safe(one)
+                ),
+                None,
             ),
             "mirrored": next(filter(self._safe, _one_filter_each(filter(self._mirrors, calm))), None),
             "plain": next(
@@ -210,6 +171,9 @@ class Rule:
             if candidate is not None and all(candidate.deformation != one.deformation for one in kept.values()):
                 kept[name] = candidate
         return kept
+
+    def _safe(self, one: Predicted) -> bool:
+        return self._margins.safe(one.deformation)
 
     def _mirrors(self, one: Predicted) -> bool:
         """Whether the model is late and lags as the plant at most does."""
@@ -245,7 +209,7 @@ class Rule:
         deformation = setting.deformation(self.estimates.largest)
         nothing = Predicted(setting, deformation, math.inf, math.inf)
         try:
-            run = self._run(self.bare.with_deformation(deformation))
+            run = self._run(setting)
         except FpirhcError:  # a gain that a loop refuses
             return nothing
         if run.stop is not None:
@@ -257,8 +221,15 @@ class Rule:
             float((_steps(run) / self._room).max()),
         )
 
-    def _run(self, controller: Controller) -> Run:
-        return simulator(self.problem, controller, compiled=False).run(seed=0)
+    def _run(self, setting: Setting) -> Run:
+        """The run of a candidate; those of one form share a loop."""
+        form = replace(setting, share=_FIRST, pole=0.5)
+        if form not in self._simulators:
+            controller = self.bare.with_deformation(form.deformation(self.estimates.largest))
+            self._simulators[form] = simulator(self.problem, controller, compiled=False, live=form.paths)
+        gain, pole = form.paths
+        numbers = {gain: setting.gain(self.estimates.largest), pole: _rounded(setting.pole)}
+        return self._simulators[form].run(seed=0, settings=numbers)
 
     def _allowed(self, chatter: float | Mapping[str, float] | None) -> np.ndarray:
         """Largest rms step of every input."""
@@ -270,76 +241,6 @@ class Rule:
             return np.asarray(np.maximum(usual, 1e-300))
         given = chatter if isinstance(chatter, Mapping) else dict.fromkeys(plant.inputs, chatter)
         return np.array([float(given.get(name, own)) for name, own in zip(plant.inputs, usual, strict=True)])
-
-    def _safe(self, one: Predicted, *, rough: bool = False) -> bool:
-        """Whether the whole loop is stable at every corner at which the controller alone is."""
-        deformation = one.deformation
-        if (deformation, rough) not in self._judged:
-            self._judged[deformation, rough] = all(
-                self._loop(corner, deformation).stable_where(self._loop(corner, None), gains)
-                for corner, gains in (self._far if rough else self._near)
-            )
-        return self._judged[deformation, rough]
-
-    @cached_property
-    def _near(self) -> tuple[tuple[Corner, tuple[float, ...]], ...]:
-        """Dead times and lags of the corners, and factors of the gains there: the gain margin is that of a review."""
-        dead, lag = self.estimates.dead, self.estimates.lag
-        corners = dict.fromkeys(Corner(tuple(dead[i]), tuple(lag[j])) for i in (2, 0) for j in (0, 2))
-        return (Corner(tuple(dead[2] + 1), tuple(lag[1])), (1.0,)), *((one, (1.4, 0.6)) for one in corners)
-
-    @cached_property
-    def _far(self) -> tuple[tuple[Corner, tuple[float, ...]], ...]:
-        """A lag is only a picture of what is slow: half as long again, and a command that is a cycle later."""
-        dead, slow = self.estimates.dead[2], 1.5 * np.maximum(self.estimates.lag[2], 0.25 * self._given.period)
-        return (Corner(tuple(dead), tuple(slow)), (2.0,)), (Corner(tuple(dead + 1), tuple(slow)), (1.4,))
-
-    def _loop(self, corner: Corner, deformation: Deformation | None) -> _Loop:
-        """The loop at a corner; None: of the controller alone."""
-        if (corner, deformation) not in self._loops:
-            problem = self._problems.setdefault(
-                corner, estimated_problem(self._given, self.estimates.gains, corner.cycles, corner.lags)
-            )
-            controller = self.bare if deformation is None else self.bare.with_deformation(deformation)
-            self._loops[corner, deformation] = _Loop(problem, controller, self.estimates)
-        return self._loops[corner, deformation]
-
-
-class _Loop:
-    """A loop on the estimated plant, linearised for any gains."""
-
-    def __init__(self, problem: Problem, controller: Controller, estimates: Estimates) -> None:
-        self._matrices = (estimates.gains, *estimates.draws[:_DRAWN])
-        self._radii: dict[float, float] = {}
-        names, count = list(problem.real_plant.parameters), range(len(estimates.gains))
-        places = [names.index(gain_name(i, j)) for i in count for j in count]
-        self._memory: np.ndarray | None = None
-        try:
-            self._loop = AskedLoop(problem, controller)
-            self._memory = self._loop.quietest(self._loop.run(self._loop.start(), 4 * self._loop.warm + 20))
-        except FpirhcError:  # it does not run
-            return
-        self._places = [self._loop.loop.memory.slice("_exact").start + k for k in places]
-
-    def stable_where(self, alone: _Loop, gains: Sequence[float]) -> bool:
-        """Whether it is stable with every factor of the gains with which the controller alone is."""
-        return all(self.radius(gain) < _STABLE for gain in gains if alone.radius(gain) < _STABLE)
-
-    def radius(self, gain: float) -> float:
-        """Largest radius over the gains, and a draw of them, times a factor; infinite where the loop does not run."""
-        if gain not in self._radii:
-            self._radii[gain] = max(self._radius(gain * one) for one in self._matrices)
-        return self._radii[gain]
-
-    def _radius(self, gains: np.ndarray) -> float:
-        if self._memory is None:
-            return math.inf
-        changed = self._memory.copy()
-        changed[self._places] = gains.ravel()
-        try:
-            return self._loop.at(changed).radius
-        except FpirhcError:
-            return math.inf
 
 
 def mean_ratio(problem: Problem, alone: Run, run: Run, names: frozenset[str] | None) -> float:
