@@ -6,37 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_outputs import SHORT, arm, circle, hill, on_outputs, sedated, simulated
+from test_outputs import arm, circle, hill, sedated, simulated
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem, NotSupported
-from fpirhc.plant.motion import with_exact_parameters
-
-RIVALS: dict[str, Controller] = {
-    "PID": fp.PID({"q1": 80.0, "q2": 60.0}, {"q1": 30.0, "q2": 20.0}, {"q1": 20.0, "q2": 15.0}),
-    "sliding": fp.SlidingMode(rate=6.0, gain=20.0, width=2.0),
-    "rate": fp.ResolvedAccelerationRate(rate=6.0),
-    "feedback": fp.AccelerationFeedback(fp.Exponential(rate=6.0), gain=0.5, time_constant=0.01),
-    "backstepping": fp.BacksteppingMRAC(6.0, (5.0, 5.0), fp.Affine(-0.5)),
-    "force": fp.ForceMRAC(fp.Exponential(rate=6.0), fp.Affine(-0.5)),
-    "Lyapunov": fp.LyapunovMRAC(rate=6.0, adaptation=1.0),
-}
-
-
-@pytest.mark.parametrize("name", RIVALS)
-def test_outputs_that_are_coordinates_change_no_signal(name: str) -> None:
-    """`ResolvedAccelerationRate` moves states by its model where outputs are measured, so its model is exact here."""
-    short = replace(SHORT, duration=0.1, measure_from=0.0)
-    if name == "rate":
-        plant = with_exact_parameters(short.plant, short.plant.approximate)
-        short = replace(short, plant=plant)
-    plain, run = (simulated(p, RIVALS[name]) for p in (short, on_outputs(short)))
-    for signal in ("state", "command", "desired"):
-        same = np.array_equal if name != "rate" else np.allclose
-        assert same(plain[signal], run[signal]), signal
-
 
 ON_DEPTH: dict[str, tuple[Controller, float]] = {
     "PID": (fp.PID({"depth": -2.0}, {"depth": -0.6}, {"depth": -2.0}), 1.0),

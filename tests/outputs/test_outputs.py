@@ -485,18 +485,6 @@ def test_the_patients_kinetics_conserve_the_drug() -> None:
 # Reviews
 
 
-def test_the_linear_loop_of_outputs_that_are_coordinates_is_that_of_the_coordinates() -> None:
-    """The reference is followed from the start: both are linearised at the same points. Motions of outputs are interpolated."""
-    controller = TWO_MASS.controllers["CTC+FPI (eq 6)"]
-    plain = replace(TWO_MASS.problem, start={"q1": 2.2, "q2": 5.4, "q1'": 0.6, "q2'": 0.9})
-    grids = [review_grid(problem, 0.0, 0) for problem in (plain, on_outputs(plain))]
-    one, other = (loops_along(grid, controller) for grid in grids)
-    assert np.allclose(grids[0].states, grids[1].states, atol=1e-4)
-    assert np.allclose(one.radii, other.radii, atol=5e-5)
-    for k in (0, -1):
-        assert np.allclose(np.sort_complex(one.loops[k].poles), np.sort_complex(other.loops[k].poles), atol=1e-4)
-
-
 def test_the_linear_loop_of_an_output_is_that_of_the_plant_whose_coordinate_it_is() -> None:
     """Where the plant hardly moves: on the way there poles of a moment depend on the coordinates, because these turn as well."""
     controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(-0.6))

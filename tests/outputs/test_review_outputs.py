@@ -50,17 +50,6 @@ def test_the_linear_loop_of_a_plan_is_the_decay_of_a_small_deviation(form: Defor
     assert loops.radii[0] == pytest.approx(decay, rel=3e-3)
 
 
-def test_the_linear_loop_of_plans_on_outputs_that_are_coordinates_is_that_of_plans_on_coordinates() -> None:
-    """Rates are weighed in both: a deviation from a feedforward needs references of states. Motions of outputs are interpolated."""
-    start = {"q1": 2.2, "q2": 5.4, "q1'": 0.6, "q2'": 0.9}
-    cost = fp.Quadratic(states={"q1": 1e3, "q2": 1e3, "q1'": 1.0, "q2'": 1.0}, rate={"Q1": 1e-4, "Q2": 1e-4})
-    plain = replace(TWO_MASS.problem, start=start, cost=cost, duration=1.0, measure_from=0.0)
-    controller = fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-3), fp.Affine(-0.5))
-    one, other = (loops_along(review_grid(p, 0.0, 0), controller) for p in (plain, on_outputs(plain)))
-    assert one.loops
-    assert np.allclose(one.radii, other.radii, atol=1e-4)
-
-
 def answers(problem: fp.Problem, controller: Controller) -> dict[str, Answer]:
     review = fp.review(problem, {"one": controller}, mismatch=0.0, seed=0)
     return {a.question: a for a in (*review.problem, *review.controllers["one"])}

@@ -303,6 +303,7 @@ def test_values_that_make_no_sense_are_refused():
 
 
 _LONG = ("chain_of_masses", "puma560", "three_link_arm", "planar_arm", "two_link_arm", "van_der_pol", "leaking_tanks")
+_LONG += ("delayed_mass", "delayed_tanks")  # the journey below reviews dead time
 
 
 @pytest.mark.parametrize(
