@@ -302,8 +302,10 @@ def test_values_that_make_no_sense_are_refused():
             fp.review(mass(), {}, mismatch=wrong, seed=0)
 
 
-_LONG = ("chain_of_masses", "puma560", "three_link_arm", "planar_arm", "two_link_arm", "van_der_pol", "leaking_tanks")
-_LONG += ("delayed_mass", "delayed_tanks")  # the journey below reviews dead time
+_LONG = (
+    *("chain_of_masses", "puma560", "three_link_arm", "planar_arm", "two_link_arm", "van_der_pol", "leaking_tanks"),
+    *("delayed_mass", "delayed_tanks"),  # the journey below reviews dead time
+)
 
 
 @pytest.mark.parametrize(
