@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 _LEAST_SHARE = 1e-5
-_WITH_POWER = re.compile(r"(?P<before>= ?|(?<![\w.+-]))(?P<number>-?\d+(?:\.\d+)?e[+-]\d+)(?!\w)")
+_WITH_POWER = re.compile(r"(?P<before>= ?|(?<![\w.]))(?P<number>[-+]?\d+(?:\.\d+)?e[+-]\d+)(?!\w)")
 _LONGEST = 1e6  # from which a number is written with a power of ten
 
 
@@ -118,7 +118,7 @@ def number(value: float) -> str:
 
 def in_percent(share: float) -> str:
     """Return a share in percent, in three digits; what is below a thousandth of a percent is said to be so."""
-    return "below 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{100 * share:.3g} %"
+    return "less than 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{100 * share:.3g} %"
 
 
 def written_out(value: float, digits: int = 3) -> str:
@@ -138,6 +138,7 @@ def numbers_written_out(text: str) -> str:
 def _as_written(found: re.Match[str]) -> str:
     value, digits = found["number"], sum(c.isdigit() for c in found["number"].partition("e")[0])
     text = written_out(float(value), max(digits, 1))
+    text = f"+{text}" if value.startswith("+") else text
     return found["before"] + (text.replace(" ", "") if "=" in found["before"] else text)
 
 

@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fpirhc.deformation.base import Deformation
+from fpirhc.describe import as_written
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.forms import INCREMENT, PLAIN, REFERENCED, forms_of
 from fpirhc.task.problem import Problem
 
-_TRY = {
-    PLAIN: "Try the map itself.",
-    INCREMENT: "Try Increment(map, cycles=problem.response_delay).",
-    REFERENCED: "Try ModelReferenced(map, cycles=...).",
-}
 LATE = 1.0  # cycles of an estimator's delay, beyond which what the model is wrong by is known too late
 
 
@@ -58,4 +54,5 @@ def right_form(problem: Problem, deformation: Deformation, harm: Callable[[Defor
     if against:
         change = "Keep the form that a comparison shows to be better."
         return Answer(question, Verdict.UNKNOWN, f"{text}; but here {against}", change)
-    return Answer(question, Verdict.UNKNOWN, text, _TRY[form])
+    change = "Try another form." if proposed is None else f"Try {as_written(proposed)}."
+    return Answer(question, Verdict.UNKNOWN, text, change)

@@ -33,7 +33,6 @@ _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 _DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
 _STEPS = 60
-_LAST = ", the zero dynamics, and the convergence of the deformation."
 SLOWER = "Let it learn more slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
 
 
@@ -57,9 +56,7 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         text += f"; no margins of a loop of {len(first.dynamics)} states"
         return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
     if radius >= 1:  # there is no margin to lose
-        change = (
-            SLOWER if learner else f"See the rates{_LAST if adapts else ' and the zero dynamics; or mend the model.'}"
-        )
+        change = SLOWER if learner else _poles_advice(loops, adapts)
         return replace(_outside(loops.radii, text, {"radius": radius}, learns=loops.learns), change=change)
     # Loops of plans are few, and differ more.
     places = range(len(loops.loops)) if len(first.cycles) > 1 else sorted({0, int(np.argmax(loops.radii))})
@@ -77,6 +74,14 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
     gentler = "weigh the inputs more" if planned else "lower the rate"
     change = "" if good else f"Lower the map's gain, or {gentler}." if adapts else f"{gentler.capitalize()}."
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
+
+
+def _poles_advice(loops: Loops, adapts: bool) -> str:
+    """Which other answer has the cause: the loop with the right model, the deformation, or else the wrong model."""
+    if loops.ideal is None or loops.ideal.radius >= 1:
+        return "See the rates and the zero dynamics."
+    right = "With a right model and no adaptation the loop converges"
+    return f"{right}: see the convergence of the deformation." if adapts else f"{right}: mend the model, or adapt."
 
 
 def _outside(radii: np.ndarray, text: str, numbers: dict[str, float], *, learns: bool) -> Answer:

@@ -47,7 +47,8 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
         return Answer(QUESTION, Verdict.YES, f"{text}; the map's step has no bound", "", numbers)
     text += f", the map by {step / problem.period:.3g}"
     if sudden:
-        text += f"; a jump of a disturbance takes the map {math.ceil(sudden / step)} cycles"
+        cycles = math.ceil(sudden / step)
+        text += f"; a jump of a disturbance takes the map {cycles} cycle{'s' * (cycles > 1)}"
     ratio = step / problem.period / max(needed, 1e-300)
     change = f"Raise the map's scale at least {SPARE / ratio:.2g} times, or leave it out to have it chosen."
     if ratio >= SPARE:

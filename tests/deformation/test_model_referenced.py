@@ -363,7 +363,7 @@ def test_review_says_which_form():
     advice = right_form(TWO_MASS.problem, affine(0.5), harmless)
     assert advice.verdict == "unknown"
     assert "it is plain; measurements speak for model-referenced" in advice.evidence
-    assert advice.change.startswith("Try ModelReferenced")
+    assert advice.change == f"Try ModelReferenced(map={affine(0.5)!r})."
     lost = right_form(TWO_MASS.problem, affine(0.5), lambda _: "with the wrong model it loses")
     assert lost.evidence.endswith("; but here with the wrong model it loses")
     assert "Try" not in lost.change

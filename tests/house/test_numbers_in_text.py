@@ -18,7 +18,7 @@ from fpirhc.summary import in_percent, numbers_written_out, written_out
     ("share", "text"),
     [
         (0.0, "0 %"),
-        (2.31e-37, "below 0.001 %"),
+        (2.31e-37, "less than 0.001 %"),
         (1e-5, "0.001 %"),
         (0.0167, "1.67 %"),
         (0.986, "98.6 %"),
@@ -64,6 +64,7 @@ def test_a_plan_is_not_better_than_the_optimum(excess, text):
         ("Use gain = -1.23e+05.", "Use gain = -123000."),
         ("Use Affine(gain=-1.2e-05).", "Use Affine(gain=-1.2e-5)."),
         ("from 1.2e-09 to 3e+05, 4.6e+275 times", "from 1.2e-9 to 300 000, 4.6e275 times"),
+        ("0.2 with it, +2.4e-05 % of its range", "0.2 with it, +2.4e-5 % of its range"),
         ("see model_v1.2e+04 and 0x1e+05", "see model_v1.2e+04 and 0x1e+05"),
     ],
 )

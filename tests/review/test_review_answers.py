@@ -116,6 +116,10 @@ def test_margins_of_an_integrator_by_hand(grid):
     unstable = linear(1.1 * one, one, 0.1 * one, np.array([0]), PERIOD)
     lost = margins_enough(grid.problem, Loops((0,), (unstable,), unstable), adapts=True, planned=False)
     assert (lost.verdict, lost.numbers) == ("no", {"radius": 1.1})
+    assert lost.change == "See the rates and the zero dynamics."
+    for adapts, advice in ((False, "mend the model, or adapt."), (True, "see the convergence of the deformation.")):
+        wrong = margins_enough(grid.problem, Loops((0,), (unstable,), integrator), adapts=adapts, planned=False)
+        assert wrong.change == f"With a right model and no adaptation the loop converges: {advice}"
     assert lost.evidence == (
         "largest closed-loop pole magnitude 1.1; a pole is outside the unit circle all along the reference"
     )

@@ -41,6 +41,7 @@ def comes_back(case: Case) -> Answer | None:
     basin = basin_of_plain_form(step, poles, rate, period, eigenvalue=eigenvalue)
     ratio = basin / max(error, 1e-300)
     text = f"errors up to {error:.3g} are predicted; it comes back from a single one of {basin:.3g}, {ratio:.3g} times as large"
+    text += "" if ratio >= _SPARE else f", where {_SPARE:g} times are wanted, because errors that last add up"
     numbers = {"error": error, "basin": basin}
     if ratio >= _SPARE:
         return Answer(TEXT, Verdict.YES, text, "", numbers)
