@@ -87,7 +87,7 @@ from .sensing.observers.model_states import ModelStates
 from .sensing.observers.moving_horizon_states import MovingHorizonStates
 from .simulation.lyapunov_view import lyapunov_view
 from .simulation.machine import RunMonitor
-from .simulation.metrics import Metric, measure
+from .simulation.metrics import Metric, figures, measure
 from .simulation.pictures.base import Quantity
 from .simulation.pictures.over_time import OverTime
 from .simulation.pictures.portrait import Portrait
@@ -253,6 +253,7 @@ __all__ = [
     "compare",
     "compare_scenarios",
     "disturbed",
+    "figures",
     "linear_parameters",
     "load_problem",
     "load_run",

@@ -4,7 +4,8 @@ A file of the folder `entries` that defines `METRICS`, a tuple of `Metric`, adds
 `fpirhc.metrics` of another package, and `metrics = (...)` in a problem file.
 """
 
+from fpirhc.simulation.metrics import figures
 from fpirhc.simulation.metrics.base import Better, Metric
 from fpirhc.simulation.metrics.measuring import Metrics, known_metrics, measure, with_own_metrics
 
-__all__ = ["Better", "Metric", "Metrics", "known_metrics", "measure", "with_own_metrics"]
+__all__ = ["Better", "Metric", "Metrics", "figures", "known_metrics", "measure", "with_own_metrics"]

@@ -1,0 +1,172 @@
+"""Figures of merit of many fields, as metrics that a problem file lists: `metrics = (fp.figures.InBand("output.BIS", 40, 60),)`.
+
+Each function returns a `Metric` of one signal or of one `Quantity` over the cycles from `measure_from` on; a run that ended early
+has NaN. Two figures of one kind in a problem need names of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import checked_call
+from fpirhc.plant.motion import followed_units
+from fpirhc.simulation.metrics.base import Metric
+from fpirhc.simulation.metrics.window import measured_cycles
+from fpirhc.simulation.pictures.base import Quantity, numbers
+from fpirhc.simulation.run import Run
+from fpirhc.task.problem import Problem
+
+__all__ = ["Energy", "InBand", "Largest", "Nadir", "Norm", "Overshoot", "TimeOver", "Total"]
+What = str | Quantity
+
+
+@checked_call
+def InBand(what: What, low: float, high: float, *, name: str = "in_band", headline: bool = True) -> Metric:
+    """Return the share of the time in which low <= s <= high, from 0 to 1; larger is better.
+
+    Args:
+        what: signal of the run, 'output.BIS', or a Quantity.
+        low: smallest value of the band, in the signal's unit.
+        high: largest value of the band.
+        name: of the metric.
+        headline: whether it stands in short tables.
+
+    Raises:
+        InvalidValue: `low` is not below `high`.
+    """
+    if not low < high:
+        raise InvalidValue(f"InBand({what!r}): low is {low:g} and high is {high:g}; expected low < high")
+    return _figure(
+        name, what, lambda s, _: np.mean((s >= low) & (s <= high)), lambda *_: "1", headline, better="larger"
+    )
+
+
+@checked_call
+def TimeOver(what: What, level: float, *, name: str = "time_over", headline: bool = True) -> Metric:
+    """Return the time during which s > level, in the problem's unit of time; arguments as in `InBand`."""
+    return _figure(name, what, lambda s, period: np.sum(s > level) * period, lambda _, time: time, headline)
+
+
+@checked_call
+def Total(what: What, *, name: str = "total", headline: bool = True) -> Metric:
+    """Return the integral of s over time, the sum over the cycles times the period; arguments as in `InBand`."""
+    return _figure(name, what, lambda s, period: np.sum(s) * period, lambda unit, time: f"{unit} {time}", headline)
+
+
+@checked_call
+def Largest(what: What, *, name: str = "largest", headline: bool = True) -> Metric:
+    """Return the largest |s|; arguments as in `InBand`."""
+    return _figure(name, what, lambda s, _: np.max(np.abs(s)), lambda unit, _: unit, headline)
+
+
+@checked_call
+def Nadir(what: What, *, name: str = "nadir", headline: bool = True) -> Metric:
+    """Return the lowest s; larger is better, as of the frequency of a grid; arguments as in `InBand`."""
+    return _figure(name, what, lambda s, _: np.min(s), lambda unit, _: unit, headline, better="larger")
+
+
+@checked_call
+def Overshoot(judged: str, *, name: str = "overshoot", headline: bool = True) -> Metric:
+    """Return how far a judged quantity y goes beyond its reference r, in the direction in which the reference last changed.
+
+    It is max(sign_k (y_k - r_k), 0) over the cycles; sign_k is that of the last change of r, at first that of r_0 - y_0.
+
+    Args:
+        judged: coordinate or output, by name.
+        name: of the metric.
+        headline: whether it stands in short tables.
+    """
+
+    def beyond(problem: Problem, run: Run) -> float:
+        error, reference = run[f"true_error.{judged}"], run[f"reference.{judged}"]
+        changes = np.concatenate([[np.sign(error[0])], np.sign(np.diff(reference))])
+        latest = np.maximum.accumulate(np.where(changes != 0, np.arange(len(changes)), 0))
+        beyond = -changes[latest] * error
+        return float(max(beyond[measured_cycles(problem, run)].max(), 0.0))
+
+    unit = lambda problem, _: followed_units(problem.plant).get(judged, "")  # noqa: E731 -- one line says it
+    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline, finite=True)
+
+
+@checked_call
+def Energy(what: What, *, name: str = "energy", headline: bool = True) -> Metric:
+    """Return the integral of s^2 over time; the energy of a current through 1 Ohm; arguments as in `InBand`."""
+    return _figure(
+        name, what, lambda s, period: np.sum(s**2) * period, lambda unit, time: f"({unit})^2 {time}", headline
+    )
+
+
+@checked_call
+def Norm(whats: Sequence[str], *, power: float = 2.0, name: str = "norm", headline: bool = True) -> Metric:
+    """Return the L_p norm of several signals of one unit, (integral of sum |s_i|^p dt)^(1/p); for p = inf the largest |s_i|.
+
+    Args:
+        whats: signals of the run.
+        power: p, at least 1; math.inf is allowed.
+        name: of the metric.
+        headline: whether it stands in short tables.
+
+    Raises:
+        InvalidValue: p is below 1, or there is no signal.
+    """
+    if not power >= 1 or not whats:
+        raise InvalidValue(
+            f"Norm: power is {power:g} of {len(whats)} signals; expected at least 1 of at least one signal"
+        )
+
+    def norm(problem: Problem, run: Run) -> float:
+        late = measured_cycles(problem, run)
+        values = np.stack([np.abs(run[what][late]) for what in whats])
+        if np.isinf(power):
+            return float(values.max())
+        largest = values.max() or 1.0  # so that no power overflows
+        return float(largest * (np.sum((values / largest) ** power) * problem.period) ** (1 / power))
+
+    unit = (lambda problem, _: _unit(problem, whats[0])) if np.isinf(power) else ""
+    return Metric(name, partial(_of_whole_runs, norm), unit=unit, headline=headline, finite=True)
+
+
+def _figure(
+    name: str,
+    what: What,
+    figure: Callable[[np.ndarray, float], Any],
+    unit: Callable[[str, str], str],
+    headline: bool,
+    **fields: Any,
+) -> Metric:
+    """The metric of one signal: `figure` of its values and the period, `unit` of its unit and that of time."""
+
+    def function(problem: Problem, run: Run) -> float:
+        return float(figure(numbers(run, what)[measured_cycles(problem, run)], problem.period))
+
+    whole = partial(_of_whole_runs, function)
+    return Metric(
+        name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, finite=True, **fields
+    )
+
+
+def _of_whole_runs(function: Callable[[Problem, Run], float], problem: Problem, run: Run) -> float:
+    """NaN for a run that ended early or before it is measured."""
+    if run.stop is not None or not measured_cycles(problem, run).any():
+        return float("nan")
+    return function(problem, run)
+
+
+def _unit(problem: Problem, what: What) -> str:
+    """The unit of a state, an output, an error or an input; nothing for other signals."""
+    if isinstance(what, Quantity):
+        return what.unit
+    plant = problem.plant
+    units = {
+        **plant.inputs,
+        **followed_units(plant),
+        **dict(zip(plant.state.elements, plant.state.entry_units, strict=True)),
+    }
+    signal, _, element = what.partition(".")
+    higher = signal in ("realised", "nominal", "desired", "deformed", "plant_realised")
+    return "" if higher else units.get(element, "")
