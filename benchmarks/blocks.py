@@ -19,7 +19,7 @@ import numpy as np
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.simulation.loop import close_loop
-from fpirhc.simulation.simulate import disturbance_table, sensing_table
+from fpirhc.simulation.simulate import run_tables
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
 from fpirhc.task.problem import Problem
@@ -88,8 +88,7 @@ def accumulated(problem: Problem, controller: Controller) -> Callable[[], float]
     if not backend.compiled:
         sys.exit("this benchmark needs a C compiler")
     evaluator = Evaluator(backend.function)
-    drawn = disturbance_table(problem, 0, CHUNK), sensing_table(problem, 0, CHUNK)
-    for argument, table in zip(evaluator.arguments[1:], [t for t in drawn if t.shape[1]], strict=True):
+    for argument, table in zip(evaluator.arguments[1:], run_tables(problem, 0, CHUNK), strict=True):
         argument.reshape(CHUNK, -1)[:] = table
     start = loop.memory.start()
 
