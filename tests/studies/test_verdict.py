@@ -16,7 +16,7 @@ import fpirhc as fp
 from fpirhc.errors import NotSupported
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.metrics import Metrics, known_metrics
-from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.compare import _pair, compare
 from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.harm import partners
 from fpirhc.studies.comparison.outcome import Outcome
@@ -253,3 +253,17 @@ def test_without_a_pair_the_smallest_error_is_named(pair):
     """By the worst coordinate of each."""
     alone = [replace(entry(e, y=v), pair=None) for e, v in zip(pair, (0.25, 0.75), strict=True)]
     assert findings(alone, {}, None)[0].text.startswith("plain has the smallest rms error (0.25)")
+
+
+def test_a_pair_has_the_same_formulas_where_several_controllers_have_the_same_settings():
+    """Two costs that users wrote as functions look the same in a description of the settings."""
+    task = fp.load_problem("two_mass")
+    planner = task.controllers["RHC"].planner
+    assert planner is not None
+
+    def weighed(weight):
+        return fp.CustomCost(terms=lambda v: {"error": weight * (v.state.q1 - v.reference.q1) ** 2 + v.input.Q1**2})
+
+    heavy, light = (fp.RecedingHorizon(planner.optimiser, cost=weighed(w)) for w in (1e4, 1e2))
+    controllers = {"heavy": heavy, "light": light, "light+FPI": replace(light, deformation=fp.Affine(-1.0))}
+    assert _pair(controllers, "light+FPI") == "light"

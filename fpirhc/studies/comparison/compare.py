@@ -14,7 +14,7 @@ from fpirhc.contraction.gains import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved, without_deformation
 from fpirhc.deformation.base import automatic, innermost
-from fpirhc.describe import describe
+from fpirhc.describe import describe, identity
 from fpirhc.errors import FpirhcError, Mistakes, NotContractive, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -276,17 +276,24 @@ def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Pred
 def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:
     """The controller with the same settings and no adaptation."""
     try:
-        wanted = describe(without_deformation(controllers[name]))
+        wanted = without_deformation(controllers[name])
     except NotSupported:
         return None
-    plain = ((n, c) for n, c in controllers.items() if not c.deformation.adapts)
-    return next((other for other, controller in plain if describe(controller) == wanted), None)
+    return _same(wanted, {n: c for n, c in controllers.items() if not c.deformation.adapts})
 
 
 def _fixed(controllers: Mapping[str, Controller], learner: Controller) -> str | None:
     """The controller around which a learner is, with its fixed model."""
-    wanted = None if learner.inner is None else describe(learner.inner)
-    return next((name for name, one in controllers.items() if describe(one) == wanted), None)
+    return None if learner.inner is None else _same(learner.inner, controllers)
+
+
+def _same(wanted: Controller, controllers: Mapping[str, Controller]) -> str | None:
+    """The controller with these settings; where several have them, the one whose formulas are the same too."""
+    for said in (identity, describe):
+        for name, one in controllers.items():
+            if said(one) == said(wanted):
+                return name
+    return None
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
