@@ -33,7 +33,7 @@ from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.exogenous import Exogenous
-from fpirhc.task.problem import Problem
+from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
 from fpirhc.tracking.base import Tracking
 
 FORMER = {  # members of earlier versions
@@ -131,7 +131,7 @@ class Planner:
         )
 
     def planned(self, problem: Problem) -> Problem:
-        """Return the problem with the cost and the margins of the plans, and with limits that hold for the measured state."""
+        """Return the problem with the plans' cost, margins and share of a stage, and limits that hold for the measured state."""
         costed = problem if self.cost is None else replace(problem, cost=self.cost)
         if costed.horizon is None:
             return costed
@@ -140,6 +140,9 @@ class Planner:
             horizon = replace(horizon, margins=self.margins)
         if measured:
             horizon = replace(horizon, measured=measured)
+        cycles, stage = (count(horizon, problem.period) for count in (cycles_per_plan, cycles_per_stage))
+        if cycles < stage:
+            horizon = replace(horizon, share=cycles / stage)
         return costed if horizon is costed.horizon else replace(costed, horizon=horizon)
 
     def check_weights(self, problem: Problem) -> None:

@@ -1,8 +1,8 @@
 """Receding-horizon control whose nominal acceleration is deformed.
 
-Every n-th cycle (one stage of the horizon) the optimiser plans inputs u_0 ... u_{N-1} with the approximate model. The
-response that the model gives to the plan's first input is the nominal one; it is re-evaluated in every cycle at the measured
-(or propagated) state, deformed, inverted, and applied. The deformation changes the command by
+Every n-th cycle, once per stage or as `Horizon(replan=...)` says, the optimiser plans inputs u_0 ... u_{N-1} with the approximate
+model. The response that the model gives to the plan's first input is the nominal one; it is re-evaluated in every cycle at the
+measured (or propagated) state, deformed, inverted, and applied. The deformation changes the command by
 
     delta = command - planned input,
 
@@ -53,7 +53,7 @@ from fpirhc.symbolic.functions import nan_where, numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, live_numbers, nominal, settled
 from fpirhc.task.exogenous import previewed_values
-from fpirhc.task.problem import Problem, cycles_per_stage
+from fpirhc.task.problem import Problem, cycles_per_plan
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
@@ -109,7 +109,7 @@ class RecedingHorizon(Controller):
         problem = self.planner.planned(problem)
         assert problem.horizon is not None
         plant = problem.plant
-        cycles = cycles_per_stage(problem.horizon, problem.period)
+        cycles = cycles_per_plan(problem.horizon, problem.period)
         before, after, late, remembered = self.replanning.parts(problem)
         plan = every(_plan_block(problem, self.optimiser, self.on_failure), cycles)
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
@@ -27,12 +28,17 @@ class Horizon(Checked):
         margins: by name of a state, the distances by which a plan stays inside the state's limits after stages 1 ... N, in the
             state's unit: room for what the model does not predict (`tightened` computes them). The problem's limits stay as they
             are for the run and its metrics.
+        replan: when the next plan is made: after one "stage", after one control "cycle", or after so many cycles, at most those of
+            a stage. Where a plan follows sooner than a stage, the horizon begins at the cycle's own time, the last plan is
+            interpolated to the new stages, and the change of the first input counts with the time that it takes: the limit of
+            its rate holds from plan to plan, and its cost is stages per plan times that of a later change.
+        share: of a stage, the time from plan to plan. Controllers fill it in from `replan`.
         measured: names of states whose limits hold for the measured state: for the plan's plus the distance of the measured one
             from the plan's start. Controllers fill it in where a plan starts elsewhere, see `fpirhc.horizon.consistent_state`.
 
     Raises:
-        InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, or margins that are not one
-            finite number of at least 0 for every stage.
+        InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, margins that are not one
+            finite number of at least 0 for every stage, or plans that follow in no whole number of cycles.
         NotSupported: an integrator that is not made of plain expressions.
     """
 
@@ -45,8 +51,17 @@ class Horizon(Checked):
         default_factory=dict, hash=False, metadata={"setting": "where given"}
     )
     measured: tuple[str, ...] = field(default=(), kw_only=True, metadata={"setting": False})
+    replan: Literal["stage", "cycle"] | Count = field(
+        default="stage", kw_only=True, metadata={"setting": "where given"}
+    )
+    share: float = field(default=1.0, kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
+        whole = isinstance(self.replan, int) and not isinstance(self.replan, bool) and self.replan >= 1
+        if not whole and self.replan not in ("stage", "cycle"):
+            raise InvalidValue(
+                f'horizon: replan must be "stage", "cycle" or a whole number of control cycles from 1, got {self.replan!r}'
+            )
         if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):
             raise InvalidValue(
                 f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"

@@ -50,6 +50,7 @@ class OptimalControl:
         along: quadratic model of the cost along the reference.
         written: number of the last entries of the state, which are limits of rates, paths and the end; they are zero in s_0.
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
+        shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
         settings: paths of the live settings, whose numbers are among the data.
         live_bounds: paths of the live limits of inputs, which are arguments of a call.
         derive: function of the numbers of settings, by path, that returns the numbers that the cost computes from them.
@@ -78,6 +79,7 @@ class OptimalControl:
     along: _ReferenceExpansion
     written: int
     state_price: np.ndarray
+    shares: np.ndarray
     settings: tuple[str, ...] = ()
     live_bounds: tuple[str, ...] = ()
     derive: Callable[[Mapping[str, float]], dict[str, float]] | None = None

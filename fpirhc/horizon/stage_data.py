@@ -30,7 +30,8 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     """Layout of one stage's data.
 
     A terminal equality adds whether the stage is the last, and the reference after it; blocks add whether the inputs are free.
-    Limits that hold for the measured state add its distance from the plan's start.
+    Limits that hold for the measured state add its distance from the plan's start. Plans that follow sooner than a stage add the
+    haste of the change of inputs: stages per time between two plans in the first stage, 1 in all others.
     """
     free = (scalar("free"),) if horizon.blocks else ()
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
@@ -38,6 +39,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     margin = (Signal("margin", names, tuple(units[e] for e in names)),) if names else ()
     shown = horizon.measured
     offset = (Signal("offset", shown, tuple(units[e] for e in shown)),) if shown else ()
+    haste = (scalar("haste"),) if horizon.share < 1 else ()
     signals = (
         time_signal(plant),
         Signal("reference", plant.output.elements, plant.output.units),
@@ -46,6 +48,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
         *free,
         *margin,
         *offset,
+        *haste,
     )
     if not horizon.terminal:
         return Layout(signals)
@@ -77,7 +80,8 @@ def stage_data(
     zero = matrix.zeros(plant.input.size)
     needed = feedforward(plant, state, response, p) if cost.uses_feedforward else zero
     # The live rows come out of the same call where they follow these rows: joining tables would copy both.
-    joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins or horizon.measured)
+    plain = not (horizon.blocks or horizon.terminal or horizon.margins or horizon.measured) and horizon.share == 1
+    joined = bool(live) and plain
     rows = [matrix.sym("live", live)] if joined else []
     stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
     one = ca.Function("fpirhc_stage_data", [t, *motion, of_cycle, *rows], [stage])
@@ -98,6 +102,8 @@ def stage_data(
         table = ca.vertcat(table, margins)
     if horizon.measured:
         table = ca.vertcat(table, np.zeros((len(horizon.measured), nodes)))
+    if horizon.share < 1:
+        table = ca.vertcat(table, np.array([[1 / horizon.share, *np.ones(nodes - 1)]]))
     if horizon.terminal:
         last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
         last[0, nodes - 2] = 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import casadi as ca
@@ -134,6 +134,7 @@ def _transcribed(
         runaway=lambda: spurious_growth(
             plant, horizon.discretisation, horizon.step, nodes[0][: plant.state.size, :-1], nodes[1]
         ),
+        shares=np.full(horizon.stages, horizon.share),
         functions=functions,
     )
     return ocp.at(values)
@@ -171,11 +172,14 @@ def _stage_expressions(
     u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
     data = layout.split(theta)
     applied = data["free"] * u + (1 - data["free"]) * before if horizon.blocks else u
-    view = _view(plant, ca.vertcat(x, before), applied, data, cost, keeps_input)
+    view = limited_view = _view(plant, ca.vertcat(x, before), applied, data, cost, keeps_input)
+    if horizon.share < 1 and keeps_input:
+        # A rate is limited as such; its square costs for as long as the change takes, which leaves the root of the haste.
+        limited_view, view = (_hastened(view, factor) for factor in (data["haste"], ca.sqrt(data["haste"])))
     try:
         advance = _advance(plant, horizon)
         x_next = advance(x, applied, view.parameters.vector)
-        written = _written(plant, horizon, limits, view, x_next, data)
+        written = _written(plant, horizon, limits, limited_view, x_next, data)
         soft = softened(written, limits, plant, _seen(plant, horizon, x, data))
         terms = {**_scalar_terms(cost.stage(view)), **soft}
         if horizon.blocks:
@@ -295,6 +299,12 @@ def _view(
         time=data["time"],
         output=_outputs(plant, s[:nx], data["parameters"]),
     )
+
+
+def _hastened(view: View, factor: Expression) -> View:
+    """The view with so many times the change of the input."""
+    u, before = view.input, view.input_before
+    return replace(view, input_before=Named(tuple(before), u.vector - factor * (u.vector - before.vector), "input"))
 
 
 def _outputs(plant: Plant, x: Expression, p: Expression) -> Named:

@@ -81,7 +81,7 @@ class Optimiser(Checked, ABC):
 
     @abstractmethod
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-        """Return the memory for a horizon that starts one stage later.
+        """Return the memory for the next horizon, which starts one stage later, or a share `ocp.shares` of every stage.
 
         Args:
             ocp: the problem.
@@ -140,14 +140,30 @@ def require_settings(owner: str, iterations: int, tolerance: float) -> None:
         raise InvalidValue(f"{owner} needs a positive tolerance, got {tolerance}")
 
 
-def shift(columns: ca.MX) -> ca.MX:
-    """Return the columns without the first stage and with the last one twice: the warm start of the next call."""
+def stage_later(columns: ca.MX) -> ca.MX:
+    """Return the columns without the first stage and with the last one twice."""
     return columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])
 
 
-def shift_gains(gains: ca.MX, size: int) -> ca.MX:
-    """Return a column of feedback one stage later, `size` entries a stage; the last stage, which is repeated, has none."""
-    return ca.vertcat(gains[size:, 0], ca.MX.zeros(size))  # [size:] alone is a row where there is one entry
+def shift(columns: ca.MX, ocp: OptimalControl) -> ca.MX:
+    """Return one column per stage for the next horizon: the warm start of the next call.
+
+    A share of a stage later they are the means (1 - share) c_i + share c_{i+1} of what the plan foresees there.
+    """
+    shares = np.append(ocp.shares, ocp.shares[-1])[None, : columns.shape[1]]  # s_0 ... s_N are one more
+    return _moved(columns, stage_later(columns), shares)
+
+
+def shift_gains(gains: ca.MX, size: int, ocp: OptimalControl) -> ca.MX:
+    """Return a column of feedback for the next horizon, `size` entries a stage; the last stage, which is repeated, has none."""
+    later = ca.vertcat(gains[size:, 0], ca.MX.zeros(size))  # [size:] alone is a row where there is one entry
+    return _moved(gains, later, np.repeat(ocp.shares, size)[:, None])
+
+
+def _moved(now: ca.MX, later: ca.MX, shares: np.ndarray) -> ca.MX:
+    if (shares == 1).all():
+        return later
+    return now + ca.repmat(ca.DM(shares), now.shape[0] // shares.shape[0], 1) * (later - now)
 
 
 def clip(columns: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:

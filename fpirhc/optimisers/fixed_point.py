@@ -18,7 +18,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Optimiser, first_plan, require_settings, sane, shift
+from fpirhc.optimisers.base import Optimiser, first_plan, require_settings, sane, stage_later
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
 from fpirhc.optimisers.plain import MOST, PlainSettings, plain_memory, plain_step, shifted_plain
@@ -180,7 +180,7 @@ def _better(
     warm = ca.logic_and(before["plan_step"] > 0, evaluated)
     begin = {name: ca.MX.zeros(plan[name].size) for name in plan.names}
     begin["plan_inputs"] = ca.if_else(warm, plain_memory["plan_inputs"], before["plan_inputs"])
-    states = ca.vec(shift(ca.reshape(plain_memory["plan_states"], ns, n)))
+    states = ca.vec(stage_later(ca.reshape(plain_memory["plan_states"], ns, n)))
     begin |= {"plan_states": ca.if_else(warm, states, 0), "plan_gains": ca.if_else(warm, plain_memory["plan_gains"], 0)}
     begin["plan_barrier"] = ca.if_else(warm, MU_WARM, 0)
     second = limited(*arguments[:4], plan.join(begin))

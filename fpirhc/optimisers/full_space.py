@@ -85,7 +85,9 @@ class FullSpaceFixedPoint(Optimiser):
         """Everything one stage later."""
         rows = {"plan_states": ocp.state.size, "plan_inputs": ocp.input.size, "plan_multipliers": ocp.state.size}
         parts = self.memory(ocp).split(memory)
-        return self.memory(ocp).join({k: ca.vec(shift(ca.reshape(v, rows[k], ocp.stages))) for k, v in parts.items()})
+        return self.memory(ocp).join(
+            {k: ca.vec(shift(ca.reshape(v, rows[k], ocp.stages), ocp)) for k, v in parts.items()}
+        )
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Every call does the same `iterations`."""

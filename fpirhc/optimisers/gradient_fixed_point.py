@@ -82,7 +82,7 @@ class GradientFixedPoint(Optimiser):
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The plan one stage later."""
-        return ca.vec(shift(ca.reshape(memory, ocp.input.size, ocp.stages)))
+        return ca.vec(shift(ca.reshape(memory, ocp.input.size, ocp.stages), ocp))
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Every call does the same `iterations`."""

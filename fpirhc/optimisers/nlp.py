@@ -93,7 +93,7 @@ class MultipleShooting(Optimiser):
         """The plan and the multipliers one stage later."""
         parts = self.memory(ocp).split(memory)
         shifted_parts = {
-            "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], ocp.input.size, ocp.stages))),
+            "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], ocp.input.size, ocp.stages), ocp)),
             "plan_variable_multipliers": shift_variables(ocp, parts["plan_variable_multipliers"]),
             "plan_dynamics_multipliers": shift_dynamics(ocp, parts["plan_dynamics_multipliers"]),
         }
@@ -213,13 +213,13 @@ def _stage_bounds(ocp: OptimalControl, s0: ca.MX, bound: np.ndarray) -> ca.MX:
 def shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
     """Return variables, or their multipliers, one stage later."""
     states, inputs = separate(ocp, column)
-    return interleave(shift(states), shift(inputs))
+    return interleave(shift(states, ocp), shift(inputs, ocp))
 
 
 def shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
     """Return multipliers of the dynamics one stage later."""
     stages: ca.MX = ca.reshape(column, ocp.state.size, ocp.stages)
-    return ca.vec(shift(stages))
+    return ca.vec(shift(stages, ocp))
 
 
 def program(ocp: OptimalControl) -> dict[str, ca.MX]:

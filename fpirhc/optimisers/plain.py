@@ -85,9 +85,9 @@ def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
     layout, ns, nu, n = plain_memory(ocp), ocp.state.size, ocp.input.size, ocp.stages
     parts = layout.split(memory)
     shifted_parts = {
-        "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], nu, n))),
-        "plan_states": ca.vec(shift(ca.reshape(parts["plan_states"], ns, n))),
-        "plan_gains": shift_gains(parts["plan_gains"], nu * ns),
+        "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], nu, n), ocp)),
+        "plan_states": ca.vec(shift(ca.reshape(parts["plan_states"], ns, n), ocp)),
+        "plan_gains": shift_gains(parts["plan_gains"], nu * ns, ocp),
     }
     return layout.join({**parts, **shifted_parts})
 

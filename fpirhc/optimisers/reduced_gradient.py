@@ -72,7 +72,7 @@ class ReducedGradient(Optimiser):
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The plan one stage later, and the same step length."""
         plan = ca.reshape(memory[:-1], ocp.input.size, ocp.stages)
-        return ca.vertcat(ca.vec(shift(plan)), memory[-1])
+        return ca.vertcat(ca.vec(shift(plan, ocp)), memory[-1])
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Every call does the same `iterations`."""

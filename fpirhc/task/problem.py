@@ -323,7 +323,7 @@ def _check_times(problem: Problem, mistakes: Mistakes) -> None:
         mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
     if problem.horizon is not None:
         try:
-            cycles_per_stage(problem.horizon, problem.period, unit)
+            cycles_per_plan(problem.horizon, problem.period, unit)
         except InvalidValue as error:
             mistakes.add(str(error))
 
@@ -342,6 +342,24 @@ def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:
             f"use a step of {whole * period:g} {unit} or a period of {horizon.step / whole:g} {unit}"
         )
     return round(ratio)
+
+
+def cycles_per_plan(horizon: Horizon, period: float, unit: str = "s") -> int:
+    """Return how many control cycles pass from plan to plan.
+
+    Raises:
+        InvalidValue: the period does not divide the horizon step, or a plan would be older than a stage.
+    """
+    stage = cycles_per_stage(horizon, period, unit)
+    if isinstance(horizon.replan, str):
+        return stage if horizon.replan == "stage" else 1
+    cycles = horizon.replan
+    if cycles > stage:
+        raise InvalidValue(
+            f"a plan every {cycles} cycles is older than its first stage, which lasts {stage} cycles ({horizon.step:g} {unit}); "
+            f"use Horizon(replan={stage}) or fewer, or longer stages"
+        )
+    return cycles
 
 
 def _check_start(problem: Problem, mistakes: Mistakes) -> None:

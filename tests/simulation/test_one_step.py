@@ -38,6 +38,18 @@ def shipped(name: str, controller: str) -> Callable[[], Loop]:
     return make
 
 
+def in_every_cycle(name: str, controller: str) -> Callable[[], Loop]:
+    """A shipped problem whose stages last longer than a cycle, with a plan in every cycle."""
+
+    def make() -> Loop:
+        problem, chosen = shipped(name, controller)()
+        assert problem.horizon is not None
+        assert problem.horizon.step > 1.5 * problem.period
+        return replace(problem, horizon=replace(problem.horizon, replan="cycle")), chosen
+
+    return make
+
+
 def believing(
     name: str, observer: Any, estimator: Any, measured: str, controller: Controller | str
 ) -> Callable[[], Loop]:
@@ -103,6 +115,8 @@ LOOPS: dict[str, Callable[[], Loop]] = {
     "map with signals": shipped("freeway_metering", "CTC+FPI"),
     "cascade": shipped("heat_exchanger", "Cascade"),
     "noise": shipped("noisy_motor", "RHC+FPI"),
+    "plans between stages": in_every_cycle("noisy_motor", "RHC+FPI"),
+    "predicted plans between stages": in_every_cycle("delayed_mass", "RHC+FPI"),
     "prediction": shipped("delayed_mass", "RHC+FPI"),
     "slots": shipped("cart_pole_slots", "slots+FPI"),
     "learning": shipped("turbojet", "RHC offset-free"),

@@ -38,7 +38,7 @@ class HeavyBall(Optimiser):
 
     def shifted(self, ocp, memory):
         """The plan one stage later."""
-        return ca.vec(shift(ca.reshape(memory, ocp.input.size, ocp.stages)))
+        return ca.vec(shift(ca.reshape(memory, ocp.input.size, ocp.stages), ocp))
 
     def step(self, ocp):
         """Every call does the same work."""

@@ -21,7 +21,7 @@ from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.simulate import simulate
 from fpirhc.status import Status
 from fpirhc.summary import in_percent
-from fpirhc.task.problem import Problem, cycles_per_stage
+from fpirhc.task.problem import Problem, cycles_per_plan
 
 TEXT = "Do the optimiser's iterations suffice for this horizon?"
 MANY = 0.05  # share of the cycles from which plans that did not converge are a cause
@@ -36,7 +36,7 @@ def iterations_suffice(case: Case) -> Answer | None:
         return None
     try:
         bare = without_deformation(case.controller)
-        model = shortened(null_problem(case.problem, bare), _PLANS * cycles_per_stage(horizon, case.problem.period))
+        model = shortened(null_problem(case.problem, bare), _PLANS * cycles_per_plan(horizon, case.problem.period))
         share, later = case.runs.once((TEXT, identity(bare)), lambda: unsolved(model, bare))
     except FpirhcError as error:
         return Answer(TEXT, Verdict.UNKNOWN, f"no run of the model: {error}")

@@ -13,7 +13,7 @@ from fpirhc.simulation.metrics import Metrics
 from fpirhc.status import Status
 from fpirhc.studies.comparison.optimality import Optimality
 from fpirhc.summary import in_percent
-from fpirhc.task.problem import Problem, cycles_per_stage
+from fpirhc.task.problem import Problem, cycles_per_plan
 
 _MUCH = 1e-2  # relative cost above the optimum
 
@@ -22,7 +22,7 @@ def plan_every(problem: Problem, controller: Controller) -> int:
     """Return the number of cycles from plan to plan; 1 for a controller that does not plan."""
     if controller.planner is None or problem.horizon is None:
         return 1
-    return cycles_per_stage(problem.horizon, problem.period)
+    return cycles_per_plan(problem.horizon, problem.period)
 
 
 def has_exact_model(problem: Problem, controller: Controller) -> bool:

@@ -22,7 +22,7 @@ from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.native import native
 from fpirhc.task.exogenous import model_values, previewed_values, rows_of, signals_of
-from fpirhc.task.problem import Problem, cycles_per_stage
+from fpirhc.task.problem import Problem, cycles_per_plan
 
 SAMPLES = 25  # plans of a run that are solved again
 _OTHER = 1e-6  # relative; closer to the optimum a negative excess is the accuracy of the solves
@@ -83,7 +83,7 @@ def measure_optimality(
     of_measured = shifted_reference(planned.plant, ocp.data, ocp.stages + 1) if planned.plant.outputs else None
     offset = offset_limits(planned.plant, planned.horizon, ocp.data) if planned.horizon.measured else None
     begin = consistent_state(planned.plant) if planner.starts_consistent(planned.plant) else None
-    stride = cycles_per_stage(problem.horizon, problem.period)
+    stride = cycles_per_plan(problem.horizon, problem.period)
     plans = np.arange(stride, run.cycles, stride)
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
     times = np.ravel(times)

@@ -13,7 +13,7 @@ from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
-from fpirhc.task.problem import Problem, cycles_per_stage
+from fpirhc.task.problem import Problem, cycles_per_plan
 
 REPLAYED = 2000  # cycles of the run that are stepped again, one by one
 ROUNDS = 40  # in which two controllers are timed in turn
@@ -62,7 +62,7 @@ def measure_price(problem: Problem, plain: tuple[Stepper, Run], adaptive: tuple[
     The result is None for runs of fewer than ten plans.
     """
     cycles = min(plain[1].cycles, adaptive[1].cycles, REPLAYED)
-    stride = cycles_per_stage(problem.horizon, problem.period) if problem.horizon else 1
+    stride = cycles_per_plan(problem.horizon, problem.period) if problem.horizon else 1
     block = max(cycles // ROUNDS // stride, 1) * stride  # whole periods of the plan
     rounds = cycles // block
     if rounds < _FEWEST:
@@ -156,7 +156,7 @@ def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | N
         taken[k] = time.perf_counter_ns() - begin
     micro = taken / 1e3
     later = micro[1:]
-    stride = cycles_per_stage(problem.horizon, problem.period) if problem.horizon and "solve" in run.layout else 1
+    stride = cycles_per_plan(problem.horizon, problem.period) if problem.horizon and "solve" in run.layout else 1
     plans = micro[stride::stride] if cycles > stride else micro
     # Whole plan periods: where every other cycle plans, the median of single cycles would be the one or the other by chance.
     whole = later[: later.size - later.size % stride] if later.size >= stride else later

@@ -1,0 +1,216 @@
+"""Plans that follow one another sooner than a stage: `Horizon(replan=...)`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import pendulum
+
+import fpirhc as fp
+from fpirhc.controllers.contract import with_optimiser
+from fpirhc.controllers.receding_horizon import _optimal_control
+from fpirhc.errors import FpirhcError
+from fpirhc.task.problem import cycles_per_plan
+
+STAGES, STEP, PERIOD = 6, 0.08, 0.02
+WEIGHTS = {"angle": 40.0, "angle'": 1.0}
+EFFORT, RATE, FASTEST = 1e-3, 0.05, 12.0
+CONVERGED = fp.FixedPoint(iterations=30, tolerance=1e-9)
+
+
+def swing(t):
+    return {"angle": 0.6 * ca.sin(1.5 * t)}
+
+
+def task(replan="cycle", *, mass=1.0, believed=1.4, **changed):
+    values: dict[str, Any] = {
+        "plant": pendulum(mass, believed),
+        "reference": fp.Trajectory(swing),
+        "start": {"angle": 0.3},
+        "period": PERIOD,
+        "duration": 0.6,
+        "limits": fp.Limits(inputs={"torque": (-6.0, 6.0)}),
+        "horizon": fp.Horizon(stages=STAGES, step=STEP, replan=replan),
+        "cost": fp.Quadratic(states=WEIGHTS, effort={"torque": EFFORT}),
+    }
+    return fp.Problem(**values | changed)
+
+
+def planning(optimiser=CONVERGED, deformation=None):
+    return fp.RecedingHorizon(optimiser, deformation or fp.Identity())
+
+
+def own_plan(problem, time, state, before, *, rate=0.0, fastest=np.inf, between=PERIOD):
+    """First input of the horizon that begins at this time, by a program of its own and IPOPT.
+
+    The first change of the input takes the time between two plans; every other one takes a stage. Its cost is the integral of the
+    squared rate, in units in which a change from stage to stage costs its weight.
+    """
+    p = problem.plant.approximate
+    rate_of = problem.plant.equations.rate
+    opti = ca.Opti()
+    u: Any = opti.variable(STAGES)
+    x: Any = ca.DM(state)
+    cost: Any = 0
+    last: Any = before
+    taken = between
+    for i in range(STAGES):
+        q = 0.6 * np.sin(1.5 * (time + i * STEP))
+        v = 0.9 * np.cos(1.5 * (time + i * STEP))
+        cost += STEP * (WEIGHTS["angle"] * (x[0] - q) ** 2 + WEIGHTS["angle'"] * (x[1] - v) ** 2 + EFFORT * u[i] ** 2)
+        cost += STEP * rate * (u[i] - last) ** 2 * STEP / taken
+        if np.isfinite(fastest):
+            opti.subject_to(opti.bounded(-fastest * taken, u[i] - last, fastest * taken))
+        k1 = rate_of(x, u[i], p)
+        k2 = rate_of(x + STEP / 2 * k1, u[i], p)
+        k3 = rate_of(x + STEP / 2 * k2, u[i], p)
+        k4 = rate_of(x + STEP * k3, u[i], p)
+        x, last, taken = x + STEP / 6 * (k1 + 2 * k2 + 2 * k3 + k4), u[i], STEP
+    end = time + STAGES * STEP
+    cost += STEP * WEIGHTS["angle"] * (x[0] - 0.6 * np.sin(1.5 * end)) ** 2
+    cost += STEP * WEIGHTS["angle'"] * (x[1] - 0.9 * np.cos(1.5 * end)) ** 2
+    opti.minimize(cost)
+    opti.subject_to(opti.bounded(-6.0, u, 6.0))
+    opti.solver("ipopt", {"print_time": 0}, {"print_level": 0, "sb": "yes", "tol": 1e-11})
+    return float(np.ravel(opti.solve().value(u))[0])
+
+
+@pytest.mark.parametrize("replan", ["stage", "cycle", 3])
+@pytest.mark.parametrize(("rate", "fastest"), [(0.0, np.inf), (RATE, np.inf), (0.0, FASTEST)])
+def test_every_plan_is_that_of_an_independent_program_at_its_own_time(replan, rate, fastest):
+    limits = fp.Limits(
+        inputs={"torque": (-6.0, 6.0)}, rates={"torque": (-FASTEST, FASTEST)} if np.isfinite(fastest) else {}
+    )
+    cost = fp.Quadratic(states=WEIGHTS, effort={"torque": EFFORT}, rate={"torque": rate} if rate else {})
+    problem = task(replan, limits=limits, cost=cost)
+    run = fp.simulate(problem, planning(), seed=0)
+    every = cycles_per_plan(problem.horizon, PERIOD)
+    assert every == {"stage": 4, "cycle": 1, 3: 3}[replan]
+    command, states = run["command"][:, 0], run["state"]
+    for k in range(every, run.cycles, 2 * every):
+        expected = own_plan(
+            problem, run.time[k], states[k], command[k - 1], rate=rate, fastest=fastest, between=every * PERIOD
+        )
+        assert command[k] == pytest.approx(expected, abs=2e-4)
+    changes = np.flatnonzero(np.abs(np.diff(command)) > 1e-9) + 1
+    assert (changes % every == 0).all()
+
+
+def test_a_plan_at_a_boundary_of_stages_is_that_of_a_plan_per_stage():
+    """Plans that are solved do not depend on how they were warm started: the same state and time give the same plan."""
+    each, per_stage = (planning(fp.FixedPoint(iterations=30, tolerance=1e-10)) for _ in range(2))
+    one = fp.simulate(task("stage"), per_stage, seed=0)
+    later = fp.simulate(task("cycle"), each, seed=0)
+    assert later["command"][0] == pytest.approx(one["command"][0], abs=1e-9)
+    again = fp.simulate(task(4), each, seed=0)
+    np.testing.assert_array_equal(again["command"], one["command"])
+
+
+@pytest.mark.parametrize("fastest", [np.inf, FASTEST])
+def test_a_limited_rate_holds_from_cycle_to_cycle(fastest):
+    rates = {"torque": (-fastest, fastest)} if np.isfinite(fastest) else {}
+    limits = fp.Limits(inputs={"torque": (-6.0, 6.0)}, rates=rates)
+    run = fp.simulate(task(limits=limits), planning(), seed=0)
+    largest = np.abs(np.diff(run["command"][:, 0])).max() / PERIOD
+    assert largest <= 1.001 * FASTEST if rates else largest > 2 * FASTEST
+
+
+OPTIMISERS = {
+    "fixed point": fp.FixedPoint(iterations=3, tolerance=1e-6),
+    "gradient": fp.GradientFixedPoint(iterations=400, tolerance=1e-4),
+    "full space": fp.FullSpaceFixedPoint(iterations=4000, tolerance=1e-3),
+    "reduced gradient": fp.ReducedGradient(iterations=60, tolerance=1e-5),
+    "interior point": fp.Ipopt(tolerance=1e-6),
+    "sequential quadratic": fp.SequentialQuadratic(tolerance=1e-6),
+    "ladder": fp.Ladder(fp.FixedPoint(iterations=1, tolerance=1e-6), fp.Ipopt(tolerance=1e-6)),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMISERS)
+def test_a_warm_start_is_what_the_plan_foresees_on_the_next_stages(name):
+    """A plan whose inputs lie on a line is, a quarter of a stage later, the same line; only its repeated end is not."""
+    problem, optimiser = task(), OPTIMISERS[name]
+    ocp = _optimal_control(planning(optimiser).planner.planned(problem), optimiser)
+    layout = optimiser.memory(ocp)
+    memory = layout.start()
+    memory[layout.slice("plan_inputs")] = 1.0 + 0.5 * np.arange(STAGES)
+    column = ca.MX.sym("memory", layout.size)
+    moved = ca.Function("moved", [column], [optimiser.shifted(ocp, column)])(memory).full().ravel()
+    plan = moved[layout.slice("plan_inputs")]
+    np.testing.assert_allclose(plan[:-1], 1.0 + 0.5 * (np.arange(STAGES - 1) + PERIOD / STEP), atol=1e-12)
+    assert plan[-1] == 1.0 + 0.5 * (STAGES - 1)
+
+
+@pytest.mark.parametrize("name", sorted(OPTIMISERS.keys() - {"full space"}))  # which needs thousands of iterations
+def test_every_optimiser_follows_the_same_plans(name):
+    problem = task(limits=fp.Limits())
+    expected = fp.simulate(problem, planning(), seed=0)["command"]
+    found = fp.simulate(problem, planning(OPTIMISERS[name]), seed=0)["command"]
+    np.testing.assert_allclose(found, expected, atol=2e-2)
+
+
+def test_on_an_exact_model_one_iteration_from_the_interpolated_plan_is_as_good_as_a_solved_plan():
+    problem = task(mass=1.0, believed=1.0)
+    solved = fp.simulate(problem, planning(), seed=0)["command"]
+    one = fp.simulate(problem, planning(fp.FixedPoint(iterations=1, tolerance=1e-6)), seed=0)["command"]
+    np.testing.assert_allclose(one, solved, atol=1e-3)
+
+
+LIMITED = fp.Limits(inputs={"torque": (-6.0, 6.0)}, states={"angle": (-0.5, 0.5)})
+TASKS = {
+    "Euler": lambda: task(horizon=fp.Horizon(STAGES, STEP, fp.Euler(2), replan="cycle")),
+    "implicit": lambda: task(horizon=fp.Horizon(STAGES, STEP, fp.ImplicitMidpoint(), replan="cycle")),
+    "limits of rates": lambda: task(limits=replace(LIMITED, rates={"torque": (-FASTEST, FASTEST)}), replan=2),
+    "soft limits": lambda: task(limits=replace(LIMITED, soft={"angle": 100.0})),
+    "the end": lambda: task(horizon=fp.Horizon(STAGES, STEP, terminal=("angle",), replan="cycle")),
+    "blocks": lambda: task(horizon=fp.Horizon(STAGES, STEP, blocks=(1, 2, 3), replan="cycle")),
+    "dead time": lambda: task(dead_time=fp.DeadTime(inputs={"torque": 2 * PERIOD})),
+}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_what_a_problem_can_have_goes_with_a_plan_in_every_cycle(name):
+    """Errors are not larger than with a plan per stage; a rate that is limited from plan to plan jumps less."""
+    problem = TASKS[name]()
+    controller = planning(fp.FixedPoint(iterations=3, tolerance=1e-4), fp.Affine(gain=-0.3))
+    if name == "dead time":
+        controller = fp.Predicted(controller, inputs=2 * PERIOD)
+    per_stage = replace(problem, horizon=replace(problem.horizon, replan="stage"))
+    each, one = (fp.simulate(p, controller, seed=0, compiled=False) for p in (problem, per_stage))
+    assert each.stop is None
+    assert np.sqrt(np.mean(each["error"] ** 2)) <= (1.3 if problem.limits.rates else 1.02) * np.sqrt(
+        np.mean(one["error"] ** 2)
+    )
+
+
+@pytest.mark.parametrize(
+    ("replan", "message"),
+    [
+        (5, "a plan every 5 cycles is older than its first stage, which lasts 4 cycles"),
+        (0, "replan"),
+        ("often", "replan"),
+        (1.5, "replan"),
+    ],
+)
+def test_a_wrong_interval_is_named(replan, message):
+    with pytest.raises(FpirhcError, match=message):
+        task(replan)
+
+
+@pytest.mark.parametrize("name", ["anaesthesia_stimulated", "fishery", "leaking_tanks"])
+def test_outputs_and_maps_are_planned_between_stages(name):
+    """With stages of three cycles a plan in every cycle is that of IPOPT, and a deformation bears it."""
+    task = fp.load_problem(name)
+    problem, controllers = task.problem, task.controllers
+    assert problem.horizon is not None
+    horizon = replace(problem.horizon, stages=10, step=3 * problem.period, blocks=(), margins={}, replan="cycle")
+    problem = replace(problem, duration=60 * problem.period, measure_from=0.0, horizon=horizon)
+    ways = [with_optimiser(controllers["RHC"], one) for one in (CONVERGED, fp.Ipopt(tolerance=1e-8))]
+    runs = [fp.simulate(problem, way, seed=0, compiled=False) for way in (*ways, controllers["RHC+FPI"])]
+    assert [run.stop for run in runs] == [None, None, None]
+    scale = np.abs(runs[1]["command"]).max()
+    np.testing.assert_allclose(runs[0]["command"], runs[1]["command"], atol=1e-4 * scale)
