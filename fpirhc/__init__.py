@@ -15,12 +15,14 @@ _import, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
 def __getattr__(name: str) -> object:
     if name in __all__:
         return _import(name)
+    if name.startswith("_"):  # tools look for such names in whatever they meet, and nobody means a public one by them
+        raise AttributeError(f"module 'fpirhc' has no attribute '{name}'")
     from fpirhc.errors import InvalidName, nearest
     from fpirhc.members import FORMER, public_member
 
     if name in FORMER:
         raise InvalidName(f"fpirhc.{name} is called fpirhc.{FORMER[name]} now.")
-    member = None if name.startswith("_") else public_member(name)
+    member = public_member(name)
     if member is None:
         raise InvalidName(f"fpirhc has no name '{name}'.{nearest(name, __all__)}")
     return member

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import control
+import importlib
+from functools import cache
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,7 +13,16 @@ import fpirhc as fp
 from fpirhc.adapters.control import controller_system, plant_of
 from fpirhc.errors import InvalidProblem
 
-MODEL, TRUE = control.tf([2], [1, 3, 2, 0]), control.tf([3], [1, 2, 2, 0])
+
+@cache
+def library() -> Any:
+    """A second of imports, which only these tests pay."""
+    return importlib.import_module("control")
+
+
+@cache
+def model_and_truth() -> tuple[Any, Any]:
+    return library().tf([2], [1, 3, 2, 0]), library().tf([3], [1, 2, 2, 0])
 
 
 def problem(plant: fp.Plant, reference: float = 0.5, **changes) -> fp.Problem:
@@ -20,18 +32,19 @@ def problem(plant: fp.Plant, reference: float = 0.5, **changes) -> fp.Problem:
 
 def test_a_transfer_function_moves_as_python_control_says():
     """The command of a run, given to python-control's own simulation of the true system."""
-    plant = plant_of(MODEL, TRUE, inputs={"u": "V"}, outputs={"y": "rad"})
+    model, true = model_and_truth()
+    plant = plant_of(model, true, inputs={"u": "V"}, outputs={"y": "rad"})
     assert plant.response_orders == {"y": 3}
     task = problem(plant, start=dict.fromkeys(plant.state.elements, 0.0))
     run = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=3.0)), seed=0, compiled=False)
     assert run.stop is None
-    held = control.c2d(control.ss(TRUE), 0.01)
-    answer = control.forced_response(held, None, run["command"][:, 0])
+    held = library().c2d(library().ss(true), 0.01)
+    answer = library().forced_response(held, None, run["command"][:, 0])
     assert run["output"][:, 0] == pytest.approx(answer.outputs, abs=1e-8)
 
 
 def test_entries_that_differ_are_parameters():
-    plant = plant_of(MODEL, TRUE)
+    plant = plant_of(*model_and_truth())
     assert {name: (p.approximate, p.exact) for name, p in plant.parameters.items()} == {
         "A_1_1": (-3.0, -2.0), "C_1_3": (2.0, 3.0)
     }  # fmt: skip
@@ -39,7 +52,7 @@ def test_entries_that_differ_are_parameters():
 
 
 def test_a_sampled_system_is_a_map():
-    plant = plant_of(control.c2d(control.ss(control.tf([1], [1, 1])), 0.1), outputs={"y": "K"})
+    plant = plant_of(library().c2d(library().ss(library().tf([1], [1, 1])), 0.1), outputs={"y": "K"})
     assert plant.step == 0.1
     task = problem(plant, start=dict.fromkeys(plant.state.elements, 0.0), period=0.1)
     run = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=1.0)), seed=0, compiled=False)
@@ -49,15 +62,19 @@ def test_a_sampled_system_is_a_map():
 @pytest.mark.parametrize(
     ("system", "arguments", "message"),
     [
-        (control.tf([1, 1], [1, 2]), {}, "the output depends on the input at once (D is not zero)"),
-        (MODEL, {"exact": control.tf([1], [1, 1])}, "the two systems differ in size or sampling time: 3 states"),
-        (MODEL, {"inputs": {"a": "V", "b": "V"}}, "inputs: 2 names for 1 inputs (u[0])"),
-        (control.ss([[0.5]], [[1]], [[1]], [[0]], True), {}, "the sampling time is not given"),
+        (lambda: library().tf([1, 1], [1, 2]), dict, "the output depends on the input at once (D is not zero)"),
+        (
+            lambda: model_and_truth()[0],
+            lambda: {"exact": library().tf([1], [1, 1])},
+            "the two systems differ in size or sampling time: 3 states",
+        ),
+        (lambda: model_and_truth()[0], lambda: {"inputs": {"a": "V", "b": "V"}}, "inputs: 2 names for 1 inputs (u[0])"),
+        (lambda: library().ss([[0.5]], [[1]], [[1]], [[0]], True), dict, "the sampling time is not given"),
     ],
 )
 def test_mistakes_are_named(system, arguments, message):
     with pytest.raises(InvalidProblem) as caught:
-        plant_of(system, **arguments)
+        plant_of(system(), **arguments())
     assert message in str(caught.value)
 
 
@@ -69,5 +86,5 @@ def test_a_controller_is_a_system():
     system = controller_system(task, law)
     measured = np.hstack([run["state"], run["realised"]])[:50].T
     assert system.input_labels == ["q1", "q2", "q1_1", "q2_1", "q1_2", "q2_2"]
-    answer = control.input_output_response(system, np.arange(50) * task.period, measured, system.initial)
+    answer = library().input_output_response(system, np.arange(50) * task.period, measured, system.initial)
     assert pytest.approx(run["command"][:50], rel=1e-12) == np.asarray(answer.outputs).T
