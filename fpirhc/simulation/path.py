@@ -8,7 +8,7 @@ What moves is a reality, the model itself with its exact parameters, or a body o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
 
@@ -53,14 +53,13 @@ def sensing_blocks(problem: Problem, other: Response | None, *, predicts: bool) 
 
 def acting_blocks(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
-    if not set(problem.plant.inputs) & set(problem.dead_time.queued):
-        return [moving(problem).advance(disturbed, problem.plant.input)]
-    plant, waits = problem.plant, [problem.dead_time.wait(name, problem.period) for name in problem.plant.inputs]
+    mover, plant, late = moving(problem), problem.plant, problem.dead_time
+    queued = [name for name in plant.inputs if name in late.queued and name not in mover.late]
+    if not queued:
+        return [mover.advance(disturbed, plant.input)]
+    waits = [late.wait(name, problem.period) if name in queued else Queue(0.0) for name in plant.inputs]
     arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
-    return [
-        delay_block("send_command", problem.plant.input, arriving, waits),
-        moving(problem).advance(disturbed, arriving),
-    ]
+    return [delay_block("send_command", plant.input, arriving, waits), mover.advance(disturbed, arriving)]
 
 
 def true_response(problem: Problem) -> Response:
@@ -83,6 +82,9 @@ class Mover(ABC):
     """Whether what it shows may be wrong, so that the loop looks for what is not plausible."""
     sent: ClassVar[tuple[str, ...]]
     """Signals that the step returns to it."""
+
+    late: Collection[str] = ()
+    """Inputs whose dead time it has itself."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -217,7 +219,7 @@ class Body(Mover):
 
     def __init__(self, problem: Problem, body: ExternalPlant) -> None:
         super().__init__(problem)
-        self.measures = body.measures
+        self.measures, self.late = body.measures, tuple(body.dead_time)
 
     @property
     def states(self) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import CountOrZero, Positive
+from fpirhc.fields.kinds import CountOrZero, Positive, finite_number
 from fpirhc.plant.plant import Plant
 
 _LONGEST = 60  # characters of an answer that are shown
@@ -64,6 +64,8 @@ class ExternalPlant(Checked):
             where it does not return, it is given up, and called again when it has returned. None: it may take its time, as a
             simulator does.
         clock: function that returns the wall time, s.
+        dead_time: by input, in the model's unit of time: how late the body acts. Controllers and reviews know it as that of the
+            problem; the body has it already, so it is not simulated.
 
     Raises:
         InvalidField: all wrong arguments together. `Problem` checks the quantities against the model and its sensing.
@@ -74,6 +76,7 @@ class ExternalPlant(Checked):
     holds: CountOrZero = 0
     deadline: Positive | None = None
     clock: Callable[[], float] = field(default=wall.perf_counter, metadata={"setting": False})
+    dead_time: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
         for name in ("reset", "step"):
@@ -154,12 +157,14 @@ class ExternalPlant(Checked):
 
     def _judged(self, ask: Callable[[], npt.ArrayLike], method: str, deadline: float | None) -> Reading:
         """The answer of a stranger's object, of which every part may raise: its numbers, its length, its words, its errors."""
-        who, begin = f"{method} of {type(self.body).__name__}", self.clock()
+        who, begin = f"{method} of {type(self.body).__name__}", self._now()
         try:
             returned = ask()
-        except (Exception, SystemExit) as error:  # noqa: BLE001  # whatever a stranger's object raises is a bad answer
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001  # whatever else a stranger's object raises is a bad answer
             return Reading(None, f"{who} raised {type(error).__name__}{_words(error)}")
-        elapsed = self.clock() - begin
+        elapsed = self._now() - begin
         answer = _real_numbers(returned)
         expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"
         if answer is None:
@@ -174,6 +179,17 @@ class ExternalPlant(Checked):
         if deadline is not None and elapsed > deadline:
             return Reading(None, f"{who} took {elapsed:.3g} s, and its deadline is {deadline:.3g} s")
         return Reading(answer)
+
+    def _now(self) -> float:
+        """The wall time; without a deadline nobody asks for it."""
+        if self.deadline is None:
+            return 0.0
+        time = self.clock()
+        if not finite_number(time):
+            raise InvalidValue(
+                f"ExternalPlant(clock=...): it returned {_short(time)}, expected the wall time as a number, in s"
+            )
+        return float(time)
 
 
 def _real_numbers(answer: object) -> np.ndarray | None:

@@ -101,6 +101,8 @@ class Problem(Checked):
         known = self.plant, self.symbolic_reality, self.period, self.integrator, self.horizon, self.sensing
         for name, value in settled_maps(*known, mistakes).items():
             object.__setattr__(self, name, value)
+        if self.foreign is not None and self.foreign.dead_time:
+            object.__setattr__(self, "dead_time", _stated_once(self.dead_time, self.foreign.dead_time, mistakes))
         mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
@@ -375,6 +377,16 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
         low, high = plant.ranges.get(name, (-math.inf, math.inf))
         if not low <= value <= high:
             mistakes.add(f"start: '{name}' is {value:g}, outside its physical range of {low:g} to {high:g}")
+
+
+def _stated_once(own: DeadTime, outside: Mapping[str, float], mistakes: Mistakes) -> DeadTime:
+    """The dead time with that of an external plant, which is the one that controllers know."""
+    if own.inputs and dict(own.inputs) != dict(outside):
+        mistakes.add(
+            f"dead_time: the external plant states {dict(outside)!r}, and the problem {dict(own.inputs)!r}; state it once, "
+            "ExternalPlant(dead_time=...) for what the body has, DeadTime(inputs=...) for what is to be simulated before it"
+        )
+    return replace(own, inputs=outside)
 
 
 def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:

@@ -113,6 +113,51 @@ def test_dead_times_stand_around_the_body():
     assert np.abs(one["plant_state"] - other["plant_state"]).max() < 1e-12
 
 
+class Late(Wrapped):
+    """The same, acting two cycles after a command."""
+
+    def reset(self, seed):
+        """With the inputs before on their way."""
+        self.waiting = [np.array(self.problem.inputs_before)] * 2
+        return super().reset(seed)
+
+    def step(self, time, command):
+        """The step under the command of two cycles before."""
+        self.waiting.append(command)
+        return super().step(time, self.waiting.pop(0))
+
+
+@pytest.mark.parametrize("name", ["computed torque", "predicted"])
+def test_a_dead_time_of_the_body_is_known_and_not_simulated(name):
+    """The run is the one in which the loop delays the commands; a controller that predicts over it does so in both."""
+    law = CONTROLLERS["computed torque"]
+    controller = fp.Predicted(law, inputs=0.002) if name == "predicted" else law
+    problem = task(dead_time=fp.DeadTime(inputs={"u": 0.002}))
+    body = fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002})
+    own = replace(task(), reality=body)
+    assert own.response_delay == problem.response_delay == 2
+    assert replace(own, duration=0.1).dead_time.inputs == {"u": 0.002}
+    inside, outside_ = run(problem, controller), run(own, controller)
+    for signal in ("plant_state", "command"):
+        assert np.abs(inside[signal] - outside_[signal]).max() <= 1e-9 * np.abs(inside[signal]).max()
+
+
+def test_a_dead_time_is_stated_once_and_by_name():
+    """Two statements that differ are one mistake, and an input that does not exist is another."""
+    body = fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002})
+    with pytest.raises(InvalidProblem, match="state it once"):
+        task(dead_time=fp.DeadTime(inputs={"u": 0.005}), reality=body)
+    with pytest.raises(InvalidProblem, match="input 'v' is unknown"):
+        task(reality=replace(body, dead_time={"v": 0.002}))
+
+
+@pytest.mark.parametrize("clock", [lambda: None, lambda: "noon", lambda: float("nan")])
+def test_a_clock_that_shows_no_time_is_named(clock):
+    """It is the user's own mistake, and no bad answer of the body."""
+    with pytest.raises(InvalidValue, match=r"ExternalPlant\(clock=\.\.\.\): it returned .*, expected the wall time"):
+        run(outside(task(), deadline=1.0, clock=clock), CONTROLLERS["computed torque"])
+
+
 def test_positions_alone_are_enough_for_an_estimator():
     """A body that measures y only runs with an estimator; errors are then those of the estimate."""
     problem = task(sensing=fp.Sensing(estimator=fp.PositionDifference()))
