@@ -27,6 +27,7 @@ from fpirhc.fields.given import described
 from fpirhc.horizon.cost import Cost
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.latest import Latest
@@ -122,7 +123,7 @@ class Planner:
 
     def corrects(self, plant: Plant) -> bool:
         """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""
-        return self.adapts or any(one.response_disturbance for one in plant.outputs.values())
+        return self.adapts or without_disturbances(plant) is not plant
 
     def starts_consistent(self, plant: Plant) -> bool:
         """Return whether plans start where the model has the measured outputs (`fpirhc.horizon.consistent_state`)."""

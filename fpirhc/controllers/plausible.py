@@ -132,10 +132,9 @@ def _plausible_states(task: Problem, along: np.ndarray, generator: np.random.Gen
 def _behind_outputs(problem: Problem) -> dict[str, Interval]:
     """Intervals of the states of a plant with outputs, by name."""
     plant, ranges = problem.plant, {}
-    if not plant.outputs:
-        return {}
-    along = reference_states(nominal(problem), _SAMPLES)
-    for k, name in enumerate(plant.state.elements):
+    behind = [name for signal in measured_signals(plant)[:-1] for name in signal.elements]
+    along = reference_states(nominal(problem), _SAMPLES) if behind else np.zeros((0, 0))
+    for k, name in enumerate(behind):
         ends = [*problem.limits.states.get(name, ()), *plant.ranges.get(name, ())]
         seen = np.array([*along[k], problem.start_state[k], *ends], dtype=float)
         middle, reach = _about(seen[np.isfinite(seen)])

@@ -22,7 +22,7 @@ import casadi as ca
 from fpirhc.controllers.base import like
 from fpirhc.controllers.reference_states import largest_response
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.integrators import runge_kutta_4
+from fpirhc.plant.integrators import USUAL, motion_of
 from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -174,14 +174,11 @@ def _propagate(plant: Plant, period: float) -> Block:
     """Block (target, planned input) -> (nominal response, target one cycle later by the model)."""
     reads = Layout((like(plant.state, "_target"), like(plant.input, "planned"), plant.parameter))
     writes = Layout((plant.response_signal("nominal"), like(plant.state, "target")))
-    response, rate = plant.equations.controlled_response, plant.equations.rate
-    calm = ca.DM.zeros(len(plant.names))
+    response, calm = plant.equations.controlled_response, ca.DM.zeros(len(plant.names))
+    after = motion_of(plant, USUAL, USUAL).step(plant, period)
 
     def step(s: Signals) -> dict[str, Expression]:
-        if plant.step is not None:
-            target_next = plant.equations.next(s._target, s.planned, s.parameters, calm)
-        else:
-            target_next = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
+        target_next = after(s._target, s.planned, s.parameters, calm)
         return {"nominal": response(s._target, s.planned, s.parameters), "target": target_next}
 
     return Block("propagate", reads, writes, step)

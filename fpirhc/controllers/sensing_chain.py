@@ -92,7 +92,8 @@ def seeing_blocks(problem: Problem) -> list[Block]:
     if problem.sensing.measured is not None:
         return _estimating_part(problem, raw, start)
     plant = problem.plant
-    return with_steps_ahead(plant, problem.sensing.estimator.block(plant, problem.period, start, raw))
+    block = problem.sensing.estimator.block(plant, problem.period, start, raw)
+    return with_steps_ahead(plant, block) if problem.sensing.estimator.of_steps else [block]
 
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
@@ -156,10 +157,10 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
     measured difference alone is left. A prediction without the last measured difference would keep the model's error for ever.
 
     Args:
-        plant: a map, or any other plant, whose estimator then stays alone.
+        plant: whose outputs are estimated.
         estimate: writes the signal of the outputs.
     """
-    if plant.step is None or max(plant.chains.values()) == 1:
+    if max(plant.chains.values()) == 1:
         return [estimate]
     measured = replace(plant.output, name=_MEASURED)
 

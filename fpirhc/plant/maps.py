@@ -24,6 +24,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import TypeVar, cast
 
 import casadi as ca
@@ -147,3 +148,30 @@ def step_of(plant: Motion, matrix: np.ndarray, cycle: float) -> np.ndarray:
 def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
     return np.real if plant.step is None else partial(decay_rates, cycle=sampling(plant))
+
+
+def time_derivatives(plant: Motion) -> Callable[[Expression, Expression, int], list[Expression]]:
+    """Return the function (motion, time, order) -> (y, y', ..., y^(order)), of a map its divided differences."""
+    return differentiated if plant.step is None else _differences(sampling(plant))
+
+
+def differentiated(value: Expression, t: Expression, order: int) -> list[Expression]:
+    """Return an expression of the time and its first derivatives."""
+    derivatives = [value]
+    for _ in range(order):
+        derivatives.append(ca.jacobian(derivatives[-1], t))
+    return derivatives
+
+
+def _differences(step: float) -> Callable[[Expression, Expression, int], list[Expression]]:
+    """The divided forward differences of a motion along the steps of a map, in place of its derivatives."""
+
+    def differences(value: Expression, t: Expression, order: int) -> list[Expression]:
+        nodes = [value] + [ca.substitute(value, t, t + k * step) for k in range(1, order + 1)]
+        column = []
+        for k in range(order + 1):
+            column.append(nodes[0] / step**k)
+            nodes = [later - earlier for earlier, later in pairwise(nodes)]
+        return column
+
+    return differences

@@ -299,7 +299,7 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     """
     plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
     first, resting = first_estimates(problem)
-    starts = (problem.start_state, first) if plant.outputs else (first,)
+    starts = (problem.start_state, first)[-len(measured_signals(plant)) :]
     states_pass = sensing.observer is None  # a believed state is the controller's own
     states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if states_pass else []
     if not sensing.ideal:

@@ -16,6 +16,7 @@ from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.user_code import named_results, scalar_expression
 from fpirhc.horizon.cost import Cost, View
 from fpirhc.horizon.horizon import Horizon
+from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
 from fpirhc.plant.maps import over
 from fpirhc.plant.motion import followed_units
@@ -119,7 +120,8 @@ def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
 
 def needed_measurements(plant: Plant, sensing: Sensing) -> tuple[str, ...]:
     """Return the names of what is measured: by sensors, and the state that is given beside outputs where nothing is believed."""
-    states = plant.state.elements if plant.outputs and sensing.observer is None else ()
+    beside = measured_signals(plant)[:-1] if sensing.observer is None else ()
+    states = [element for signal in beside for element in signal.elements]
     return tuple(dict.fromkeys((*states, *sensing.measures(plant))))
 
 

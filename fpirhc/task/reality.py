@@ -210,6 +210,8 @@ class Reality(Checked):
             NotSupported: with what differs.
         """
         plant = self.plant
+        if plant is model:
+            return plant
         differences = [
             f"the coordinate {c}, which the controller is not given" for c in plant.names if c not in model.names
         ]

@@ -14,7 +14,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -22,7 +21,8 @@ import numpy as np
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, named_results, scalar_expression
-from fpirhc.plant.motion import followed, followed_units, sampling
+from fpirhc.plant.maps import differentiated, time_derivatives
+from fpirhc.plant.motion import followed, followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import kind
@@ -56,7 +56,7 @@ class Reference(Checked, ABC):
         t = matrix.sym("t")
         motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
         _check(plant, motion, what)
-        by = _differentiate if plant.step is None else _differences(sampling(plant))
+        by = time_derivatives(plant)
         derivatives = {c: by(motion[c], t, r) for c, r in plant.chains.items()}
         state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.output.elements]
         response = [derivatives[c][r] for c, r in plant.chains.items()]
@@ -67,7 +67,7 @@ class Reference(Checked, ABC):
         """Function t -> the coordinate's nominal value and its derivatives up to `order`, shape (order + 1,)."""
         matrix = kind(self.opaque)
         t = matrix.sym("t")
-        values = _differentiate(matrix(self.coordinates(t)[coordinate]), t, order)
+        values = differentiated(matrix(self.coordinates(t)[coordinate]), t, order)
         return ca.Function("fpirhc_reference_derivatives", [t], [ca.densify(ca.vertcat(*values))])
 
     @property
@@ -190,27 +190,6 @@ class Table(Reference):
         # A choice and not a clamped argument: fmin and fmax have half a derivative at the table's first and last time.
         held = ca.if_else(t < times[0], spline(times[0]), spline(times[-1]))
         return ca.if_else(ca.logic_or(t < times[0], t > times[-1]), held, spline(t))
-
-
-def _differentiate(value: Expression, t: Expression, order: int) -> list[Expression]:
-    derivatives = [value]
-    for _ in range(order):
-        derivatives.append(ca.jacobian(derivatives[-1], t))
-    return derivatives
-
-
-def _differences(step: float) -> Callable[[Expression, Expression, int], list[Expression]]:
-    """The divided forward differences of a motion along the steps of a map, in place of its derivatives."""
-
-    def differences(value: Expression, t: Expression, order: int) -> list[Expression]:
-        nodes = [value] + [ca.substitute(value, t, t + k * step) for k in range(1, order + 1)]
-        column = []
-        for k in range(order + 1):
-            column.append(nodes[0] / step**k)
-            nodes = [later - earlier for earlier, later in pairwise(nodes)]
-        return column
-
-    return differences
 
 
 def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:

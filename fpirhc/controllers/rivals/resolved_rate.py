@@ -142,9 +142,11 @@ def _increment_block(problem: Problem) -> Block:
     measured = ca.SX.sym("f", len(plant.controlled_names))
     response = plant.equations.controlled_response(x, u, p)
     highest = plant.equations.response(x, u, p)
-    # The measured responses move the state; the model's response does where nothing is measured, and where outputs are.
-    for k, index in enumerate(() if plant.outputs else controlled_places(plant)):
-        highest[index] = measured[k]
+    # The measured responses move the state; the model's response does where nothing is measured.
+    orders = dict(zip(plant.names, plant.orders, strict=True))
+    for k, (name, order) in enumerate(plant.response_orders.items()):
+        if orders.get(name) == order:
+            highest[plant.names.index(name)] = measured[k]
     rates = []
     for element in plant.state.elements:
         higher = element + "'"

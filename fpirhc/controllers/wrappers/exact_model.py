@@ -47,10 +47,8 @@ class ExactModel(Controller):
         """Return the plant that a run moves, its exact parameters, and the signals as they really are."""
         if problem.foreign is not None:
             raise NotSupported("a foreign reality has no equations that could be the exact model; leave ExactModel out")
-        if problem.symbolic_reality is not None:
-            plant = problem.symbolic_reality.as_model(problem.plant)
-            return PlantModel(plant, really_known(problem.signals), exact=True)
-        return PlantModel(problem.real_plant, really_known(problem.signals), exact=True)
+        plant = problem.truth.as_model(problem.plant)
+        return PlantModel(plant, really_known(problem.signals), exact=True)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of the wrapped controller."""

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fpirhc.controllers.base import Controller
+from fpirhc.plant.chain import measured_signals
 from fpirhc.sensing.base import names_of_responses, response_names
 from fpirhc.symbolic.block import Composite
 from fpirhc.task.problem import Problem
@@ -60,8 +61,9 @@ def sentences(problem: Problem, known: Mapping[str, Information]) -> tuple[str, 
 def _given(problem: Problem) -> str:
     plant, sensing = problem.plant, problem.sensing
     names = sensing.measures(plant) if sensing.estimates else (*plant.output.elements, *response_names(plant))
-    if plant.outputs and sensing.observer is None:  # the state too
-        names = (*plant.state.elements, *(n for n in names if n not in plant.state.elements))
+    if sensing.observer is None:  # the state beside outputs too
+        beside = [element for signal in measured_signals(plant)[:-1] for element in signal.elements]
+        names = (*beside, *(n for n in names if n not in beside))
     names = tuple(dict.fromkeys(names))  # an output of order 0 is its own response
     text = f"all controllers are given {', '.join(names)} in every cycle of {problem.period:g} {problem.time_unit}"
     late = problem.dead_time.measurement
