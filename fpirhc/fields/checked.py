@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 import sys
 from abc import ABCMeta
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,6 +28,8 @@ from fpirhc.fields.expected import Anything, Expected, Number, accepts, expected
 from fpirhc.fields.given import call_of, described, shortened, signature_of
 from fpirhc.fields.user_code import users_place
 from fpirhc.members import FORMER_MEMBERS
+
+_WITH_UNIT = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)? ?[a-zA-Z%/^*]+\d?")  # '1 ms'
 
 
 class _CheckedWhenCalled(ABCMeta):
@@ -276,6 +279,8 @@ def _mended(expected: Expected, value: object) -> str:
         return _mended_text(expected, value, contract)
     if isinstance(value, ca.SX | ca.MX):
         return "a setting is a number" if expected.fits(1) or expected.fits(0.5) else ""
+    if isinstance(value, int | float) and expected.fits((-abs(value), abs(value))) and not expected.fits([value]):
+        return f"write both ends, such as {(-abs(value), abs(value))}"
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 and expected.fits(int(value)):
         return f"write {int(value)}"
     return _made_of(expected, value, contract)
@@ -300,7 +305,8 @@ def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
         except ValueError:
             continue
     if contract is None:
-        return ""
+        alone = _WITH_UNIT.fullmatch(text) and expected.fits(0.1)
+        return "write the number alone, in the unit that is expected" if alone else ""
     loaded = getattr(contract, "_LOADED", "").format(repr(text))
     members = {_plain(name): member for name, member in _public(contract) if member is not contract or not loaded}
     close = get_close_matches(_plain(text), members, n=1, cutoff=0.5)

@@ -115,7 +115,7 @@ def _wrong_arguments(plant: Motion, expected: int) -> str:
     mend = f"; {arguments} arguments are those of order {fitting}" if fitting > 0 else _OF_STATES
     mend = "" if state or inspect.Parameter.KEYWORD_ONLY in kinds else mend
     return (
-        f"{function} takes {arguments} argument(s){f' ({place})' if place else ''}; "
+        f"{function} takes {arguments} argument{'s' * (arguments != 1)}{f' ({place})' if place else ''}; "
         f"{'' if state else f'with order {order} '}it is called as {function}({', '.join(names)}){mend}"
     )
 

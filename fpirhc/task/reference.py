@@ -194,7 +194,11 @@ class Table(Reference):
 
 def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:
     mistakes = Mistakes("reference")
-    mistakes.unknown(what, motion, followed_units(plant))
+    known = followed_units(plant)
+    slopes = [name for name in motion if name not in known and name.rstrip("'") in known]
+    for name in slopes:
+        mistakes.add(f"'{name}' is taken from '{name.rstrip(chr(39))}' by differentiation; leave it out")
+    mistakes.unknown(what, [name for name in motion if name not in slopes], known)
     for c in plant.chains:
         if c not in motion:
             mistakes.add(f"{what} '{c}' has no nominal motion; add '{c}' to the reference")

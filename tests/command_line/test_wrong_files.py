@@ -57,6 +57,25 @@ def line(words: str, *said: str) -> Wrong:
 
 
 PLANTS = {
+    "a number with its unit": one(
+        PENDULUM,
+        "period=1e-2",
+        'period="10 ms"',
+        "Problem.period: expected a number",
+        "write the number alone, in the unit that is expected",
+    ),
+    "one end of a limit": one(
+        PENDULUM,
+        '"torque": (-15.0, 15.0)',
+        '"torque": 15.0',
+        "Limits.inputs['torque']: expected (a number, a number), got 15.0; write both ends, such as (-15.0, 15.0)",
+    ),
+    "a derivative in the reference": one(
+        PENDULUM,
+        '{"angle": 0.8 * ca.sin(2 * t)}',
+        """{"angle": 0.8 * ca.sin(2 * t), "angle'": 1.6 * ca.cos(2 * t)}""",
+        "'angle'' is taken from 'angle' by differentiation; leave it out",
+    ),
     "right-hand side as a vector": one(
         PENDULUM,
         'return {"angle": (u.torque - p.friction * v.angle) / inertia - 9.81 / p.length * ca.sin(q.angle)}',
@@ -69,7 +88,7 @@ PLANTS = {
         PENDULUM,
         "def response(q, v, u, p):",
         "def response(x, u):",
-        "response takes 2 argument(s) (mine.py, line 7)",
+        "response takes 2 arguments (mine.py, line 7)",
         "it is called as response(q, v, u, p)",
         "Plant.of_states(rates=...)",
     ),
@@ -77,7 +96,7 @@ PLANTS = {
         REACTOR,
         "def rates(x, u, p)",
         "def rates(t, x, u, p)",
-        "rates takes 4 argument(s) (mine.py, line 7); it is called as rates(x, u, p)",
+        "rates takes 4 arguments (mine.py, line 7); it is called as rates(x, u, p)",
     ),
     "order of a velocity": one(
         PENDULUM, "order=2", "order=1", "called as response(q, u, p); 4 arguments are those of order 2"

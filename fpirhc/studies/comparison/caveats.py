@@ -56,7 +56,7 @@ def not_followed(plain: Entry, adaptive: Entry, names: list[str], yardstick: Yar
     lost = [n for n in names if yardstick.beyond(plain, n) and yardstick.beyond(adaptive, n)]
     if not lost:
         return ""
-    texts = ", ".join(
+    texts = "; ".join(
         f"the rms error of {n} is {plain.metrics.rms_error[n]:.3g} and {adaptive.metrics.rms_error[n]:.3g}{_unit(adaptive, n)}, "
         f"{yardstick.beyond(adaptive, n)}"
         for n in lost
@@ -68,7 +68,7 @@ def leaves_reference(entry: Entry, yardstick: Yardstick) -> str:
     """Return a sentence where a run that finished leaves the neighbourhood of its reference; else nothing."""
     errors = entry.metrics.rms_error if entry.run.stop is None else {}
     lost = [n for n in errors if yardstick.beyond(entry, n)]
-    texts = ", ".join(f"rms error of {n} {errors[n]:.3g}{_unit(entry, n)}, {yardstick.beyond(entry, n)}" for n in lost)
+    texts = "; ".join(f"rms error of {n} {errors[n]:.3g}{_unit(entry, n)}, {yardstick.beyond(entry, n)}" for n in lost)
     return (
         f"{entry.name} leaves the neighbourhood of its reference, for which its gains and its review are made: {texts}."
         if lost

@@ -169,7 +169,7 @@ def _sentence(
             f"({costs})."
         )
     return (
-        f"{head}failed, {adaptive} is worse than {plain} although there is nothing to adapt ({numbers}). Its gain is too small for "
-        "its law or its plan, or it takes something else for an error of the model: the drift of the response within a long cycle, "
-        "an unpaired delay, or noise. fpirhc review says more."
+        f"{head}failed, {adaptive} is worse than {plain} although there is nothing to adapt ({numbers}). Its gain, or the "
+        "largest step of its map, is too small for its law or its plan, or it takes something else for an error of the model: the "
+        "drift of the response within a long cycle, an unpaired delay, or noise. fpirhc review says more."
     )
