@@ -159,35 +159,38 @@ def _of_a_period(loop: LinearLoop, place: int) -> tuple[float, float, float]:
 
     A mode turns by at most pi in a period, so the delay of a turned command follows from the turn of the mode.
     """
-    up = _first(lambda x: _turned(loop, place, math.exp(x)), _DECADES)
-    down = _first(lambda x: _turned(loop, place, math.exp(-x)), _DECADES)
+    up = _first(lambda x: _turned(loop, place, np.exp(x)), _DECADES)
+    down = _first(lambda x: _turned(loop, place, np.exp(-x)), _DECADES)
     angle = _first(lambda x: _turned(loop, place, np.exp(-1j * x)), math.pi)
-    poles = _turned(loop, place, np.exp(-1j * angle)) if math.isfinite(angle) else np.ones(1)
+    poles = _turned(loop, place, np.exp([-1j * angle]))[0] if math.isfinite(angle) else np.ones(1)
     turns = np.angle(poles[np.abs(np.abs(poles) - 1) < 1e-3])
     fastest = float(np.abs(turns).max(initial=0.0)) / (len(loop.cycles) * loop.period)
     return math.exp(min(up, down)), math.degrees(angle), angle / fastest if fastest else math.inf
 
 
-def _turned(loop: LinearLoop, place: int, factor: complex) -> np.ndarray:
-    """Poles of a period in which a command is multiplied by a factor, without those that are no fault of the loop."""
+def _turned(loop: LinearLoop, place: int, factors: np.ndarray) -> np.ndarray:
+    """Poles (factors, poles) of a period in which a command is multiplied, without those that are no fault of the loop."""
     whole: np.ndarray = np.eye(loop.dynamics.shape[1])
     for one in loop.cycles:
-        more = (factor - 1) * np.outer(one.entry[:, place], one.arriving[place])
+        more = (factors[:, None, None] - 1) * np.outer(one.entry[:, place], one.arriving[place])
         whole = (one.dynamics + more) @ whole
     poles = np.asarray(np.linalg.eigvals(whole))
     for hidden in loop.poles[loop.hidden]:
-        poles = np.delete(poles, int(np.argmin(np.abs(poles - hidden))))
+        nearest = np.argmin(np.abs(poles - hidden), axis=1)
+        others = np.arange(poles.shape[1]) != nearest[:, None]
+        poles = poles[others].reshape(len(poles), -1)
     return poles
 
 
-def _first(poles: Callable[[float], np.ndarray], most: float) -> float:
+def _first(poles: Callable[[np.ndarray], np.ndarray], most: float) -> float:
     """The smallest argument up to `most` where a pole leaves the unit circle; infinite where none does."""
 
-    def outside(x: float) -> float:
-        return float(np.abs(poles(x)).max(initial=0.0)) - 1
+    def outside(x: np.ndarray) -> np.ndarray:
+        return np.asarray(np.abs(poles(x)).max(axis=1, initial=0.0)) - 1
 
     steps = np.linspace(0, most, _STEPS + 1)
-    beyond = next((k for k, x in enumerate(steps) if outside(float(x)) >= 0), None)
-    if beyond is None:
+    beyond = np.flatnonzero(outside(steps) >= 0)
+    if not beyond.size:
         return math.inf
-    return _root(outside, steps[beyond - 1], steps[beyond], 1e-6) if beyond else 0.0
+    k = int(beyond[0])
+    return _root(lambda x: float(outside(np.array([x]))[0]), steps[k - 1], steps[k], 1e-6) if k else 0.0

@@ -1,9 +1,9 @@
 """Does adaptation leave a right model alone? The null test: with the model as the plant, adaptation must not do harm.
 
 Without simulation the response error that adaptation makes on the model's own run says so (`prediction`); where it is not zero, the
-model is run as its own plant over at most 2000 cycles, with the deformation and without (`null_runs`). The iteration takes whatever
-moves the response within a cycle for an error of the model: a plant that is fast against the period drifts within it, and the
-plain form and `Increment` ask for less or more than they should.
+model is run as its own plant over at most 2000 cycles, with the deformation and without. The iteration takes whatever moves the
+response within a cycle for an error of the model: a plant that is fast against the period drifts within it, and the plain form and
+`Increment` ask for less or more than they should.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.form import form_of
 from fpirhc.review.forms import forms_of
-from fpirhc.review.null_runs import null_runs
+from fpirhc.review.nominal_runs import null_runs
 from fpirhc.review.pays import ROUNDING, nominal_size, rms
 from fpirhc.review.prediction import NominalRun, errors_without_adaptation, response_errors
 from fpirhc.review.question import Case
@@ -46,8 +46,7 @@ def leaves_right_model_alone(case: Case) -> Answer:
         text += "the loop with the right model does not converge without adaptation"
         return Answer(QUESTION_TEXT, Verdict.UNKNOWN, text, "See the rates.", numbers)
     try:
-        # The nominal run of a plant with outputs has the states of the plant, and not those of the model.
-        runs = null_runs(case.problem, case.controller, None if case.problem.plant.outputs else nominal)
+        runs = null_runs(case.problem, case.controller, case.runs)
     except FpirhcError as error:
         return Answer(QUESTION_TEXT, Verdict.UNKNOWN, f"{text}no run of the model: {error}", "", numbers)
     worst = runs.worst

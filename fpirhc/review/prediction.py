@@ -18,6 +18,7 @@ where u^_k is the model's own command. The same recursion serves without adaptat
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,11 +29,15 @@ from fpirhc.controllers.contract import resolved, tracking_law, without_deformat
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
+from fpirhc.describe import identity
 from fpirhc.errors import NotSupported
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
+from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
@@ -84,16 +89,32 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
             that does not stay finite.
         FpirhcError: every error that the controller raises about the problem.
     """
+
+    def run() -> Run:
+        plant = problem.plant
+        own = (
+            known_exactly(plant) if plant.outputs else exactly(plant, controller.plant_model(problem).parameters(plant))
+        )
+        model = replace(problem, plant=own, disturbances={}, sensing=Sensing())
+        return simulate(model, without_deformation(resolved(problem, controller)), seed=0, compiled=compiled)
+
+    return nominal_of(problem, controller, run)
+
+
+def nominal_of(problem: Problem, controller: Controller, run: Callable[[], Run]) -> NominalRun:
+    """Return the nominal run from the run of the controller on its model, which is made where there is a prediction.
+
+    Raises:
+        NotSupported, FpirhcError: see `nominal_run`.
+    """
     _check(problem, controller)
     ready = resolved(problem, controller)
     ready.check(problem)
+    made = run()
+    if made.stop is not None or made.cycles < 2:
+        raise NotSupported(f"no prediction: the model's own run ended early: {made.stop}")
     believed = ready.plant_model(problem).parameters(problem.plant)
-    own = known_exactly(problem.plant) if problem.plant.outputs else exactly(problem.plant, believed)
-    model = replace(problem, plant=own, disturbances={}, sensing=Sensing())
-    run = simulate(model, without_deformation(ready), seed=0, compiled=compiled)
-    if run.stop is not None or run.cycles < 2:
-        raise NotSupported(f"no prediction: the model's own run ended early: {run.stop}")
-    return NominalRun(problem, ready, run["state"], run["desired"][:-1], believed)
+    return NominalRun(problem, ready, made["state"], made["desired"][:-1], believed)
 
 
 def response_errors(
@@ -108,7 +129,15 @@ def response_errors(
     """
     map_ = nominal.controller.deformation if deformation is None else deformation
     parameters = nominal.problem.plant.exact if exact is None else np.asarray(exact, dtype=float)
-    step = _recursion(nominal, map_, parameters)
+    made = identity(map_), parameters.tobytes(), nominal.problem.period
+    return _ERRORS.of((nominal.states, nominal.problem.plant), made, lambda: _errors(nominal, map_, parameters))
+
+
+_ERRORS: Latest[ResponseErrors] = Latest(8)  # several questions ask for the same ones
+
+
+def _errors(nominal: NominalRun, deformation: Deformation, exact: np.ndarray) -> ResponseErrors:
+    step = _recursion(nominal, deformation, exact)
     reads = (nominal.states[:-1], nominal.desired, nominal.states[1:])
     run: Any = step.function.mapaccum(f"{step.function.name()}_run", nominal.cycles)
     log = np.asarray(run(step.memory.start(), *(rows.T for rows in reads))[1].full()).T
@@ -180,10 +209,12 @@ def known_exactly(plant: Plant) -> Plant:
 
 
 def exactly(plant: Plant, values: np.ndarray) -> Plant:
-    """Return the plant with these exact parameters."""
-    pairs = zip(plant.parameters.items(), values, strict=True)
-    named = {n: replace(p, exact=float(v), spread=None) for (n, p), v in pairs}
-    return replace(plant, parameters=named)
+    """Return the plant with these exact parameters; the same one for the same values, so that what is built of it is shared."""
+    values = np.asarray(values, dtype=float)
+    return _EXACT.of((plant,), (values.tobytes(),), lambda: with_exact_parameters(plant, values))
+
+
+_EXACT: Latest[Plant] = Latest(8)
 
 
 def _check(problem: Problem, controller: Controller) -> None:

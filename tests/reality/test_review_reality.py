@@ -14,7 +14,7 @@ import fpirhc as fp
 from fpirhc.report.series import chart_data
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.null_runs import null_problem, null_runs
+from fpirhc.review.nominal_runs import null_problem, null_runs
 from fpirhc.review.questions.reality_lag import TEXT as LAG
 from fpirhc.review.questions.reality_loop import TEXT as LOOP
 from fpirhc.review.questions.reality_resonance import TEXT as RESONANCE

@@ -11,13 +11,14 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import with_optimiser, without_deformation
-from fpirhc.describe import as_written, identity
+from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.null_runs import null_problem
+from fpirhc.review.nominal_runs import null_problem
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.simulation.model_as_plant import shortened
+from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.status import Status
 from fpirhc.summary import in_percent
@@ -37,7 +38,7 @@ def iterations_suffice(case: Case) -> Answer | None:
     try:
         bare = without_deformation(case.controller)
         model = shortened(null_problem(case.problem, bare), _PLANS * cycles_per_plan(horizon, case.problem.period))
-        share, later = case.runs.once((TEXT, identity(bare)), lambda: unsolved(model, bare))
+        share, later = unsolved(case.runs.bare(bare), model.cycles)
     except FpirhcError as error:
         return Answer(TEXT, Verdict.UNKNOWN, f"no run of the model: {error}")
     text = f"on its own model {in_percent(share)} of the first {model.cycles} cycles have a plan that did not converge"
@@ -55,13 +56,12 @@ def iterations_suffice(case: Case) -> Answer | None:
 QUESTION = ControllerQuestion(iterations_suffice, order=1, adaptive=False)
 
 
-def unsolved(problem: Problem, controller: Controller) -> tuple[float, float]:
-    """Return the share of the cycles with a plan that did not converge, and that of the second half; 1 where the run ends."""
-    run = simulate(problem, controller, seed=0, compiled=False)
-    if run.stop is not None:
+def unsolved(run: Run, cycles: int) -> tuple[float, float]:
+    """Return the share of the first cycles with a plan that did not converge, and of their second half; 1 where the run ends."""
+    if run.cycles < cycles:
         return 1.0, 1.0
-    failed = run["status"] == Status.NOT_CONVERGED
-    return float(np.mean(failed)), float(np.mean(failed[len(failed) // 2 :]))
+    failed = run["status"][:cycles] == Status.NOT_CONVERGED
+    return float(np.mean(failed)), float(np.mean(failed[cycles // 2 :]))
 
 
 def _remedy(model: Problem, bare: Controller, optimiser: Optimiser) -> str:
@@ -70,7 +70,8 @@ def _remedy(model: Problem, bare: Controller, optimiser: Optimiser) -> str:
         if longer is None:
             return "Take an optimiser that iterates until its plans are solved, or shorten the horizon."
         try:
-            if unsolved(model, with_optimiser(bare, longer))[1] < MANY:
+            run = simulate(model, with_optimiser(bare, longer), seed=0, compiled=False)
+            if unsolved(run, model.cycles)[1] < MANY:
                 return f"Give the optimiser {times} times the iterations: {as_written(longer)}."
         except FpirhcError:
             break

@@ -75,6 +75,7 @@ class AskedLoop:
         self._phases = [k for k, c in enumerate(self.loop.memory.columns) if c.endswith("_phase")]
         self._gains = [k for k, c in enumerate(self.loop.memory.columns) if c.split(".")[-1] == GAIN]
         self._inputs = len(self.problem.plant.inputs)
+        self._known: dict[bytes, list[Directions]] = {}  # of the points of `at`
 
     @property
     def quick(self) -> bool:
@@ -141,12 +142,13 @@ class AskedLoop:
                 iteration that does not converge is near its fixed point too; None: none is.
         """
         memories, traces, still = [memory], [], 0
+        leads = None if led is None else np.isfinite(led)
         for k in range(cycles):
             memory_next, trace = self._step(memories[-1])
             if not (np.isfinite(memory_next).all() and np.isfinite(trace[self._arriving]).all()):
                 break
-            if led is not None:
-                memory_next[self._state] = np.where(np.isfinite(led[k]), led[k], memory_next[self._state])
+            if led is not None and leads is not None:
+                np.copyto(memory_next[self._state], led[k], where=leads[k])
             if request is not None and k == self.warm and len(self._request) == request.size:
                 memory_next[self._request] = request
             memories.append(memory_next)
@@ -189,6 +191,8 @@ class AskedLoop:
     def between(self, memory: np.ndarray, gains: tuple[float, float], *, held: bool = False) -> tuple[LinearLoop, ...]:
         """Return the linear loops of two gains of a `LinearMap` in the same coordinates.
 
+        What `at` has found of the second gain is not sought again.
+
         Args:
             memory: at which both are linearised.
             gains: the effective gains.
@@ -200,20 +204,22 @@ class AskedLoop:
 
     def _among(self, periods: list[list[np.ndarray]]) -> tuple[LinearLoop, ...]:
         """The linear loops along several periods, in the same coordinates."""
-        scales = self._scales(periods[0][0])
+        scales, names = self._scales(periods[0][0]), [b"".join(map(bytes, period)) for period in periods]
         ways = [[self._step.way(at, scales) for at in together] for together in zip(*periods, strict=True)]
         places = np.arange(self._state.start, self._state.stop)
         if self.quick:
             directions = [along(some, np.eye(len(scales))[:, self._free], self._inputs) for some in ways]
         else:
-            directions = reached(ways, self._free, places, self._inputs)
+            directions = reached(ways, self._free, places, self._inputs, self._known.get(names[-1]))
+        if len(periods) == 1:
+            self._known[names[0]] = directions
         return tuple(self._linear([at[k] for at in ways], directions, k, scales[places]) for k in range(len(periods)))
 
     def _linear(self, ways: list[Way], directions: list[Directions], number: int, scales: np.ndarray) -> LinearLoop:
         """The linear loop of one of the ways of every cycle."""
-        cycles, nothing = [], np.zeros(self.loop.memory.size)
+        cycles, nothing = [], np.zeros((self.loop.memory.size, self._inputs))
         for way, at, later in zip(ways, directions, [*directions[1:], directions[0]], strict=True):
-            entry = np.column_stack([way(nothing, one)[0] for one in np.eye(self._inputs)])
+            entry = way(nothing, np.eye(self._inputs))[0]
             state, arriving = at.basis[self._state] * scales[:, None], at.traces[number][self._arriving]
             onto = later.basis.T
             cycles.append(LinearCycle(onto @ at.moved[number], onto @ entry, arriving, state))

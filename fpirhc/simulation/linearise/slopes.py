@@ -13,6 +13,7 @@ the next direction, until nothing is (Arnoldi's iteration).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -50,7 +51,7 @@ class Step:
         return self._evaluator.results[0].copy(), self._evaluator.results[1].copy()
 
     def way(self, memory: np.ndarray, scales: np.ndarray) -> Way:
-        """Return the function (deviation in scales, w) -> (next deviation in scales, deviation of the trace) at a point."""
+        """Return the function (deviations in scales, w) -> (next deviations in scales, deviations of the trace), all by columns."""
         if not self.scalar:
             return self._evaluated(memory, scales)
         if self._slopes is None:
@@ -61,22 +62,22 @@ class Step:
             raise NotSupported("the loop has no finite slope at a point of its run")
         by_memory, by_input = (m.reshape(columns, -1).T for m, columns in zip(slopes, (size, nu), strict=True))
 
-        def move(deviation: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            both = by_memory @ (scales * deviation) + by_input @ w
-            return both[:size] / scales, both[size:]
+        def move(deviations: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            both = by_memory @ (scales[:, None] * deviations) + by_input @ w
+            return both[:size] / scales[:, None], both[size:]
 
         return move
 
     def _evaluated(self, memory: np.ndarray, scales: np.ndarray) -> Way:
-        def move(deviation: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            size = float(max(np.linalg.norm(deviation), np.linalg.norm(w)))
-            if size == 0:
-                return np.zeros(memory.size), np.zeros(self.loop.trace.size)
-            h = _STEP / size
-            ahead, behind = (self(memory + s * h * scales * deviation, s * h * w) for s in (1, -1))
-            ways = [(a - b) / (2 * h) for a, b in zip(ahead, behind, strict=True)]
-            moved = ways[0] / scales
-            return np.where(np.abs(moved) > _ROUNDING * size, moved, 0.0), ways[1]
+        def move(deviations: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            sizes = np.sqrt(np.maximum((deviations**2).sum(axis=0), (w**2).sum(axis=0)))
+            moved, traces = np.zeros_like(deviations), np.zeros((self.loop.trace.size, w.shape[1]))
+            for k in np.flatnonzero(sizes):
+                h = _STEP / sizes[k]
+                by_memory, by_input = h * scales * deviations[:, k], h * w[:, k]
+                ahead, behind = self(memory + by_memory, by_input), self(memory - by_memory, -by_input)
+                moved[:, k], traces[:, k] = (ahead[0] - behind[0]) / (2 * h * scales), (ahead[1] - behind[1]) / (2 * h)
+            return np.where(np.abs(moved) > _ROUNDING * sizes, moved, 0.0), traces
 
         return move
 
@@ -98,11 +99,17 @@ class Directions:
 
 def along(ways: Sequence[Way], basis: np.ndarray, inputs: int) -> Directions:
     """Return given directions (n, m) of a cycle, moved."""
-    images = [[way(one, np.zeros(inputs)) for one in basis.T] for way in ways]
-    return _collected(basis, images)
+    images = [way(basis, np.zeros((inputs, basis.shape[1]))) for way in ways]
+    return Directions(basis, [moved for moved, _ in images], [trace for _, trace in images])
 
 
-def reached(ways: Sequence[Sequence[Way]], free: np.ndarray, first: np.ndarray, inputs: int) -> list[Directions]:
+def reached(
+    ways: Sequence[Sequence[Way]],
+    free: np.ndarray,
+    first: np.ndarray,
+    inputs: int,
+    begun: Sequence[Directions] | None = None,
+) -> list[Directions]:
     """Return directions at every cycle of a period that the motion from some first ones does not leave.
 
     Args:
@@ -110,37 +117,82 @@ def reached(ways: Sequence[Sequence[Way]], free: np.ndarray, first: np.ndarray, 
         free: which entries may deviate, (n,).
         first: places of the plant's state.
         inputs: number of inputs.
+        begun: those of each cycle's last way alone, from which the others go on; None: none are known.
 
     Raises:
         NotSupported: more directions than a loop should need.
     """
-    still, calm, count = np.zeros(free.size), np.zeros(inputs), len(ways)
-    waiting = [(0, np.where(np.arange(free.size) == k, 1.0, 0.0)) for k in first]
-    for k, some in enumerate(ways):
-        moved = [way(still, one)[0] * free for way in some for one in np.eye(inputs)]
-        waiting += [((k + 1) % count, one / (np.linalg.norm(one) or 1.0)) for one in moved]
-    bases = [np.zeros((0, free.size))] * count
-    images: list[list[list[tuple[np.ndarray, np.ndarray]]]] = [[[] for _ in some] for some in ways]
-    while waiting:
-        place, one = waiting.pop(0)
-        basis = bases[place]
+    count, kicks, fixed = len(ways), (np.zeros((free.size, inputs)), np.eye(inputs)), ~free
+    parts = [_Part(some, free.size, None if begun is None else begun[k]) for k, some in enumerate(ways)]
+    waiting = [(0, np.where(np.arange(free.size) == k, 1.0, 0.0)) for k in first] if begun is None else []
+
+    def passed(place: int, moved: np.ndarray) -> None:
+        moved[fixed] = 0.0
+        waiting.extend(((place + 1) % count, one) for one in moved.T)
+
+    for k, part in enumerate(parts):
+        for way in ways[k] if begun is None else ways[k][:-1]:
+            moved = way(*kicks)[0]
+            passed(k, moved / (np.linalg.norm(moved * free[:, None], axis=0) + 1e-300))
+        for moved in part.caught_up(inputs):
+            passed(k, moved)
+    calm, at = np.zeros((inputs, 1)), 0
+    while at < len(waiting):
+        place, one = waiting[at]
+        at += 1
+        part = parts[place]
+        basis = part.basis[:, : part.count]
         for _ in range(2):  # the second time for the rounding of the first
-            one = one - basis.T @ (basis @ one)
-        length = float(np.linalg.norm(one))
-        if length <= _NEW:
-            continue
-        if len(basis) >= _LARGEST:
+            one = one - basis @ (one @ basis)
+        length = math.sqrt(one @ one)
+        if length > _NEW:
+            for moved in part.joined((one / length)[:, None], calm):
+                passed(place, moved)
+    return [part.directions for part in parts]
+
+
+class _Part:
+    """The directions of one cycle while they are sought."""
+
+    def __init__(self, ways: Sequence[Way], size: int, begun: Directions | None) -> None:
+        self.ways, self.count, self._begun = ways, 0, begun
+        self.basis = np.zeros((size, 0))
+        self._images: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in ways]
+
+    def caught_up(self, inputs: int) -> list[np.ndarray]:
+        """Take over the directions that are known of the last way; return what the other ways make of them."""
+        if self._begun is None:
+            return []
+        self._append(self._begun.basis)
+        self._images[-1].append((self._begun.moved[0], self._begun.traces[0]))
+        calm = np.zeros((inputs, self.count))
+        for way, known in zip(self.ways[:-1], self._images, strict=False):
+            known.append(way(self._begun.basis, calm))
+        return [known[0][0].copy() for known in self._images[:-1]]
+
+    def joined(self, direction: np.ndarray, calm: np.ndarray) -> list[np.ndarray]:
+        """Add a direction (n, 1); return what every way makes of it."""
+        if self.count >= _LARGEST:
             raise NotSupported(f"the loop moves in more than {_LARGEST} directions")
-        bases[place] = np.vstack([basis, one / length])
-        for way, known in zip(ways[place], images[place], strict=True):
-            known.append(way(one / length, calm))
-            waiting.append(((place + 1) % count, known[-1][0] * free))
-    return [_collected(basis.T, known) for basis, known in zip(bases, images, strict=True)]
+        self._append(direction)
+        for way, known in zip(self.ways, self._images, strict=True):
+            known.append(way(direction, calm))
+        return [known[-1][0].copy() for known in self._images]
 
+    def _append(self, directions: np.ndarray) -> None:
+        rows, more = directions.shape
+        if self.count + more > self.basis.shape[1]:
+            wider = np.zeros((rows, 2 * (self.count + more) + 32), order="F")
+            wider[:, : self.count] = self.basis[:, : self.count]
+            self.basis = wider
+        self.basis[:, self.count : self.count + more] = directions
+        self.count += more
 
-def _collected(basis: np.ndarray, images: Sequence[Sequence[tuple[np.ndarray, np.ndarray]]]) -> Directions:
-    moved, traces = ([np.column_stack([one[k] for one in known]) for known in images] for k in (0, 1))
-    return Directions(basis, moved, traces)
+    @property
+    def directions(self) -> Directions:
+        """Those that were found, and what each way makes of them."""
+        moved, traces = ([np.hstack([one[k] for one in known]) for known in self._images] for k in (0, 1))
+        return Directions(self.basis[:, : self.count].copy(), moved, traces)
 
 
 def _derivative(function: ca.Function) -> ca.Function:

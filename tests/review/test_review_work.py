@@ -1,0 +1,35 @@
+"""A review composes a loop, plans and linearises no more often than its controllers differ."""
+
+import fpirhc as fp
+from fpirhc.controllers import beside_plan
+from fpirhc.simulation import loop
+from fpirhc.simulation.linearise.asked_loop import AskedLoop
+from fpirhc.simulation.linearise.slopes import Step
+
+
+def counted(monkeypatch, owner, name):
+    """Count the calls of a function from now on."""
+    calls, original = [], getattr(owner, name)
+
+    def count(*arguments, **named):
+        calls.append(name)
+        return original(*arguments, **named)
+
+    monkeypatch.setattr(owner, name, count)
+    return calls
+
+
+def test_controllers_that_differ_in_their_deformation_share_what_a_review_builds(monkeypatch):
+    task = fp.load_problem("two_mass")
+    pair = {name: task.controllers[name] for name in ("RHC", "RHC+FPI")}
+    loops = counted(monkeypatch, loop, "_closed")
+    plans = counted(monkeypatch, beside_plan, "first_memory")
+    asked = counted(monkeypatch, AskedLoop, "__init__")
+    linear = counted(monkeypatch, AskedLoop, "_among")
+    steps = counted(monkeypatch, Step, "__call__")
+    fp.review(task.problem, pair, mismatch=0.0, seed=0)
+    assert len(plans) == 1  # exact parameters are numbers of the plant, and no other horizon
+    assert len(asked) == 2  # without adaptation, and with a map of any gain
+    assert len(loops) <= 7  # with those of the runs: one of the model each, and one of each map that is tried
+    assert len(linear) <= 32
+    assert len(steps) <= 19_000
