@@ -421,3 +421,42 @@ def test_journey_of_probe(folder, capsys):
     assert main([*words, "--json"]) == ExitCode.FINISHED
     facts = json.loads(capsys.readouterr().out)
     assert set(facts) == {"gain", "dead_time", "lag", "noise", "drift", "lines", "why", "trials", "notes"}
+
+
+def test_review_asks_the_plant_as_estimated(folder, capsys):
+    """A plant outside has no equations: after a probe its inverse, poles and margins are answered as those of the estimate."""
+    del folder
+    Path("outside.py").write_text(OUTSIDE)
+    answers = []
+    for words in (["review", "outside.py", "--json"], ["review", "outside.py", "--probe", "--json"]):
+        main(words)
+        facts = json.loads(capsys.readouterr().out)
+        every = [*facts["answers"], *facts["controllers"]["CTC+FPI"]]
+        answers.append(sum(one["verdict"] != "unknown" for one in every))
+    assert answers[1] >= answers[0] + 3
+
+
+OUTSIDE = """import fpirhc as fp
+import casadi as ca
+
+class Body:
+    def reset(self, seed):
+        self.y, self.v, self.late = 0.0, 0.0, [0.0]
+        return [0.0, 0.0, 0.0]
+    def step(self, time, command):
+        self.late.append(float(command[0]))
+        a = 1.4 * self.late.pop(0) - 3 * self.y - 0.2 * self.v
+        self.y, self.v = self.y + 5e-3 * self.v + 1.25e-5 * a, self.v + 5e-3 * a
+        return [self.y, self.v, a]
+
+parameters = {"b": fp.Parameter(1.0, 1.0, "1/kg")}
+plant = fp.Plant({"y": "m"}, {"u": "N"}, parameters, lambda q, v, u, p: {"y": p.b * u.u})
+problem = fp.Problem(
+    plant=plant,
+    reality=fp.ExternalPlant(Body(), measures={"y": "m", "y'": "m/s", "y''": "m/s^2"}),
+    reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}), start={"y": 0.0, "y'": 2.0}, period=5e-3, duration=2.0,
+    limits=fp.Limits(inputs={"u": (-30.0, 30.0)}),
+)
+law = fp.Exponential(rate=6.0)
+controllers = {"CTC": fp.ComputedTorque(law), "CTC+FPI": fp.ComputedTorque(law, fp.ModelReferenced(fp.Affine(gain=-0.3)))}
+"""

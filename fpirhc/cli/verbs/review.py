@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from fpirhc.cli.options import add_controllers, add_json, add_mismatch, add_problem, add_seed
 from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
+    from fpirhc.controllers.base import Controller
     from fpirhc.review.answer import Answer, Review
+    from fpirhc.task.problem import Problem
 
 _COLOURS = {"yes": "green", "no": "red", "unknown": "yellow"}
 
@@ -19,6 +21,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
     add_controllers(parser)
     add_mismatch(parser)
+    text = "first probe the plant, and ask the plant as estimated: for a plant outside, whose equations nobody knows"
+    parser.add_argument("--probe", action="store_true", help=text)
     add_seed(parser, "the exact parameters that are drawn")
     add_json(parser, "the text")
 
@@ -32,12 +36,28 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.view import to_json
 
     controllers = select(task, options.controllers)
-    answers = review(task.problem, controllers, mismatch=options.mismatch, seed=options.seed)
+    problem = _probed(task.problem, controllers, options.seed) if options.probe else task.problem
+    answers = review(problem, controllers, mismatch=options.mismatch, seed=options.seed)
     if options.json:
         print(to_json(_facts(task.name, answers)))
     else:
         _show(task.title, answers)
     return ExitCode.FINISHED if answers.ready else ExitCode.ANSWERED_NO
+
+
+def _probed(problem: Problem, controllers: Mapping[str, Controller], seed: int) -> Problem:
+    """The problem with the plant as a probe estimates it.
+
+    Raises:
+        NotSupported: a plant whose estimate is refused, or has no equations.
+    """
+    from fpirhc.errors import NotSupported
+    from fpirhc.probing.probe import probe
+
+    found = probe(problem, next(iter(controllers.values())), trials=False, seed=seed)
+    if found.problem is None:
+        raise NotSupported(f"review --probe: {found.why}")
+    return found.problem
 
 
 def _show(title: str, review: Review) -> None:
@@ -98,6 +118,7 @@ VERB = Verb(
     examples=(
         ("fpirhc review two_mass --mismatch 20", "before a run, exact parameters within 20 %"),
         ("fpirhc review my_arm.py --controllers RHC+FPI", "one controller"),
+        ("fpirhc review my_arm.py --probe", "a plant outside, as a probe of it estimates it"),
         ("fpirhc review two_mass --json", "one JSON object on standard output"),
     ),
     notes="""
