@@ -148,10 +148,13 @@ def _in_module_of_its_name(root: ModuleType, name: str) -> Any:
 
 
 FORMER_MEMBERS = {  # members and arguments of earlier versions
+    "Plant.affine": "equations.affine",
     "Plant.controlled_response_function": "equations.controlled_response",
     "Plant.derivative_function": "equations.rate",
     "Plant.forced_derivative_function": "equations.forced_rate",
     "Plant.inverse_function": "equations.inverse",
+    "Plant.inverse_opaque": "equations.inverse_opaque",
+    "Plant.known_by_outputs": "equations.known_by_outputs",
     "Plant.next_function": "equations.next",
     "Plant.of_map": "discrete",
     "Plant.output_function": "equations.output",
