@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.adapters.control import controller_system, plant_of
 from fpirhc.errors import InvalidProblem
 
 
 @cache
+def adapter() -> Any:
+    """It takes a second to import python-control, which only these tests pay."""
+    return importlib.import_module("fpirhc.adapters.control")
+
+
 def library() -> Any:
-    """A second of imports, which only these tests pay."""
-    return importlib.import_module("control")
+    """Python-control."""
+    return adapter().control
 
 
 @cache
@@ -33,7 +37,7 @@ def problem(plant: fp.Plant, reference: float = 0.5, **changes) -> fp.Problem:
 def test_a_transfer_function_moves_as_python_control_says():
     """The command of a run, given to python-control's own simulation of the true system."""
     model, true = model_and_truth()
-    plant = plant_of(model, true, inputs={"u": "V"}, outputs={"y": "rad"})
+    plant = adapter().plant_of(model, true, inputs={"u": "V"}, outputs={"y": "rad"})
     assert plant.response_orders == {"y": 3}
     task = problem(plant, start=dict.fromkeys(plant.state.elements, 0.0))
     run = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=3.0)), seed=0, compiled=False)
@@ -44,7 +48,7 @@ def test_a_transfer_function_moves_as_python_control_says():
 
 
 def test_entries_that_differ_are_parameters():
-    plant = plant_of(*model_and_truth())
+    plant = adapter().plant_of(*model_and_truth())
     assert {name: (p.approximate, p.exact) for name, p in plant.parameters.items()} == {
         "A_1_1": (-3.0, -2.0), "C_1_3": (2.0, 3.0)
     }  # fmt: skip
@@ -52,7 +56,7 @@ def test_entries_that_differ_are_parameters():
 
 
 def test_a_sampled_system_is_a_map():
-    plant = plant_of(library().c2d(library().ss(library().tf([1], [1, 1])), 0.1), outputs={"y": "K"})
+    plant = adapter().plant_of(library().c2d(library().ss(library().tf([1], [1, 1])), 0.1), outputs={"y": "K"})
     assert plant.step == 0.1
     task = problem(plant, start=dict.fromkeys(plant.state.elements, 0.0), period=0.1)
     run = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=1.0)), seed=0, compiled=False)
@@ -74,7 +78,7 @@ def test_a_sampled_system_is_a_map():
 )
 def test_mistakes_are_named(system, arguments, message):
     with pytest.raises(InvalidProblem) as caught:
-        plant_of(system(), **arguments())
+        adapter().plant_of(system(), **arguments())
     assert message in str(caught.value)
 
 
@@ -83,7 +87,7 @@ def test_a_controller_is_a_system():
     task = fp.load_problem("two_link_arm").problem
     law = fp.ComputedTorque(fp.Exponential(rate=10.0), fp.ModelReferenced(fp.Affine(gain=-0.1)))
     run = fp.simulate(task, law, seed=0, compiled=False)
-    system = controller_system(task, law)
+    system = adapter().controller_system(task, law)
     measured = np.hstack([run["state"], run["realised"]])[:50].T
     assert system.input_labels == ["q1", "q2", "q1_1", "q2_1", "q1_2", "q2_2"]
     answer = library().input_output_response(system, np.arange(50) * task.period, measured, system.initial)

@@ -113,18 +113,13 @@ def null_change(name: str) -> float:
     return float(np.abs(runs[1][key] - runs[0][key]).max() / np.abs(runs[0][key]).max())
 
 
-def adaptive_problems() -> list[str]:
-    collected = []
-    for name in sorted(shipped_problems()):
-        module: Any = fp.load_problem(name)
-        adaptive = resolved(module.problem, module.controllers[module.headline[1]])
-        collected += [name] if adaptive.deformation.adapts and adaptive.deforms == "response" else []
-    return collected
-
-
-@pytest.mark.parametrize("name", adaptive_problems())
+@pytest.mark.parametrize("name", sorted(shipped_problems()))
 def test_exact_model_is_left_alone(name):
     """On every shipped problem, behind its sensors and dead time, quanta included: nothing changes beyond rounding."""
+    task: Any = fp.load_problem(name)
+    adaptive = resolved(task.problem, task.controllers[task.headline[1]])
+    if not adaptive.deformation.adapts or adaptive.deforms != "response":
+        pytest.skip("its headline deforms no response")
     assert null_change(name) <= 1e-9
 
 
