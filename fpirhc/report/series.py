@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,16 +128,16 @@ def _chart(title: str, unit: str, lines: Sequence[tuple[str, np.ndarray]], edges
 
 def _extremes(values: np.ndarray, edges: np.ndarray) -> list[float | None]:
     """Two values per interval: its extremes in the order in which they occur; None where the run had ended."""
-    extremes: list[float | None] = []
-    for begin, end in pairwise(edges):
-        part = values[begin:end]
-        if part.size == 0:
-            extremes += [None, None]
-            continue
-        low, high = int(np.argmin(part)), int(np.argmax(part))
-        extremes += _round(part[[min(low, high), max(low, high)]])
-    return extremes
+    begins = edges[:-1][edges[:-1] < len(values)]
+    if not len(begins):
+        return [None] * (2 * (len(edges) - 1))
+    width = int(np.diff(edges).max())  # an interval that is shorter repeats its last value
+    ends = np.minimum(edges[1 : len(begins) + 1], len(values))
+    parts = values[np.minimum(begins[:, None] + np.arange(width), ends[:, None] - 1)]
+    places = np.sort(np.column_stack([parts.argmin(axis=1), parts.argmax(axis=1)]))
+    extremes = np.take_along_axis(parts, places, axis=1).ravel()
+    return [*_round(extremes), *[None] * (2 * (len(edges) - 1 - len(begins)))]
 
 
 def _round(values: np.ndarray) -> list[float]:
-    return [float(f"{v:.5g}") for v in values]
+    return [float(f"{v:.5g}") for v in values.tolist()]
