@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -51,12 +52,22 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
 
 
 @cache
+def blocks(text: str) -> list[tuple[bool, str]]:
+    """Return the paragraphs of a description, each with whether it is set as written, as indented equations and tables are."""
+    found = (block for block in textwrap.dedent(text).strip().split("\n\n") if block.strip())
+    return [(True, textwrap.dedent(b)) if b.startswith("  ") else (False, " ".join(b.split())) for b in found]
+
+
 def _environment() -> Environment:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader(__package__)
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.filters |= {"css_class": css_class, "indented": lambda value: json.dumps(value, indent=1)}
+    environment.filters |= {
+        "css_class": css_class,
+        "blocks": blocks,
+        "indented": lambda value: json.dumps(value, indent=1),
+    }
     return environment
 
 

@@ -19,6 +19,7 @@ import fpirhc as fp
 from fpirhc.errors import OutputError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render, write_report
+from fpirhc.report.page import blocks
 from fpirhc.report.series import INTERVALS, chart_data
 from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare
@@ -83,6 +84,18 @@ def test_verdict_comes_first_then_table_charts_and_pictures(whole):
     places = [page.index(m) for m in marks]
     assert places == sorted(places)
     assert page.count("<img alt='") == 7
+
+
+def test_equations_and_tables_of_a_description_keep_their_columns():
+    """Indented blocks are set as written; the lines of a paragraph flow."""
+    text = "A sledge that\nslips,\n\n    m x'' = F - f,\n    z' = x'\n\nand\n\n    rms     x [m]\n    CTC    0.0018\n"
+    assert blocks(text) == [
+        (False, "A sledge that slips,"),
+        (True, "m x'' = F - f,\nz' = x'"),
+        (False, "and"),
+        (True, "rms     x [m]\nCTC    0.0018"),
+    ]
+    assert blocks("") == []
 
 
 def test_hostile_names_are_only_text(whole):
