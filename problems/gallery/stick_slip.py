@@ -22,10 +22,8 @@ Task: x = 50 mm sin 2 t, which reverses twice in pi s; the error counts from 4 s
     RHC exact model      1.5e-05
 
 The exact model's bristles move at 1 000 per second: a stage of 10 ms in one explicit step is unstable, the exact model's plan
-has no digits, and is refused. The stages below have 8 sub-steps each, which cures it. Every state is told to
-the controllers; the deflection z, which nobody can measure, serves the exact model alone: without it the filter is as good.
-
-The gains below are those that a review recommends.
+has no digits, and is refused. The stages below have 8 sub-steps each, which cures it. All states are given
+to the controllers; the deflection z, which nobody can measure, serves the exact model alone: without it the filter is as good.
 """
 
 import casadi as ca
