@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
+from fpirhc.errors import NotSupported
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
@@ -44,7 +45,12 @@ def preview_of(problem: Problem) -> ca.Function | None:
     """Function (own signals) -> (states, responses) at the nodes of the horizon; None without own signals."""
     if problem.horizon is None:
         return None
-    return problem.reference.preview(problem.plant, problem.horizon.stages, problem.horizon.step)
+    preview = problem.reference.preview(problem.plant, problem.horizon.stages, problem.horizon.step)
+    if preview is not None and problem.horizon.lengths:
+        raise NotSupported(
+            "Horizon(lengths=...) needs a reference that is known ahead; leave lengths out with set-points"
+        )
+    return preview
 
 
 def with_reference(problem: Problem, blocks: Sequence[Block]) -> list[Block]:

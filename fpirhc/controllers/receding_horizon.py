@@ -239,7 +239,7 @@ def _check_reference(problem: Problem) -> None:
     """
     assert problem.horizon is not None
     moving = live_numbers(problem.reference)
-    if moving and not problem.reference.rests(problem.horizon.stages * problem.horizon.step):
+    if moving and not problem.reference.rests(float(problem.horizon.nodes[-1])):
         raise NotSupported(
             f"setting '{next(iter(moving))}' cannot be live with a plan: the reference moves within the first horizon, from which "
             "the optimiser's scale and the first plan are taken; let it rest there"

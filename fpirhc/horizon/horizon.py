@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Count, Duration
@@ -23,6 +25,9 @@ class Horizon(Checked):
         discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), ImplicitMidpoint(), RadauIIA(). A
             map has none: a stage is a whole number of its steps.
         terminal: names of states that must meet the reference at the end of the horizon.
+        lengths: of the stages, as multiples of `step`, which is that of the first one: fine stages first. One number of at least
+            1 for every stage; empty: all stages are equal. Every stage counts with its length in the cost, and limits and costs of
+            input changes count with the time since the change before. Prices of limits count every node alike.
         blocks: lengths of blocks of stages over which the inputs are held (move blocking); they add up to the stages. Empty: every
             stage has inputs of its own.
         margins: by name of a state, the distances by which a plan stays inside the state's limits after stages 1 ... N, in the
@@ -50,6 +55,7 @@ class Horizon(Checked):
     margins: Mapping[str, Sequence[float]] = field(
         default_factory=dict, hash=False, metadata={"setting": "where given"}
     )
+    lengths: tuple[float, ...] = field(default=(), kw_only=True, metadata={"setting": "where given"})
     measured: tuple[str, ...] = field(default=(), kw_only=True, metadata={"setting": False})
     replan: Literal["stage", "cycle"] | Count = field(
         default="stage", kw_only=True, metadata={"setting": "where given"}
@@ -61,6 +67,15 @@ class Horizon(Checked):
         if not whole and self.replan not in ("stage", "cycle"):
             raise InvalidValue(
                 f'horizon: replan must be "stage", "cycle" or a whole number of control cycles from 1, got {self.replan!r}'
+            )
+        if self.lengths and (
+            len(self.lengths) != self.stages
+            or self.lengths[0] != 1
+            or not all(1 <= length < math.inf for length in self.lengths)
+        ):
+            raise InvalidValue(
+                f"horizon: lengths must be {self.stages} finite numbers of at least 1, one for every stage in steps of the first, "
+                f"which is 1; got {self.lengths}"
             )
         if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):
             raise InvalidValue(
@@ -76,3 +91,25 @@ class Horizon(Checked):
             raise NotSupported(
                 "a horizon needs an integrator of plain expressions, such as RungeKutta4() or RadauIIA()"
             )
+
+    @property
+    def relative_lengths(self) -> np.ndarray:
+        """Lengths of the stages in steps of the first one, shape (N,)."""
+        return np.array(self.lengths) if self.lengths else np.ones(self.stages)
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Times of s_0 ... s_N from the start, shape (N + 1,), in the plant's unit of time."""
+        if not self.lengths:
+            return np.arange(self.stages + 1) * self.step
+        return np.concatenate([[0.0], np.cumsum(self.lengths)]) * self.step
+
+    @property
+    def longest(self) -> float:
+        """Length of the longest stage."""
+        return self.step * max(self.lengths, default=1.0)
+
+    @property
+    def last(self) -> float:
+        """Length of the last stage."""
+        return self.step * (self.lengths[-1] if self.lengths else 1.0)

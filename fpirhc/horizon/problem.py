@@ -31,7 +31,7 @@ class OptimalControl:
 
     Args:
         stages: number of stages N.
-        step: length of one stage, s.
+        step: length of the first stage, s.
         state: signal of s_i.
         input: signal of u_i.
         data: layout of theta_i.
@@ -50,6 +50,7 @@ class OptimalControl:
         along: quadratic model of the cost along the reference.
         written: number of the last entries of the state, which are limits of rates, paths and the end; they are zero in s_0.
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
+        node_times: of s_0 ... s_N from the start, shape (N + 1,), s.
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
         settings: paths of the live settings, whose numbers are among the data.
         live_bounds: paths of the live limits of inputs, which are arguments of a call.
@@ -79,6 +80,7 @@ class OptimalControl:
     along: _ReferenceExpansion
     written: int
     state_price: np.ndarray
+    node_times: np.ndarray
     shares: np.ndarray
     settings: tuple[str, ...] = ()
     live_bounds: tuple[str, ...] = ()

@@ -31,7 +31,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
 
     A terminal equality adds whether the stage is the last, and the reference after it; blocks add whether the inputs are free.
     Limits that hold for the measured state add its distance from the plan's start. Plans that follow sooner than a stage add the
-    haste of the change of inputs: stages per time between two plans in the first stage, 1 in all others.
+    haste of the change of inputs: first stages per time since the change before. Stages of several lengths add theirs.
     """
     free = (scalar("free"),) if horizon.blocks else ()
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
@@ -39,7 +39,8 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     margin = (Signal("margin", names, tuple(units[e] for e in names)),) if names else ()
     shown = horizon.measured
     offset = (Signal("offset", shown, tuple(units[e] for e in shown)),) if shown else ()
-    haste = (scalar("haste"),) if horizon.share < 1 else ()
+    haste = (scalar("haste"),) if hastened(horizon) else ()
+    length = (scalar("length"),) if horizon.lengths else ()
     signals = (
         time_signal(plant),
         Signal("reference", plant.output.elements, plant.output.units),
@@ -49,10 +50,16 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
         *margin,
         *offset,
         *haste,
+        *length,
     )
     if not horizon.terminal:
         return Layout(signals)
     return Layout((*signals, scalar("last"), Signal("target", plant.state.elements, plant.state.units)))
+
+
+def hastened(horizon: Horizon) -> bool:
+    """Return whether the change of inputs takes another time in some stages than in others."""
+    return horizon.share < 1 or bool(horizon.lengths)
 
 
 def stage_data(
@@ -74,25 +81,27 @@ def stage_data(
     looked_up = signals is not None and not signals.is_a("SXFunction")
     matrix = kind(reference.opaque or plant.equations.inverse_opaque or looked_up)
     t, of_cycle = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
-    p = of_cycle if signals is None else signals(t + horizon.step / 2, of_cycle)
+    half = matrix.sym("half") if horizon.lengths else horizon.step / 2
+    p = of_cycle if signals is None else signals(t + half, of_cycle)
     motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.chains))] if previewed else []
     state, response = motion or reference.function(plant)(t)
     zero = matrix.zeros(plant.input.size)
     needed = feedforward(plant, state, response, p) if cost.uses_feedforward else zero
     # The live rows come out of the same call where they follow these rows: joining tables would copy both.
-    plain = not (horizon.blocks or horizon.terminal or horizon.margins or horizon.measured) and horizon.share == 1
+    plain = not (horizon.blocks or horizon.terminal or horizon.margins or horizon.measured) and not hastened(horizon)
     joined = bool(live) and plain
     rows = [matrix.sym("live", live)] if joined else []
     stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
-    one = ca.Function("fpirhc_stage_data", [t, *motion, of_cycle, *rows], [stage])
+    one = ca.Function("fpirhc_stage_data", [t, *motion, of_cycle, *rows, *([half] if horizon.lengths else [])], [stage])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     columns = dict(zip(("states", "responses"), motion, strict=False))
     tables = [ca.MX.sym(name, m.numel(), horizon.stages + 1) for name, m in columns.items()]
     settings = [ca.MX.sym("live", live)] if live else []
     nodes = horizon.stages + 1
-    times = start + ca.DM(np.arange(nodes) * horizon.step).T
+    times = start + ca.DM(horizon.nodes).T
+    halves = [ca.DM(0.5 * np.append(np.diff(horizon.nodes), horizon.last)).T] if horizon.lengths else []
     repeated = [ca.repmat(v, 1, nodes) for v in (parameters, *(settings if joined else ()))]
-    table = one.map(nodes)(times, *tables, *repeated)
+    table = one.map(nodes)(times, *tables, *repeated, *halves)
     if horizon.blocks:
         free = np.zeros((1, nodes))
         free[0, [0, *np.cumsum(horizon.blocks)]] = 1.0
@@ -102,8 +111,10 @@ def stage_data(
         table = ca.vertcat(table, margins)
     if horizon.measured:
         table = ca.vertcat(table, np.zeros((len(horizon.measured), nodes)))
-    if horizon.share < 1:
-        table = ca.vertcat(table, np.array([[1 / horizon.share, *np.ones(nodes - 1)]]))
+    if hastened(horizon):
+        table = ca.vertcat(table, 1 / np.array([[horizon.share, *horizon.relative_lengths]]))
+    if horizon.lengths:
+        table = ca.vertcat(table, np.array([[*horizon.lengths, horizon.lengths[-1]]]))
     if horizon.terminal:
         last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
         last[0, nodes - 2] = 1.0

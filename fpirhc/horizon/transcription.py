@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
+from typing import cast
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
+from fpirhc.errors import InvalidName, InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.constraint_states import (
     ConstraintState,
@@ -27,7 +28,7 @@ from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, known_on_reference, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
-from fpirhc.horizon.stage_data import data_layout, live_signals, live_table, settings_in, stage_data
+from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.stiffness import spurious_growth
 from fpirhc.symbolic.latest import Latest
@@ -87,7 +88,7 @@ def _transcribed(
         plant, reference, horizon, cost, limits, [number.of(ca.SX) for number in others.values()]
     )
     binding, free = stage.binding, stage.before.numel()
-    dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
+    dynamics, stage_cost, terminal_cost = _stage_functions(stage)
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
@@ -132,9 +133,10 @@ def _transcribed(
         derive=derive,
         inner=tuple(zip(plant.equations.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
         runaway=lambda: spurious_growth(
-            plant, horizon.discretisation, horizon.step, nodes[0][: plant.state.size, :-1], nodes[1]
+            plant, horizon.discretisation, horizon.longest, nodes[0][: plant.state.size, :-1], nodes[1]
         ),
-        shares=np.full(horizon.stages, horizon.share),
+        node_times=horizon.nodes,
+        shares=horizon.share / horizon.relative_lengths,
         functions=functions,
     )
     return ocp.at(values)
@@ -157,6 +159,7 @@ class _Stage:
     final: Expression
     binding: list[ConstraintState]
     settings: list[ca.SX]
+    length: Expression | float
 
 
 def _stage_expressions(
@@ -173,21 +176,25 @@ def _stage_expressions(
     data = layout.split(theta)
     applied = data["free"] * u + (1 - data["free"]) * before if horizon.blocks else u
     view = limited_view = _view(plant, ca.vertcat(x, before), applied, data, cost, keeps_input)
-    if horizon.share < 1 and keeps_input:
+    length = data["length"] if horizon.lengths else 1.0
+    if hastened(horizon) and keeps_input:
         # A rate is limited as such; its square costs for as long as the change takes, which leaves the root of the haste.
-        limited_view, view = (_hastened(view, factor) for factor in (data["haste"], ca.sqrt(data["haste"])))
+        limited_view, view = (_hastened(view, factor) for factor in (data["haste"], ca.sqrt(data["haste"] / length)))
     try:
         advance = _advance(plant, horizon)
-        x_next = advance(x, applied, view.parameters.vector)
+        if horizon.lengths:
+            x_next = _stretched(plant, horizon)(x, applied, ca.vertcat(view.parameters.vector, length))
+        else:
+            x_next = advance(x, applied, view.parameters.vector)
         written = _written(plant, horizon, limits, limited_view, x_next, data)
         soft = softened(written, limits, plant, _seen(plant, horizon, x, data))
         terms = {**_scalar_terms(cost.stage(view)), **soft}
         if horizon.blocks:
             # Inputs that have no effect are drawn to those that are held, so that a plan states what is applied.
             terms["held"] = (1 - data["free"]) * ca.sumsqr((u - before) / _reach(limits, plant))
-        terminal = cost.terminal_cost(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
+        terminal = cost.terminal_cost(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.last)
         end = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
-        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.step * end
+        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.last * end
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
     binding = hard(written, soft_names(limits, plant))
@@ -195,17 +202,17 @@ def _stage_expressions(
     if settings:
         live = live_signals(tuple(s.name() for s in settings), plant.input)
         theta = ca.vertcat(theta, *settings, ca.SX.sym("live", live.size - len(settings)))
-    return _Stage(x, before, u, applied, theta, x_next, terms, final, binding, settings)
+    return _Stage(x, before, u, applied, theta, x_next, terms, final, binding, settings, horizon.step * length)
 
 
-def _stage_functions(stage: _Stage, step: float) -> tuple[ca.Function, ca.Function, ca.Function]:
+def _stage_functions(stage: _Stage) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Functions of the dynamics, the stage cost and the terminal cost."""
     u, theta, binding = stage.u, stage.theta, stage.binding
     s = ca.vertcat(stage.x, stage.before, ca.SX.sym("z", len(binding)))
     s_next = ca.vertcat(
         stage.x_next, *([stage.applied] if stage.before.numel() else []), *(w.expression for w in binding)
     )
-    costs = step * ca.vertcat(*stage.terms.values())
+    costs = stage.length * ca.vertcat(*stage.terms.values())
     return (
         ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(s_next)]),
         ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(costs), ca.densify(costs)]),
@@ -318,6 +325,24 @@ def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
     step = horizon.discretisation.step(plant, horizon.step)
     x, u, p = plant.symbols()
     return ca.Function("fpirhc_advance", [x, u, p], [step(x, u, p, ca.SX.zeros(len(plant.names)))])
+
+
+def _stretched(plant: Plant, horizon: Horizon) -> ca.Function:
+    """Function (x, u, (p, length)) -> x after so many steps at once: f times the length, over one step."""
+    if plant.step is not None:
+        raise NotSupported(
+            "Horizon(lengths=...): the stages of a map are whole steps of it, all equal; leave lengths out"
+        )
+    rate = plant.equations.forced_rate
+    x, u, p, w = (ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
+    p_length = ca.vertcat(p, ca.SX.sym("length"))
+    slow = ca.Function(
+        "fpirhc_stretched", [x, u, p_length, w], [p_length[-1] * rate(x, u, p, w)], ["x", "u", "p", "w"], ["dx"]
+    )
+    step = horizon.discretisation.step(
+        cast(Plant, SimpleNamespace(equations=SimpleNamespace(forced_rate=slow))), horizon.step
+    )
+    return ca.Function("fpirhc_advance", [x, u, p_length], [step(x, u, p_length, ca.SX.zeros(w.numel()))])
 
 
 def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca.Function) -> Linearisation:

@@ -145,12 +145,13 @@ def stage_later(columns: ca.MX) -> ca.MX:
     return columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])
 
 
-def shift(columns: ca.MX, ocp: OptimalControl) -> ca.MX:
+def shift(columns: ca.MX, ocp: OptimalControl, node: int = 0) -> ca.MX:
     """Return one column per stage for the next horizon: the warm start of the next call.
 
-    A share of a stage later they are the means (1 - share) c_i + share c_{i+1} of what the plan foresees there.
+    A share of a stage later they are the means (1 - share) c_i + share c_{i+1} of what the plan foresees there. `node` is that
+    of the first column: 1 for s_1 ... s_N.
     """
-    shares = np.append(ocp.shares, ocp.shares[-1])[None, : columns.shape[1]]  # s_0 ... s_N are one more
+    shares = np.append(ocp.shares, ocp.shares[-1])[None, node : node + columns.shape[1]]
     return _moved(columns, stage_later(columns), shares)
 
 

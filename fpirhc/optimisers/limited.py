@@ -54,8 +54,8 @@ def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
     rows = layout["plan_multipliers"].size // (2 * n)
     sides = ca.horzsplit(ca.reshape(parts["plan_multipliers"], rows, 2 * n), n)
     shifted_parts: dict[str, ca.MX] = {
-        name: ca.vec(shift(ca.reshape(parts[name], size, n), ocp))
-        for name, size in (("plan_inputs", nu), ("plan_states", ns), ("plan_costates", ns))
+        name: ca.vec(shift(ca.reshape(parts[name], size, n), ocp, node))
+        for name, size, node in (("plan_inputs", nu, 0), ("plan_states", ns, 1), ("plan_costates", ns, 1))
     }
     shifted_parts["plan_gains"] = shift_gains(parts["plan_gains"], nu * ns, ocp)
     shifted_parts["plan_multipliers"] = ca.vec(ca.horzcat(*(shift(side, ocp) for side in sides)))

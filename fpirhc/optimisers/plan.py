@@ -70,7 +70,7 @@ class Plan:
             ("cost", _shown(self.cost, lambda v: f"{v:.7g}")),
             ("stationarity", _shown(self.stationarity, number)),
             ("feasibility", _shown(self.feasibility, number)),
-            ("stages", f"{self.problem.stages} of {self.problem.step:g} {self.problem.time_unit}"),
+            ("stages", _stages(self.problem)),
             ("iterations", f"{steps} in {self.calls} calls"),
         ]
 
@@ -188,6 +188,11 @@ def solve(
     )
 
 
+def _stages(ocp: OptimalControl) -> str:
+    lengths = np.unique(np.round(np.diff(ocp.node_times), 12))
+    return f"{ocp.stages} of {' to '.join(f'{v:g}' for v in (lengths[0], lengths[-1])[: lengths.size])} {ocp.time_unit}"
+
+
 def _shown(value: float | None, text: Callable[[float], str]) -> str:
     return "none" if value is None else text(value)
 
@@ -259,7 +264,7 @@ def _reasons(
 def _sentence(ocp: OptimalControl, breach: _Breach, stuck: list[str], others: list[str]) -> str:
     last, most = int(breach.stages[-1]), float(breach.beyond[1:].max())
     amount = f"{most:.3g} {breach.unit}".strip()
-    length = f"{ocp.stages} stages ({ocp.stages * ocp.step:g} {ocp.time_unit})"
+    length = f"{ocp.stages} stages ({ocp.node_times[-1]:g} {ocp.time_unit})"
     held = f" with {' and '.join(stuck)} at the limit" if stuck else ""
     if breach.equation and breach.name.endswith(" at the end"):
         return (
@@ -275,7 +280,7 @@ def _sentence(ocp: OptimalControl, breach: _Breach, stuck: list[str], others: li
         return (
             f"{limit}: {start} and is still {left} beyond at the end of {length}{held}; {why}. {_remedy(stuck, others)}"
         )
-    back = f"stage {last + 1} ({(last + 1) * ocp.step:g} {ocp.time_unit})"
+    back = f"stage {last + 1} ({ocp.node_times[last + 1]:g} {ocp.time_unit})"
     middle = "cannot be back" if begins else f"passes it by {amount} and cannot be back"
     return (
         f"{limit}: {start}, {middle} before {back}{held}; softening helps: with "

@@ -22,7 +22,7 @@ def stage_follows(grid: ReviewGrid, believed: np.ndarray, question: str) -> Answ
     problem, plant = grid.problem, grid.problem.plant
     if problem.horizon is None or plant.step is not None:
         return None
-    h, discretisation = problem.horizon.step, problem.horizon.discretisation
+    h, discretisation = problem.horizon.longest, problem.horizon.discretisation
     place = first_place(grid, believed)
     try:
         poles = step_poles(plant, discretisation, h, place)

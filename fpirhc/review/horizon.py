@@ -30,7 +30,7 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     problem, plant = grid.problem, grid.problem.plant
     if problem.horizon is None or problem.cost is None:
         return None
-    reach, unit = problem.horizon.stages * problem.horizon.step, problem.time_unit
+    reach, unit = float(problem.horizon.nodes[-1]), problem.time_unit
     try:
         [first] = gains_at(problem, problem.horizon, problem.cost, [0.0], plant.approximate, grid.states_at)
         [second] = gains_at(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate, grid.states_at)

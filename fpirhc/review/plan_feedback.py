@@ -201,8 +201,8 @@ def plan_gains(
     gains = []
     for time in times:
         data = np.asarray(data_of(time, believed).full())
-        clock = time + horizon.step * np.arange(horizon.stages)
-        nodes = np.append(clock, clock[-1] + horizon.step)
+        nodes = time + horizon.nodes
+        clock = nodes[:-1]
         states = data[ocp.data.slice("reference")] if states_at is None else states_at(nodes).T
         wanted = np.asarray(function.map(horizon.stages)(clock[None, :])[1].full())[controlled]
         repeated = np.repeat(believed[:, None], horizon.stages, axis=1)
@@ -216,7 +216,8 @@ def plan_gains(
 
 def longer(horizon: Horizon) -> Horizon:
     """Return the horizon with twice as many stages, and its blocks repeated."""
-    return replace(horizon, stages=2 * horizon.stages, blocks=2 * horizon.blocks)
+    lengths = (*horizon.lengths, *horizon.lengths[-1:] * horizon.stages)
+    return replace(horizon, stages=2 * horizon.stages, blocks=2 * horizon.blocks, lengths=lengths)
 
 
 def _first_gain(

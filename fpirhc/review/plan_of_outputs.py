@@ -92,7 +92,7 @@ def output_plan_gains(
     start_at = _starts(plant) if consistent else None
     gains = []
     for time, state in zip(times, states, strict=True):
-        clock = time + horizon.step * np.arange(ocp.stages)
+        clock = time + horizon.nodes[:-1]
         seen, responses = (np.asarray(v.full()) for v in reference.map(ocp.stages)(clock[None, :]))
         table, y = data_of(time, believed), seen[:, 0]
         start = None if start_at is None else start_at(state, y, responses[controlled, 0], believed)

@@ -102,8 +102,12 @@ def stiff_advice(grid: ReviewGrid, believed: np.ndarray, *, planned: bool) -> st
         return ""
     try:
         place, horizon, cycle = first_place(grid, believed), problem.horizon, problem.integrator
-        if planned and horizon is not None and step_poles(plant, horizon.discretisation, horizon.step, place).unstable:
-            cure = advice(HORIZON, plant, horizon.discretisation, horizon.step, place)
+        if (
+            planned
+            and horizon is not None
+            and step_poles(plant, horizon.discretisation, horizon.longest, place).unstable
+        ):
+            cure = advice(HORIZON, plant, horizon.discretisation, horizon.longest, place)
             return f"Its discretisation grows. {cure}"
         if not cycle.opaque and step_poles(plant, cycle, problem.period, place).unstable:
             return f"The integrator of the plant grows. {advice(CYCLE, plant, cycle, problem.period, place)}"

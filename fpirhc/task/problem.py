@@ -492,7 +492,13 @@ def _time_rows(problem: Problem) -> list[tuple[str, str]]:
         ("judged", ", ".join(problem.judged_names)),
     ]
     if horizon is not None:
-        rows.append(("horizon", f"{horizon.stages} stages of {horizon.step:g} {unit}"))
+        rows.append(
+            (
+                "horizon",
+                f"{horizon.stages} stages of {horizon.step:g} {unit}"
+                + (f" to {horizon.longest:g} {unit}" if horizon.lengths else ""),
+            )
+        )
     return rows
 
 

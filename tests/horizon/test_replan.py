@@ -1,4 +1,4 @@
-"""Plans that follow one another sooner than a stage: `Horizon(replan=...)`."""
+"""Plans that follow one another sooner than a stage, and stages of several lengths: `Horizon(replan=..., lengths=...)`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from fpirhc.task.problem import cycles_per_plan
 STAGES, STEP, PERIOD = 6, 0.08, 0.02
 WEIGHTS = {"angle": 40.0, "angle'": 1.0}
 EFFORT, RATE, FASTEST = 1e-3, 0.05, 12.0
+GROWING = (1.0, 1.0, 1.5, 2.0, 3.0, 4.0)
 CONVERGED = fp.FixedPoint(iterations=30, tolerance=1e-9)
 
 
@@ -44,11 +45,11 @@ def planning(optimiser=CONVERGED, deformation=None):
     return fp.RecedingHorizon(optimiser, deformation or fp.Identity())
 
 
-def own_plan(problem, time, state, before, *, rate=0.0, fastest=np.inf, between=PERIOD):
+def own_plan(problem, time, state, before, *, rate=0.0, fastest=np.inf, between=PERIOD, lengths=(1.0,) * STAGES):
     """First input of the horizon that begins at this time, by a program of its own and IPOPT.
 
-    The first change of the input takes the time between two plans; every other one takes a stage. Its cost is the integral of the
-    squared rate, in units in which a change from stage to stage costs its weight.
+    The first change of the input takes the time between two plans; every other one takes the stage before. Its cost is the integral
+    of the squared rate, in units in which a change from stage to stage costs its weight.
     """
     p = problem.plant.approximate
     rate_of = problem.plant.equations.rate
@@ -58,21 +59,21 @@ def own_plan(problem, time, state, before, *, rate=0.0, fastest=np.inf, between=
     cost: Any = 0
     last: Any = before
     taken = between
+    t = time
     for i in range(STAGES):
-        q = 0.6 * np.sin(1.5 * (time + i * STEP))
-        v = 0.9 * np.cos(1.5 * (time + i * STEP))
-        cost += STEP * (WEIGHTS["angle"] * (x[0] - q) ** 2 + WEIGHTS["angle'"] * (x[1] - v) ** 2 + EFFORT * u[i] ** 2)
-        cost += STEP * rate * (u[i] - last) ** 2 * STEP / taken
+        h = STEP * lengths[i]
+        cost += h * (WEIGHTS["angle"] * (x[0] - 0.6 * np.sin(1.5 * t)) ** 2 + EFFORT * u[i] ** 2)
+        cost += h * WEIGHTS["angle'"] * (x[1] - 0.9 * np.cos(1.5 * t)) ** 2
+        cost += rate * STEP**2 * ((u[i] - last) / taken) ** 2 * taken
         if np.isfinite(fastest):
             opti.subject_to(opti.bounded(-fastest * taken, u[i] - last, fastest * taken))
         k1 = rate_of(x, u[i], p)
-        k2 = rate_of(x + STEP / 2 * k1, u[i], p)
-        k3 = rate_of(x + STEP / 2 * k2, u[i], p)
-        k4 = rate_of(x + STEP * k3, u[i], p)
-        x, last, taken = x + STEP / 6 * (k1 + 2 * k2 + 2 * k3 + k4), u[i], STEP
-    end = time + STAGES * STEP
-    cost += STEP * WEIGHTS["angle"] * (x[0] - 0.6 * np.sin(1.5 * end)) ** 2
-    cost += STEP * WEIGHTS["angle'"] * (x[1] - 0.9 * np.cos(1.5 * end)) ** 2
+        k2 = rate_of(x + h / 2 * k1, u[i], p)
+        k3 = rate_of(x + h / 2 * k2, u[i], p)
+        k4 = rate_of(x + h * k3, u[i], p)
+        x, last, taken, t = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), u[i], h, t + h
+    cost += h * WEIGHTS["angle"] * (x[0] - 0.6 * np.sin(1.5 * t)) ** 2
+    cost += h * WEIGHTS["angle'"] * (x[1] - 0.9 * np.cos(1.5 * t)) ** 2
     opti.minimize(cost)
     opti.subject_to(opti.bounded(-6.0, u, 6.0))
     opti.solver("ipopt", {"print_time": 0}, {"print_level": 0, "sb": "yes", "tol": 1e-11})
@@ -80,21 +81,23 @@ def own_plan(problem, time, state, before, *, rate=0.0, fastest=np.inf, between=
 
 
 @pytest.mark.parametrize("replan", ["stage", "cycle", 3])
+@pytest.mark.parametrize("lengths", [(), GROWING], ids=["equal", "growing"])
 @pytest.mark.parametrize(("rate", "fastest"), [(0.0, np.inf), (RATE, np.inf), (0.0, FASTEST)])
-def test_every_plan_is_that_of_an_independent_program_at_its_own_time(replan, rate, fastest):
+def test_every_plan_is_that_of_an_independent_program_at_its_own_time(replan, rate, fastest, lengths):
     limits = fp.Limits(
         inputs={"torque": (-6.0, 6.0)}, rates={"torque": (-FASTEST, FASTEST)} if np.isfinite(fastest) else {}
     )
     cost = fp.Quadratic(states=WEIGHTS, effort={"torque": EFFORT}, rate={"torque": rate} if rate else {})
     problem = task(replan, limits=limits, cost=cost)
+    assert problem.horizon is not None
+    problem = replace(problem, horizon=replace(problem.horizon, lengths=lengths))
     run = fp.simulate(problem, planning(), seed=0)
     every = cycles_per_plan(problem.horizon, PERIOD)
     assert every == {"stage": 4, "cycle": 1, 3: 3}[replan]
     command, states = run["command"][:, 0], run["state"]
     for k in range(every, run.cycles, 2 * every):
-        expected = own_plan(
-            problem, run.time[k], states[k], command[k - 1], rate=rate, fastest=fastest, between=every * PERIOD
-        )
+        settings = {"rate": rate, "fastest": fastest, "between": every * PERIOD, "lengths": lengths or (1.0,) * STAGES}
+        expected = own_plan(problem, run.time[k], states[k], command[k - 1], **settings)
         assert command[k] == pytest.approx(expected, abs=2e-4)
     changes = np.flatnonzero(np.abs(np.diff(command)) > 1e-9) + 1
     assert (changes % every == 0).all()
@@ -130,19 +133,49 @@ OPTIMISERS = {
 }
 
 
+@pytest.mark.parametrize("replan", ["cycle", "stage"])
 @pytest.mark.parametrize("name", OPTIMISERS)
-def test_a_warm_start_is_what_the_plan_foresees_on_the_next_stages(name):
-    """A plan whose inputs lie on a line is, a quarter of a stage later, the same line; only its repeated end is not."""
-    problem, optimiser = task(), OPTIMISERS[name]
+def test_a_warm_start_is_what_the_plan_foresees_on_the_next_stages(name, replan):
+    """The mean of the plan over every stage of the next horizon, by quadrature on a fine grid; the last stage goes on."""
+    horizon = fp.Horizon(STAGES, STEP, replan=replan, lengths=GROWING)
+    problem, optimiser = task(horizon=horizon), OPTIMISERS[name]
     ocp = _optimal_control(planning(optimiser).planner.planned(problem), optimiser)
-    layout = optimiser.memory(ocp)
+    layout, inputs = optimiser.memory(ocp), np.random.default_rng(0).standard_normal(STAGES)
     memory = layout.start()
-    memory[layout.slice("plan_inputs")] = 1.0 + 0.5 * np.arange(STAGES)
+    memory[layout.slice("plan_inputs")] = inputs
     column = ca.MX.sym("memory", layout.size)
     moved = ca.Function("moved", [column], [optimiser.shifted(ocp, column)])(memory).full().ravel()
-    plan = moved[layout.slice("plan_inputs")]
-    np.testing.assert_allclose(plan[:-1], 1.0 + 0.5 * (np.arange(STAGES - 1) + PERIOD / STEP), atol=1e-12)
-    assert plan[-1] == 1.0 + 0.5 * (STAGES - 1)
+    nodes, later = horizon.nodes, {"cycle": PERIOD, "stage": STEP}[replan]
+    fine = (np.arange(2000) + 0.5) / 2000
+    times = nodes[:-1, None] + later + fine * np.diff(nodes)[:, None]
+    place = np.minimum(np.searchsorted(nodes, times, side="right") - 1, STAGES - 1)
+    np.testing.assert_allclose(moved[layout.slice("plan_inputs")], inputs[place].mean(axis=1), atol=2e-3)
+
+
+def test_stages_of_one_length_are_equal_stages():
+    """The same plans, whether the lengths are left out or are all one."""
+    one, other = (
+        fp.simulate(task(horizon=fp.Horizon(STAGES, STEP, lengths=lengths, replan="cycle")), planning(), seed=0)
+        for lengths in ((), (1.0,) * STAGES)
+    )
+    np.testing.assert_allclose(one["command"], other["command"], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "lengths", [(1.0, 2.0), (2.0,) * STAGES, (1.0, 0.5, 1.0, 1.0, 1.0, 1.0), (1.0,) * 5 + (np.inf,)]
+)
+def test_wrong_lengths_are_named(lengths):
+    with pytest.raises(FpirhcError, match="lengths must be 6 finite numbers of at least 1"):
+        fp.Horizon(STAGES, STEP, lengths=lengths)
+
+
+def test_stages_of_a_map_are_equal():
+    problem = fp.load_problem("fishery").problem
+    assert problem.horizon is not None
+    lengths = tuple(1.0 + k for k in range(problem.horizon.stages))
+    problem = replace(problem, horizon=replace(problem.horizon, lengths=lengths))
+    with pytest.raises(FpirhcError, match="the stages of a map are whole steps of it"):
+        planning().check(problem)
 
 
 @pytest.mark.parametrize("name", sorted(OPTIMISERS.keys() - {"full space"}))  # which needs thousands of iterations
@@ -168,6 +201,11 @@ TASKS = {
     "soft limits": lambda: task(limits=replace(LIMITED, soft={"angle": 100.0})),
     "the end": lambda: task(horizon=fp.Horizon(STAGES, STEP, terminal=("angle",), replan="cycle")),
     "blocks": lambda: task(horizon=fp.Horizon(STAGES, STEP, blocks=(1, 2, 3), replan="cycle")),
+    "lengths, Radau": lambda: task(horizon=fp.Horizon(STAGES, STEP, fp.RadauIIA(), replan="cycle", lengths=GROWING)),
+    "lengths, limits": lambda: task(limits=LIMITED, horizon=fp.Horizon(STAGES, STEP, replan=2, lengths=GROWING)),
+    "lengths, blocks, end": lambda: task(
+        horizon=fp.Horizon(STAGES, STEP, terminal=("angle",), blocks=(1, 2, 3), replan="cycle", lengths=GROWING)
+    ),
     "dead time": lambda: task(dead_time=fp.DeadTime(inputs={"torque": 2 * PERIOD})),
 }
 

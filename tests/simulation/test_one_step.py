@@ -38,14 +38,15 @@ def shipped(name: str, controller: str) -> Callable[[], Loop]:
     return make
 
 
-def in_every_cycle(name: str, controller: str) -> Callable[[], Loop]:
+def in_every_cycle(name: str, controller: str, growth: float = 1.0) -> Callable[[], Loop]:
     """A shipped problem whose stages last longer than a cycle, with a plan in every cycle."""
 
     def make() -> Loop:
         problem, chosen = shipped(name, controller)()
         assert problem.horizon is not None
         assert problem.horizon.step > 1.5 * problem.period
-        return replace(problem, horizon=replace(problem.horizon, replan="cycle")), chosen
+        lengths = tuple(growth**k for k in range(problem.horizon.stages)) if growth > 1 else ()
+        return replace(problem, horizon=replace(problem.horizon, replan="cycle", lengths=lengths)), chosen
 
     return make
 
@@ -116,6 +117,7 @@ LOOPS: dict[str, Callable[[], Loop]] = {
     "cascade": shipped("heat_exchanger", "Cascade"),
     "noise": shipped("noisy_motor", "RHC+FPI"),
     "plans between stages": in_every_cycle("noisy_motor", "RHC+FPI"),
+    "growing stages": in_every_cycle("two_mass", "RHC+FPI", growth=1.1),
     "predicted plans between stages": in_every_cycle("delayed_mass", "RHC+FPI"),
     "prediction": shipped("delayed_mass", "RHC+FPI"),
     "slots": shipped("cart_pole_slots", "slots+FPI"),
