@@ -65,6 +65,7 @@ class NullTest(FoundByName):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "text", numbers_written_out(self.text))
+        super().__post_init__()
 
     @property
     def passed(self) -> bool:

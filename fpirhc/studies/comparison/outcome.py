@@ -39,3 +39,4 @@ class Finding(FoundByName):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "text", numbers_written_out(self.text))
+        super().__post_init__()
