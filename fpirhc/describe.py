@@ -15,7 +15,7 @@ def describe(value: Any) -> Any:
     """Return `value` as data for JSON; a dataclass becomes {"is": its class, field: ...}, a function its name.
 
     A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing. One with
-    {"setting": "where given"} is left out while it is empty, so that a setting that came later makes no earlier baseline stale.
+    {"setting": "where given"} is left out while it is empty or its default, so that a setting that came later makes no earlier baseline stale.
     """
     if is_dataclass(value) and not isinstance(value, type):
         facts = {
@@ -70,7 +70,7 @@ def _named(value: Any) -> Iterator[object]:
 
 def _is_setting(one: Field[Any], content: object) -> bool:
     kind = one.metadata.get("setting", True)
-    return bool(content) if kind == "where given" else bool(kind)
+    return bool(content) and _differs(one, content) if kind == "where given" else bool(kind)
 
 
 def as_written(value: Any) -> str:

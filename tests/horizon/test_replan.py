@@ -13,6 +13,7 @@ from plants import pendulum
 import fpirhc as fp
 from fpirhc.controllers.contract import with_optimiser
 from fpirhc.controllers.receding_horizon import _optimal_control
+from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
 from fpirhc.task.problem import cycles_per_plan
 
@@ -252,3 +253,10 @@ def test_outputs_and_maps_are_planned_between_stages(name):
     assert [run.stop for run in runs] == [None, None, None]
     scale = np.abs(runs[1]["command"]).max()
     np.testing.assert_allclose(runs[0]["command"], runs[1]["command"], atol=1e-4 * scale)
+
+
+def test_the_usual_way_to_replan_is_no_setting_of_a_baseline() -> None:
+    """Baselines from before there was a choice stay usable; a plan in every cycle is another problem."""
+    usual, every = (describe(fp.Horizon(stages=3, step=0.1, **more)) for more in ({}, {"replan": "cycle"}))
+    assert "replan" not in usual
+    assert every == {**usual, "replan": "cycle"}
