@@ -15,7 +15,8 @@ def describe(value: Any) -> Any:
     """Return `value` as data for JSON; a dataclass becomes {"is": its class, field: ...}, a function its name.
 
     A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing. One with
-    {"setting": "where given"} is left out while it is empty or its default, so that a setting that came later makes no earlier baseline stale.
+    {"setting": "where given"} is left out while it is empty or its default: a setting that came later makes no earlier baseline
+    stale.
     """
     if is_dataclass(value) and not isinstance(value, type):
         facts = {
