@@ -2,16 +2,16 @@
 
     live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
 
-A path begins at the controller, or at the problem for cost, limits, reference and sensing. The path of an interval stands for its
-finite ends, 'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a sigmoid, are recomputed
-from the others.
+A path begins at the controller, or at the problem for cost, limits, dead times, reference, sensing and disturbances. The path of an
+interval stands for its finite ends, 'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a
+sigmoid, are recomputed from the others. A number that no block reads may be live where the loop is the same one for other numbers.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -28,8 +28,10 @@ from fpirhc.symbolic.live import PREFIX, copied, live_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in, opened, paths_to
 from fpirhc.task.problem import Problem
 
-_OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing")
+_OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances")
 _ALWAYS_DATA = "Parameters (exact and approximate) and the start are data of every loop; they need no live setting"
+_IN_TABLES = ("sensing", "disturbances")  # of what Python makes tables before a run
+_NUDGES, _SMALLEST = (0.07, 2.0), 1e-3  # shares by which a number is changed to see whether the loop depends on it
 Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
 
 
@@ -90,12 +92,36 @@ class LiveSettings:
         read = {s.name for b in composite.blocks for s in b.inputs.signals}
         for path in self.paths:
             if PREFIX + path not in read:
-                raise NotSupported(
-                    f"setting '{path}' cannot be live: the loop of {type(self.controller).__name__} does not use it, or uses only "
-                    "numbers that are computed from it while the loop is built"
-                )
+                self._require_apart(path, composite, compose)
         _refuse_lost(composite, self.paths)
         return composite
+
+    def _require_apart(
+        self, path: str, composite: Composite, compose: Callable[[Problem, Controller], Composite]
+    ) -> None:
+        """Raise for a number that no block reads, unless the loop is the same one for others: then checks or tables read it."""
+        elsewhere = self._in_problem(path) and path.partition(".")[0] not in _IN_TABLES
+        if elsewhere or not all(self._same_with(path, share, composite, compose) for share in _NUDGES):
+            raise NotSupported(
+                f"setting '{path}' cannot be live: the loop of {type(self.controller).__name__} does not use it, or uses only "
+                "numbers that are computed from it while the loop is built"
+            )
+
+    def _same_with(
+        self, path: str, share: float, composite: Composite, compose: Callable[[Problem, Controller], Composite]
+    ) -> bool:
+        value = self._content(path)
+        other, paths = value + share * max(abs(value), _SMALLEST), tuple(p for p in self.paths if p != path)
+        if self._in_problem(path):
+            apart = replace(self, paths=paths, problem=changed_at(self.problem, path, other, copied))
+        else:
+            apart = replace(self, paths=paths, controller=changed_at(self.controller, path, other, copied))
+        try:
+            again = compose(*apart.planted())
+            same = again.function.serialize() == composite.function.serialize()
+        except (ArithmeticError, AttributeError, FpirhcError, RuntimeError, TypeError, ValueError):
+            return False
+        return same and np.array_equal(again.memory.start(), composite.memory.start())
 
     def _refusal(self, error: Exception) -> Exception:
         """The error that names the settings, for an error of the build."""
@@ -139,6 +165,10 @@ class LiveSettings:
             else:
                 unresolved = changed_at(unresolved, path, value)
         controller = resolved(problem, unresolved)
+        if [s.elements for s in problem.sensing.drawn] != [s.elements for s in self.problem.sensing.drawn]:
+            raise InvalidValue(
+                "whether a sensor loses samples decides what the loop is made of: expected a dropout above 0, as in the build"
+            )
         for path in self.automatic:
             values[path] = float(cast(float, content_at(controller, path)))
         return problem, checked(problem, controller, numbers_only=True), values
@@ -213,10 +243,10 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
         if not ends:
             raise InvalidValue(f"setting '{path}' is {content!r}: there is no limit that could change")
         return ends
-    if isinstance(content, bool) or _is_whole(owner, path):
+    if isinstance(content, bool) or (isinstance(content, int | float) and _is_structure(owner, path)):
         raise NotSupported(
-            f"setting '{path}' is {content!r} and cannot be live: a whole number or a switch decides what the loop is made of; "
-            "build one loop for each"
+            f"setting '{path}' is {content!r} and cannot be live: a whole number or a switch, or what stands for one, decides what "
+            "the loop is made of; build one loop for each"
         )
     if not isinstance(content, int | float | np.number):
         ways = ", ".join(names_in(content)) or "none"
@@ -229,10 +259,13 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
     return [path]
 
 
-def _is_whole(owner: object, path: str) -> bool:
+def _is_structure(owner: object, path: str) -> bool:
     parent, _, name = path.rpartition(".")
     value = content_at(owner, parent) if parent else owner
-    return is_dataclass(value) and expects_whole_number(type(value), name)
+    if not is_dataclass(value):
+        return False
+    declared = {f.name: f.metadata.get("structure") for f in fields(value)}
+    return bool(declared.get(name)) or expects_whole_number(type(value), name)
 
 
 def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Controller:

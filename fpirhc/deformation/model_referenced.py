@@ -59,7 +59,7 @@ class ModelReferenced(Wrapper):
     """
 
     cycles: Cycles = 0.0
-    measurement: float = 0.0
+    measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle
     lag: float | tuple[float, ...] = 0.0
     uncertainty: int | None = None
     pole: float | None = None

@@ -24,7 +24,7 @@ import casadi as ca
 
 from fpirhc.by_name import find_by_name
 from fpirhc.errors import InvalidField, nearest
-from fpirhc.fields.expected import Anything, Expected, Number, accepts, expected_by
+from fpirhc.fields.expected import Anything, Choice, Expected, Number, accepts, expected_by
 from fpirhc.fields.given import call_of, described, shortened, signature_of
 from fpirhc.fields.user_code import users_place
 from fpirhc.members import FORMER_MEMBERS
@@ -88,7 +88,8 @@ def field_names(owner: type) -> tuple[str, ...]:
 def expects_whole_number(owner: type, name: str) -> bool:
     """Whether a field of a class is declared as a whole number, with or without a range."""
     one = _arguments_of(owner).expected.get(name)
-    return isinstance(one, Number) and one.whole
+    options = one.options if isinstance(one, Choice) else (one,)
+    return any(isinstance(option, Number) and option.whole for option in options)
 
 
 def unnamed_inner(value: object, contract: type) -> Iterator[str]:

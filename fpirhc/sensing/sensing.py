@@ -32,7 +32,7 @@ from fpirhc.sensing.sensor import Sensor
 from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.functions import ceil
+from fpirhc.symbolic.functions import ceil, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.dead_time import delay_block
@@ -242,7 +242,7 @@ class Sensing(Checked):
 
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]
-        lossy = [(n, "lost", s.dropout > 0) for n, s in self.sensors.items()]
+        lossy = [(n, "lost", not stays(s.dropout, 0.0)) for n, s in self.sensors.items()]
         pairs = [p for both in zip(noisy, lossy, strict=True) for p in both]
         return tuple(f"{n} {what}" for n, what, there in pairs if there)
 
@@ -261,7 +261,7 @@ class Sensing(Checked):
                 if sensor.noise is not None:
                     seen[name] = seen[name] + s.sensing[columns.index(f"{name} noise")]
                 seen[name] = self.rounded(name, seen[name])
-                if sensor.dropout:
+                if name in lossy:
                     lost = s.sensing[columns.index(f"{name} lost")] > 0.5
                     seen[name] = ca.if_else(lost, s.sensor_last[lossy.index(name)], seen[name])
             results = {"measured": ca.vertcat(*(seen[n] for n in measured.elements))}

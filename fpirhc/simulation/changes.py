@@ -30,6 +30,7 @@ class InForce:
         numbers: of all live settings at the start, by path.
         patches: (first cycle, places in the memory, values) of every change, in the order of time.
         record: what was in force when, as plain data: [time in s, {path: number}], ...
+        later: (first cycle, problem) of every change, for the tables of the run.
     """
 
     problem: Problem
@@ -37,6 +38,7 @@ class InForce:
     numbers: Mapping[str, float]
     patches: Sequence[tuple[int, np.ndarray, np.ndarray]]
     record: Sequence[tuple[float, Mapping[str, float]]]
+    later: Sequence[tuple[int, Problem]] = ()
 
 
 def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes) -> InForce:
@@ -61,16 +63,17 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
         return InForce(problem, live.controller, numbers, (), [(0.0, numbers)])
     ready, controller, numbers = first.changed(settings)
     record: list[tuple[float, Mapping[str, float]]] = [(0.0, numbers)] if numbers else []
-    patches, settings_now = [], dict(first.flat(settings))
+    patches, later, settings_now = [], [], dict(first.flat(settings))
     for time in sorted(changes):
         if not 0 <= time < problem.duration:
             raise InvalidValue(f"a change of settings at {time!r} s: expected a time in [0, {problem.duration:g}) s")
         settings_now |= first.flat(changes[time])
-        _, _, values = first.changed(settings_now)
+        changed, _, values = first.changed(settings_now)
         cycle = int(np.ceil(time / problem.period - 1e-9))
+        later.append((cycle, changed))
         patches.append((cycle, *patch(loop, values)))
         record.append((cycle * problem.period, values))
-    return InForce(ready, controller, numbers, patches, record)
+    return InForce(ready, controller, numbers, patches, record, later)
 
 
 def _check_times(changes: Changes) -> None:

@@ -86,7 +86,8 @@ def start_memory(
     starts = {s.name: s.start_vector() for s in remembered}
     if numbers:
         derived = loop.derived(numbers)
-        starts |= {PREFIX + path: np.array([value]) for path, value in numbers.items()}
+        live = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
+        starts |= {name: value for name, value in live.items() if name in loop.memory}
         starts |= {**derived.signals, **derived.memory()}
     return loop.memory.pack(starts | _first_estimates(loop, problem, starts))
 

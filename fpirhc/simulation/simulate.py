@@ -18,9 +18,9 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.simulation.changes import Changes, in_force
+from fpirhc.simulation.changes import Changes, InForce, in_force
 from fpirhc.simulation.common_columns import with_common_columns
-from fpirhc.simulation.foreign_run import Patch, run_foreign, stopped
+from fpirhc.simulation.foreign_run import run_foreign, stopped
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import Dropped, ranges_of
 from fpirhc.simulation.run import Run
@@ -104,7 +104,7 @@ class Simulator:
         start = start_memory(self.loop, problem, controller, force.numbers)
         common = (problem, start, self.loop, self.evaluator, seed, disturbed, progress)
         run_cycles = _run_chunks if problem.foreign is None else _run_foreign
-        logged, stop = run_cycles(*common, force.patches, setpoints)
+        logged, stop = run_cycles(*common, force, setpoints)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
@@ -241,7 +241,13 @@ def judged_run(
 
 
 def run_tables(
-    problem: Problem, seed: int, cycles: int, *, disturbed: bool = True, setpoints: Setpoints | None = None
+    problem: Problem,
+    seed: int,
+    cycles: int,
+    *,
+    disturbed: bool = True,
+    setpoints: Setpoints | None = None,
+    later: Sequence[tuple[int, Problem]] = (),
 ) -> list[np.ndarray]:
     """Return what the loop reads in every cycle: disturbances, the sensors' random series, set-points, where there are any.
 
@@ -251,10 +257,21 @@ def run_tables(
         cycles: number of rows.
         disturbed: whether disturbances act; the sensors' noise always does.
         setpoints: by coordinate, in place of those of the reference.
+        later: (first cycle, problem) with other numbers of disturbances and sensors from a cycle on.
     """
-    times = np.arange(cycles) * problem.period
-    random = float(disturbed) * disturbance_values(problem, times, seed), problem.sensing.table(times, seed)
-    return [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
+    times, sensing, disturbances = np.arange(cycles) * problem.period, problem.sensing, problem.disturbances
+    random = float(disturbed) * disturbance_values(problem, times, seed), sensing.table(times, seed)
+    tables = [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
+    moved = [
+        (cycle, other)
+        for cycle, other in later
+        if other.sensing is not sensing or other.disturbances is not disturbances
+    ]
+    for cycle, other in moved:
+        changed = run_tables(other, seed, cycles, disturbed=disturbed, setpoints=setpoints)
+        for table, rows in zip(tables, changed, strict=True):
+            table[cycle:] = rows[cycle:]
+    return tables
 
 
 def _run_chunks(
@@ -265,12 +282,12 @@ def _run_chunks(
     seed: int,
     disturbed: bool,
     progress: Progress | None,
-    patches: Sequence[tuple[int, np.ndarray, np.ndarray]] = (),
-    setpoints: Setpoints | None = None,
+    force: InForce,
+    setpoints: Setpoints | None,
 ) -> tuple[np.ndarray, str | None]:
-    cycles, trace, dropped = problem.cycles, loop.trace, Dropped(loop)
+    cycles, trace, dropped, patches = problem.cycles, loop.trace, Dropped(loop), force.patches
     padded = (-(-cycles // CHUNK) + (1 if patches else 0)) * CHUNK
-    tables = run_tables(problem, seed, padded, disturbed=disturbed, setpoints=setpoints)
+    tables = run_tables(problem, seed, padded, disturbed=disturbed, setpoints=setpoints, later=force.later)
     log, ranges = np.empty((padded, trace.size)), ranges_of(problem, trace)
     evaluator.arguments[0][:] = start
     for at, end in _pieces(cycles, [cycle for cycle, _, _ in patches]):
@@ -316,11 +333,11 @@ def _run_foreign(
     seed: int,
     disturbed: bool,
     progress: Progress | None,
-    patches: Sequence[Patch] = (),
-    setpoints: Setpoints | None = None,
+    force: InForce,
+    setpoints: Setpoints | None,
 ) -> tuple[np.ndarray, str | None]:
-    tables = run_tables(problem, seed, problem.cycles, disturbed=disturbed, setpoints=setpoints)
-    return run_foreign(problem, start, loop, evaluator, seed, tables, progress, patches)
+    tables = run_tables(problem, seed, problem.cycles, disturbed=disturbed, setpoints=setpoints, later=force.later)
+    return run_foreign(problem, start, loop, evaluator, seed, tables, progress, force.patches)
 
 
 def _failed(at: int, problem: Problem, why: str) -> str:

@@ -123,8 +123,11 @@ class Block:
         if not function.has_free():
             return function, self.reads
         open_symbols = ca.symvar(ca.veccat(*results)) if self.opaque else ca.symvar(ca.vertcat(*results))
-        declared = {v.name() for v in ca.symvar(ca.vertcat(*columns))} if columns else set()
-        settings = [v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in declared]
+        entries = {v.name() for v in ca.symvar(ca.vertcat(*columns))} if columns else set()
+        entries -= {signal.name for signal in arguments}  # those of vectors, which are declared
+        live = {v.name(): v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in entries}
+        columns = [live.pop(signal.name, v) for signal, v in zip(arguments, columns, strict=True)]
+        settings = list(live.values())
         inputs = self.reads + Layout(tuple(scalar(v.name()) for v in settings))
         at = len(self.reads.signals)
         columns[at:at], names = settings, [*self.reads.names, *_identifiers(settings), *self.memory.names]

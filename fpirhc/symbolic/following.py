@@ -8,14 +8,14 @@ The signal is named after its first setting, so that two controllers in one loop
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fpirhc.symbolic.block import Derived, Values
 from fpirhc.symbolic.layout import Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber
+from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, is_live
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +43,11 @@ class Following:
     def derived(self, values: Values) -> Derived:
         """Return the column for these numbers of the settings."""
         return Derived({self.signal.name: self.of(values)}, stale={self.signal.name: self.stale})
+
+
+def remembered(name: str, elements: Sequence[str], values: Sequence[float]) -> Layout:
+    """Return the signal in which a block remembers numbers, to notice a change; none where no run changes them."""
+    return Layout((Signal(name, tuple(elements), start=(1.0,) * len(values)),)) if is_live(values) else Layout()
 
 
 def following(

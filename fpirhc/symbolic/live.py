@@ -205,8 +205,8 @@ def is_live(*values: object) -> bool:
 
 
 def settled(value: T, numbers: Mapping[str, float]) -> T:
-    """Return a value with other numbers, by path, in place of all live numbers in it."""
-    return cast(T, _mapped(value, lambda number: numbers[number.paths[0]]))
+    """Return a value with other numbers, by path, in place of live numbers; the others have the number of the build."""
+    return cast(T, _mapped(value, lambda number: numbers.get(number.paths[0], number.value)))
 
 
 def copied(value: T, changes: Mapping[str, object]) -> T:

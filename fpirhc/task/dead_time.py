@@ -10,14 +10,14 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.live import live_numbers, nominal
 from fpirhc.symbolic.queue import MOST, Queue, room
 
 MEASUREMENT = "measurement"  # the name beside those of the inputs
@@ -48,7 +48,7 @@ class DeadTime(Checked):
         return tuple(n for n in dict.fromkeys((*late, *self.longest)) if n in self.longest or nominal(late[n]))
 
     def opened(self, paths: tuple[str, ...]) -> DeadTime:
-        """Return it with queues of twice the dead time where one becomes live and no longest one is stated."""
+        """Return it with queues of twice the dead time where one becomes live and no longest one is stated; none for zero."""
         late = {**self.inputs, MEASUREMENT: self.measurement}
         names = [path.removeprefix("inputs.") for path in paths]
         more = {n: room(late[n]) for n in names if late.get(n) and n not in self.longest}
@@ -68,7 +68,12 @@ class DeadTime(Checked):
 
         Raises:
             InvalidProblem: all mistakes together.
+            NotSupported: a live dead time where a controller makes another problem of this one.
         """
+        for path in live_numbers(self):
+            raise NotSupported(
+                f"setting '{path}' cannot be live here: what follows from it decides what the loop is made of"
+            )
         mistakes, unit = Mistakes("dead_time"), plant.time_unit
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("before: input", self.before, plant.inputs)

@@ -17,10 +17,11 @@ from fpirhc.plant.motion import followed_units, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.following import remembered
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.gap import GAP, is_long
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.symbolic.live import nominal
 from fpirhc.tracking.base import Tracking
 
 ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor
@@ -144,9 +145,7 @@ def integral_delay(plant: Plant) -> tuple[Delay, ...]:
 
 def gains_before(plant: Plant, gains: Sequence[float]) -> Layout:
     """What a law remembers of its integral gains, one per controlled coordinate: the last ones where some are live."""
-    if not is_live(gains):
-        return Layout()
-    return Layout((vector("integral_gain", plant.controlled_names, "1", [1.0] * len(gains)),))
+    return remembered("integral_gain", plant.controlled_names, gains)
 
 
 def bumpless(s: Signals, gains: Sequence[float]) -> tuple[Expression, dict[str, Expression]]:

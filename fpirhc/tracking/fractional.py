@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -35,9 +35,11 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.following import following
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.live import live_numbers, nominal, settled
 from fpirhc.tracking.error import ROOM, IntegralLaw, Useful, check_modes, error_chains, law_signals, own_errors
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
@@ -64,7 +66,7 @@ class Fractional(IntegralLaw):
 
     rate: float
     order: float
-    memory: float | None = None
+    memory: float | None = field(default=None, metadata={"structure": True})
     largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
@@ -79,6 +81,10 @@ class Fractional(IntegralLaw):
             raise InvalidValue(
                 f"Fractional(memory={self.memory!r}): expected at least 1 / rate = {1 / self.rate:.4g}; 20 / rate is usual"
             )
+
+    def opened(self, paths: tuple[str, ...]) -> Fractional:
+        """Return it with its memory stated, where a rate that becomes live would change its length."""
+        return replace(self, memory=_REACH / self.rate) if "rate" in paths and self.memory is None else self
 
     def cycles(self, period: float) -> int:
         """Length L of the memory in control cycles.
@@ -117,13 +123,16 @@ class Fractional(IntegralLaw):
 
     def _law(self, plant: Plant, period: float, *, lost: bool) -> Block:
         check_modes(self, plant, [self.rate])
-        cycles, size = self.cycles(period), len(plant.controlled_names)
+        cycles, size = nominal(self).cycles(period), len(plant.controlled_names)
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
         memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))
         reads, writes = law_signals(plant)
-        weights, stiffness = ca.DM(self.weights(cycles)), (self.rate * period) ** self.order
+        row = following("past_weights", live_numbers(self), lambda values: settled(self, values)._row(cycles, period))
+        own = ca.DM(nominal(self)._row(cycles, period))
 
         def step(s: Signals) -> dict[str, Expression]:
+            column = own if row is None else getattr(s, row.signal.name)
+            weights, stiffness = column[:cycles], column[cycles]
             error = s._target - getattr(s, plant.output.name)
             errors = error_chains(plant, error)
             running = s.warm_up > 0.5
@@ -149,16 +158,25 @@ class Fractional(IntegralLaw):
                 "decay_first_next": first,
             }
 
+        derived = None
+        if row is not None:
+            reads, derived = reads + row.reads, row.derived
         if not lost:
             lossy = lambda: self._law(plant, period, lost=True)  # noqa: E731
-            return Block("tracking", reads, writes, step, memory, opaque=True, bridged=lossy)
+            return Block("tracking", reads, writes, step, memory, opaque=True, derived=derived, bridged=lossy)
 
         def wait(s: Signals) -> dict[str, Expression]:
             again = (_pushed(queue, queue[0]) for queue in ca.vertsplit(s.decay_past, cycles))
             return {"decay_past_next": ca.vertcat(*again), "decay_first_next": s.decay_first}
 
         waits = Block("tracking_waits", Layout(), Layout(), wait, memory, opaque=True)
-        return Block("tracking", reads + Layout((GAP,)), writes, step, memory, opaque=True, waits=waits)
+        return Block(
+            "tracking", reads + Layout((GAP,)), writes, step, memory, opaque=True, derived=derived, waits=waits
+        )
+
+    def _row(self, cycles: int, period: float) -> np.ndarray:
+        """The weights of the past, and (Lambda T)^beta."""
+        return np.append(self.weights(cycles), (self.rate * period) ** self.order)
 
     def _useful(self, plant: Plant) -> list[Useful]:
         """What the integrals may ask for by way of rate S."""

@@ -109,7 +109,6 @@ WRONG = [
     (["start.q1"], InvalidName, "data of every loop"),
     (["cost.states.q3"], InvalidName, "q1"),
     (["optimiser.iterations"], NotSupported, "what the loop is made of"),
-    (["optimiser.map.gain"], NotSupported, "optimiser.map.gain"),
     (["deformation"], InvalidValue, "go on with one of"),
 ]
 

@@ -1,10 +1,11 @@
-"""Every number of every member either is refused by name as a live setting, or runs bit by bit as the loop built with it."""
+"""Every number of every member may be live, and runs bit by bit as the loop built with it; structure alone is refused."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import pytest
 from on_problem import on_problem
 
@@ -12,13 +13,14 @@ import fpirhc as fp
 from fpirhc.conformance.live import check_live, number_paths
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError
+from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.members import Example, examples
 from fpirhc.simulation.simulate import simulator
 from fpirhc.task.problem import Problem
 
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=50.0)
 TRACKING = fp.Exponential(rate=8.0)
+STRUCTURE = "decides what the loop is made of", "does not use it", "which is the length of a queue"
 WEIGHTS: dict[str, Any] = {"states": {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}, "deviation": {"Fa": 1e-3, "Fb": 1e-3}}
 
 
@@ -41,8 +43,9 @@ def named(values: Any) -> list[str]:
 
 
 def check(controller: Controller, problem: Problem, least: int = 1) -> None:
-    """Check some paths, and that at least so many of them can be live."""
+    """Check some paths, that what is refused decides what the loop is made of, and that at least so many can be live."""
     tried = check_live(problem, controller, paths=some_paths(problem, controller), cycles=30)
+    assert [t for t in tried if t.refused and not any(words in t.refused for words in STRUCTURE)] == []
     assert sum(t.factor is not None for t in tried) >= least, tried
 
 
@@ -140,6 +143,56 @@ def test_the_switch_of_slots_may_be_live():
     problem = replace(task.problem, measure_from=0.0)
     tried = check_live(problem, task.controllers["slots"], paths=["blend", "smallest_gain"], cycles=60)
     assert all(t.factor for t in tried), tried
+
+
+def test_schedules_of_slots_are_live():
+    """Durations, dwells, weights: the cycles in which slots begin follow them."""
+    task = fp.load_problem("mass_spring_slots")
+    problem, slotted = replace(task.problem, measure_from=0.0), cast(Any, task.controllers["slots"])
+    first, second = (slot.coordinate for slot in slotted.slots)
+    state = problem.plant.state.elements
+    schedules = {
+        fp.Periodic({second: 0.04, first: 0.06}): [f"durations.{second}", f"durations.{first}"],
+        fp.ByError({first: 1.0, second: 2.0}, dwell=0.05): ["dwell", "hysteresis", f"weights.{first}"],
+        fp.ByLookAhead(dict.fromkeys(state, 1.0), dwell=0.05): ["dwell", "hysteresis", f"weights.{state[0]}"],
+    }
+    for schedule, names in schedules.items():
+        controller = replace(slotted, schedule=schedule)
+        tried = check_live(problem, controller, paths=[f"schedule.{name}" for name in names], cycles=200)
+        assert all(t.factor for t in tried), tried
+
+
+def noisy() -> Problem:
+    """Two masses with a noisy, coarse sensor that loses samples, and a noisy force."""
+    problem = two_masses()
+    sensor = fp.Sensor(noise=fp.Noise(1e-4), quantum=1e-3, dropout=0.2)
+    sensing = fp.Sensing({problem.plant.output.elements[0]: sensor}, estimator=fp.PositionDifference())
+    return replace(problem, sensing=sensing, disturbances={"Fa": fp.Noise(0.5)})
+
+
+NOISES = [f"sensing.sensors.a.{name}" for name in ("noise.deviation", "dropout")] + ["disturbances.Fa.deviation"]
+
+
+@pytest.mark.parametrize("compiled", [False, True], ids=["VM", "C"])
+def test_noises_and_sensors_are_live(compiled):
+    """Also numbers of the series that are drawn before a run."""
+    tried = check_live(noisy(), fp.ComputedTorque(TRACKING, SIGMOID), paths=NOISES, cycles=60, compiled=compiled)
+    assert all(t.factor for t in tried), tried
+
+
+def test_a_noise_changes_during_a_run():
+    """The drawn numbers are those of the seed, times the deviation in force; a sensor that loses none is another loop."""
+    ready = simulator(noisy(), fp.ComputedTorque(TRACKING, SIGMOID), live=NOISES, compiled=False)
+    at = 20 * ready.problem.period
+    plain, run = ready.run(seed=3), ready.run(seed=3, changes={at: {NOISES[2]: 5.0}})
+    acting = [one["arriving" if "arriving" in one.layout.names else "command"] for one in (plain, run)]
+    assert np.array_equal(plain["state"][:20], run["state"][:20])
+    assert np.array_equal(acting[0][:20], acting[1][:20])
+    assert not np.array_equal(plain["plant_state"][21], run["plant_state"][21])
+    loud = ready.run(seed=3, settings={NOISES[2]: 5.0})
+    assert not np.array_equal(loud["plant_state"][1], run["plant_state"][1])
+    with pytest.raises(InvalidValue, match="loses samples"):
+        ready.run(seed=3, settings={NOISES[1]: 0.0})
 
 
 def test_the_law_catches_a_lost_number():

@@ -9,7 +9,7 @@ Both choose only among admissible slots, those whose gain d y^(r)/du is large en
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeGuard
 
 import casadi as ca
@@ -19,13 +19,16 @@ import scipy.linalg
 from fpirhc.controllers.base import error_signal, like
 from fpirhc.controllers.slots.schedules import Schedule, check_stretch
 from fpirhc.controllers.slots.slot import Channel
-from fpirhc.controllers.slots.slot_modes import linear_modes
+from fpirhc.controllers.slots.slot_modes import Mode, linear_modes
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.horizon.nominal import reference_state
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.following import following
+from fpirhc.symbolic.functions import rounded
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
 _NEVER = -1e300  # score of a slot that may not be chosen
@@ -117,15 +120,29 @@ class ByLookAhead(Schedule):
         if reason:
             raise NotSupported(f"ByLookAhead: {reason}; use ByError")
         n = problem.plant.state.size
-        weight = np.diag([self.weights.get(e, 0.0) for e in problem.plant.state.elements])
-        transitions = [(scipy.linalg.expm(m.generator * self.dwell) @ m.start(m))[:n, :n] for m in modes]
-        forms = [phi.T @ weight @ phi for phi in transitions]
+        column = lambda values: np.ravel(settled(self, values)._forms(problem, modes))  # noqa: E731
+        row = following("look_ahead", live_numbers(self), column)
+        own = nominal(self)._forms(problem, modes)
 
         def score(s: Signals) -> list[Expression]:
             away = s.state - reference_state(problem.plant, s.reference)
-            return [-ca.bilin(ca.DM(form), away, away) for form in forms]
+            forms = own if row is None else _matrices(getattr(s, row.signal.name), n)
+            return [-ca.bilin(ca.SX(form), away, away) for form in forms]
 
-        return _chosen(problem, channels, score, self.dwell, self.hysteresis)
+        block = _chosen(problem, channels, score, self.dwell, self.hysteresis)
+        return block if row is None else replace(block, reads=block.reads + row.reads, derived=row.derived)
+
+    def _forms(self, problem: Problem, modes: Sequence[Mode]) -> list[np.ndarray]:
+        """The matrix of V one dwell later, as a form of the distance now, for every slot."""
+        n = problem.plant.state.size
+        weight = np.diag([self.weights.get(e, 0.0) for e in problem.plant.state.elements])
+        transitions = [(scipy.linalg.expm(m.generator * self.dwell) @ m.start(m))[:n, :n] for m in modes]
+        return [phi.T @ weight @ phi for phi in transitions]
+
+
+def _matrices(column: Expression, n: int) -> list[Expression]:
+    """The matrices in a column, which holds their rows one after the other."""
+    return [ca.reshape(one, n, n).T for one in ca.vertsplit(column, n * n)]
 
 
 def _check_choice(owner: str, dwell: float, hysteresis: float, problem: Problem, mistakes: Mistakes) -> None:
@@ -151,7 +168,7 @@ def _chosen(problem: Problem, channels: Sequence[Channel], score: Scores, dwell:
         scalar("warm_up"),
         Signal("_admissible", names),
     )
-    shortest = round(dwell / problem.period)
+    shortest = rounded(dwell / problem.period)
 
     def step(s: Signals) -> dict[str, Expression]:
         scores = [ca.if_else(s._admissible[k] > 0.5, v, _NEVER) for k, v in enumerate(score(s))]

@@ -8,7 +8,6 @@ Times are rounded to whole control cycles. Schedules that choose by the state ar
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,9 @@ from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.motion import time_signal
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import rounded
 from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.live import expressed, nominal
 from fpirhc.task.problem import Problem
 
 SlotSpans = tuple[tuple[str, float], ...]
@@ -101,10 +102,10 @@ class FixedSchedule(Schedule):
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
         """Return Block time -> slot."""
         starts = [(name, start / problem.period) for name, start, _ in self._ordered()]
-        return _timed(problem, channels, starts, math.inf)
+        return _timed(problem, channels, starts)
 
     def _ordered(self) -> list[tuple[str, float, float]]:
-        return sorted(self.spans, key=lambda span: span[1])
+        return sorted(self.spans, key=lambda span: nominal(span[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +136,10 @@ class Periodic(Schedule):
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
         """Return Block time -> slot."""
-        starts, at = [], 0
+        starts, at = [], 0.0
         for name, duration in self.durations.items():
-            starts.append((name, float(at)))
-            at += round(duration / problem.period)
+            starts.append((name, at))
+            at += rounded(duration / problem.period)
         return _timed(problem, channels, starts, at)
 
 
@@ -164,14 +165,16 @@ def check_stretch(what: str, value: float, problem: Problem, mistakes: Mistakes)
         mistakes.add(f"{what} is {value:g} {unit}, shorter than one control cycle of {problem.period:g} {unit}")
 
 
-def _timed(problem: Problem, channels: Sequence[Channel], starts: Sequence[tuple[str, float]], cycles: float) -> Block:
-    """Block time -> slot from the cycles in which slots start, repeated after `cycles`."""
+def _timed(
+    problem: Problem, channels: Sequence[Channel], starts: Sequence[tuple[str, float]], cycles: float | None = None
+) -> Block:
+    """Block time -> slot from the cycles in which slots start, repeated after `cycles` where that is a number."""
     numbers = {c.slot.coordinate: c.number for c in channels}
     order = [numbers[name] for name, _ in starts]
 
     def step(s: Signals) -> dict[str, Expression]:
         cycle = ca.floor(s.time / problem.period + 0.5)
-        phase = ca.fmod(cycle, cycles) if math.isfinite(cycles) else cycle
+        phase = cycle if cycles is None else ca.fmod(cycle, expressed(cycles, cycle))
         slot = ca.SX(order[0])
         for before, number, (_, start) in zip(order, order[1:], starts[1:], strict=False):
             slot += (number - before) * (phase > start - 0.5)

@@ -168,7 +168,15 @@ def for_channel(
 
     writes = Layout(tuple(renamed(w) for w in block.writes.signals))
     layout = Layout((*reads, *reads_begun))
-    return Block(f"{block.name}_{one.number}", layout, writes, step, Layout(tuple(own)), opaque=block.opaque)
+    return Block(
+        f"{block.name}_{one.number}",
+        layout,
+        writes,
+        step,
+        Layout(tuple(own)),
+        opaque=block.opaque,
+        derived=block.derived,
+    )
 
 
 def delays_for_channel(delays: tuple[Delay, ...], one: Channel) -> list[Delay]:
