@@ -64,7 +64,7 @@ def test_first_gain_is_the_one_that_review_recommends(page, tmp_path):
     assert [a.question for a in answers if a.verdict == "no"] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", [*PAGES, *sorted(DOCS.parent.glob("*.md"))], ids=lambda p: p.stem)
 def test_links_lead_somewhere(page):
     """Relative links point to files; those into the gallery to the scripts that it is made of."""
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):

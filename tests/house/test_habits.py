@@ -1,4 +1,4 @@
-"""What contributors rely on: the same gates everywhere, links that lead somewhere, a quick lane of tests that exist."""
+"""What contributors rely on: the same gates everywhere, a quick lane of tests that exist."""
 
 from __future__ import annotations
 
@@ -31,9 +31,7 @@ def test_workflow_runs_what_contributors_run():
     assert "./.ci/gates" in text(".ci/run")
 
 
-def test_links_of_contributing_lead_somewhere():
-    for target in re.findall(r"\]\(([^)#]+)\)", text("CONTRIBUTING.md")):
-        assert (ROOT / target).exists(), target
+def test_folders_of_contributing_are_there():
     for folder in re.findall(r"`((?:fpirhc|problems|tests|docs)/[\w/.]+)`", text("CONTRIBUTING.md")):
         assert "NAME" in folder or (ROOT / folder).exists(), folder
 
