@@ -17,7 +17,6 @@ import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
 
 FOLDER = Path(__file__).parent
-NAMES = tuple(sorted(path.stem for path in FOLDER.glob("*.py") if not path.stem.startswith("_")))
 
 
 def load(name: str, variant: str = "problem") -> Task:
