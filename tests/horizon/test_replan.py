@@ -261,3 +261,15 @@ def test_the_usual_way_to_replan_is_no_setting_of_a_baseline() -> None:
     every = describe(fp.Horizon(stages=3, step=0.1, replan="cycle"))
     assert "replan" not in usual
     assert every == {**usual, "replan": "cycle"}
+
+
+def test_a_run_has_its_cost_per_cycle_whatever_the_stages_are():
+    """The signal is the stage cost over one cycle at the states that were reached, whose rate no length of a stage changes."""
+    horizons = fp.Horizon(STAGES, STEP, replan="cycle", lengths=GROWING), fp.Horizon(STAGES, STEP)
+    for horizon in horizons:
+        run = fp.simulate(task(horizon=horizon), planning(), seed=0)
+        angle, rate = run["state"].T
+        q, v = 0.6 * np.sin(1.5 * run.time), 0.9 * np.cos(1.5 * run.time)
+        expected = WEIGHTS["angle"] * (angle - q) ** 2 + WEIGHTS["angle'"] * (rate - v) ** 2
+        expected += EFFORT * run["command"][:, 0] ** 2
+        np.testing.assert_allclose(run["cost"].sum(axis=1) / PERIOD, expected, rtol=1e-9)
