@@ -1,27 +1,40 @@
-"""The pages of comparisons and of scenarios: verdict first, then the tables, charts, pictures, settings."""
+"""HTML reports: one self-contained file with its styles, scripts and pictures inside, from a template and a view.
+
+The verdict is first, then come the tables, charts, pictures, and settings.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
-from collections.abc import Iterator, Mapping
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fpirhc.errors import InvalidName
 from fpirhc.report.figures import contraction_figure, lyapunov_figure, mismatch_figure, pair_figures
-from fpirhc.report.page import Image, asset, picture, render_page
 from fpirhc.report.series import chart_data
 from fpirhc.simulation.drawing import BANDS, PALETTE
-from fpirhc.simulation.picture import Drawing
+from fpirhc.simulation.picture import Drawing, png
+from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import Column, Table
 from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
+    from matplotlib.figure import Figure
+
     from fpirhc.simulation.pictures.base import Picture
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Entry
     from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
+    from fpirhc.studies.view import View
 
 _CAPTIONS = {
     "Trajectory tracking": "Nominal (dashed) and realised motion over time.",
@@ -36,13 +49,20 @@ _LYAPUNOV = (
     "measured part. A small response error keeps V near zero."
 )
 _CONTRACTION = "Predicted contraction factor against the gain, and the response error's decay"
-
-
 _MISMATCH = (
     "One point per scenario and controller; lines join medians of scenarios with similar mismatch, crosses at the upper edge "
     "are runs that ended early. Mismatch: rms over the parameters of the relative distance between the model and the drawn "
     "plant. Error: rms error divided by the reference's range, root mean square over the coordinates."
 )
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture inside a page; one that cannot be drawn has no source, and its caption says why."""
+
+    source: str
+    alt: str
+    caption: str
 
 
 def write_report(comparison: Comparison, path: Path) -> None:
@@ -155,3 +175,68 @@ def render_scenarios(comparison: ScenarioComparison) -> str:
     figure = mismatch_figure(comparison) if comparison.summaries else None
     chart = picture(figure, "Error against mismatch", _MISMATCH) if figure else None
     return render_page("scenarios.html", comparison.view, chart=chart)
+
+
+def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:
+    """Return a page's text.
+
+    The page loads nothing from anywhere, and a browser that reads its content security policy also refuses to: it runs the
+    page's own scripts alone, which are named by their hashes, and shows pictures that are inside the page.
+
+    Args:
+        name: of the template.
+        view: what the page says.
+        scripts: texts of the page's scripts, which run in this order after those of every page.
+        context: further values for the template.
+    """
+    from markupsafe import Markup
+
+    every = [Markup(script) for script in (asset("table.js"), *scripts)]
+    styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")]
+    template = _environment().get_template(name)
+    return template.render(view=view, policy=Markup(_policy(every)), styles=styles, scripts=every, **context)
+
+
+@cache
+def blocks(text: str) -> list[tuple[bool, str]]:
+    """Return the paragraphs of a description, each with whether it is set as written, as indented equations and tables are."""
+    found = (block for block in textwrap.dedent(text).strip().split("\n\n") if block.strip())
+    return [(True, textwrap.dedent(b)) if b.startswith("  ") else (False, " ".join(b.split())) for b in found]
+
+
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader(__package__)
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.filters |= {
+        "css_class": css_class,
+        "blocks": blocks,
+        "indented": lambda value: json.dumps(value, indent=1),
+    }
+    return environment
+
+
+def css_class(outcome: Outcome | None) -> str:
+    """Return the class of a sentence: green is better, red worse, amber mixed or doubtful."""
+    return "remark" if outcome is None else f"outcome-{outcome.value.replace(' ', '-')}"
+
+
+def _policy(scripts: Sequence[str]) -> str:
+    """Content security policy that allows these scripts, the styles inside the page, and pictures inside the page."""
+    hashes = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii") for script in scripts)
+    code = " ".join(f"'sha256-{one}'" for one in hashes)
+    return (
+        f"default-src 'none'; script-src {code}; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
+        "form-action 'none'"
+    )
+
+
+def picture(figure: Figure, alt: str, caption: str = "") -> Image:
+    """Return a figure as a picture inside the page."""
+    return Image(f"data:image/png;base64,{base64.b64encode(png(figure)).decode('ascii')}", alt, caption)
+
+
+def asset(name: str) -> str:
+    """Return the text of a style or script."""
+    return files("fpirhc.report").joinpath("assets", name).read_text(encoding="utf-8")

@@ -427,7 +427,7 @@ BUILDS = {
     "review/prediction.py": {"Identity"},  # no adaptation
     "review/suggest.py": {"Filtered"},  # the suggested deformation
     "simulation/held_input.py": {"Identity"},  # no controller: nothing is adapted
-    "studies/comparison/left_alone.py": {"HeldInput"},  # the plant with nobody at it
+    "studies/comparison/caveats.py": {"HeldInput"},  # the plant with nobody at it
     "simulation/linearise/asked_loop.py": {"Jump"},  # the entry of signals at the inputs
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
     "task/checks.py": {"MapSteps", "StepDifference"},  # what a map has in place of an integrator and of its response

@@ -18,8 +18,7 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.errors import OutputError
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.html import render, write_report
-from fpirhc.report.page import blocks
+from fpirhc.report.html import blocks, render, write_report
 from fpirhc.report.series import INTERVALS, chart_data
 from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare

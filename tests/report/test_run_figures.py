@@ -16,8 +16,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.figures import contraction_figure, pair_figures
-from fpirhc.report.html import headline_pair
-from fpirhc.report.page import asset
+from fpirhc.report.html import asset, headline_pair
 from fpirhc.studies.comparison.compare import compare
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.studies.comparison.caveats import error_left_alone
 from fpirhc.studies.comparison.changes import ranges
-from fpirhc.studies.comparison.left_alone import error_left_alone
 
 
 def tank(**changes: Any) -> fp.Problem:

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from fpirhc.report.page import asset, css_class
+from fpirhc.report.html import asset, css_class
 from fpirhc.report.terminal import STYLES
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.scenarios.paired import ConfidenceInterval, Summary, verdict

@@ -9,8 +9,7 @@ import abroad
 import pytest
 
 import fpirhc as fp
-from fpirhc.report.html import render
-from fpirhc.report.page import css_class
+from fpirhc.report.html import css_class, render
 from fpirhc.report.terminal import STYLES
 from fpirhc.review.margins import SLOWER
 from fpirhc.studies.comparison.compare import compare
