@@ -117,10 +117,12 @@ def twice(controller: Controller) -> Named:
 
 
 def test_a_users_map_is_reviewed_as_the_shipped_one_that_it_equals():
-    """R - 0.25 h, once as Affine and once as a user's own map: the same answers to every question."""
+    """R - 0.25 h, once as Affine and once as a user's own map: the same answers to every question, by its own name."""
     own, shipped = (answers(mass(limits=LIMITS), fp.ComputedTorque(TRACK, d)) for d in (Gentle(-0.5), fp.Affine(-0.5)))
     assert about(own, "Does the deformation converge").verdict == "yes"
-    assert own == shipped
+    assert {
+        q: replace(one, change=one.change.replace("Gentle(gain", "Affine(gain")) for q, one in own.items()
+    } == shipped
 
 
 def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
