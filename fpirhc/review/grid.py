@@ -142,19 +142,6 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     return ReviewGrid(problem, times, states, responses, rows, inner, mismatch, real, elsewhere)
 
 
-def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:
-    """Return the interval of every parameter of the plant over all draws: the range of the mismatch and the approximate value.
-
-    Raises:
-        InvalidValue, InvalidProblem: see `exact_ranges`.
-    """
-    ranges, parameters = exact_ranges(problem.plant, mismatch), problem.plant.parameters
-    return {
-        n: (min(parameters[n].approximate, low), max(parameters[n].approximate, high))
-        for n, (low, high) in ranges.items()
-    }
-
-
 def _draws(
     lower: np.ndarray, upper: np.ndarray, approximate: np.ndarray, random: np.random.Generator, most: int
 ) -> np.ndarray:

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import scipy.linalg
 
 from fpirhc.errors import FpirhcError
+from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
+from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import shifted_reference, stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.maps import growth_of
-from fpirhc.plant.motion import sampling
+from fpirhc.plant.motion import controlled_places, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.plan_feedback import PlanGain, longer
-from fpirhc.review.plan_of_outputs import gains_at
 from fpirhc.review.stages import stiff_advice
 from fpirhc.review.state_slopes import state_slopes
 from fpirhc.summary import in_percent
+from fpirhc.task.limits import Limits
+from fpirhc.task.problem import Problem
 
 QUESTION = "Is the horizon long enough?"
 _SAME = 0.1  # relative change of the plan's feedback
@@ -32,12 +40,10 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
         return None
     reach, unit = float(problem.horizon.nodes[-1]), problem.time_unit
     try:
-        [first] = gains_at(problem, problem.horizon, problem.cost, [0.0], plant.approximate, grid.states_at)
-        [second] = gains_at(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate, grid.states_at)
+        first, second = (plan_gain(problem, one, grid.states_at) for one in (problem.horizon, _longer(problem.horizon)))
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
-    size = float(np.linalg.norm(second.entries))
-    change = float(np.linalg.norm(first.entries - second.entries)) / max(size, 1e-300)
+    change = float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
     grows = _growth(grid, first)
     slowest = _slowest(grid)
     text = (
@@ -57,6 +63,90 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     return Answer(QUESTION, Verdict.YES, text, "", numbers)
 
 
+def plan_gain(
+    problem: Problem, horizon: Horizon, states_at: Callable[[np.ndarray], np.ndarray] | None = None
+) -> np.ndarray:
+    """Return [K, L], shape (nu, nx + nu), of a plan at the start of the reference, u = u* + K (x - x^N) + L (u_before - u*).
+
+    They are the first gains of the Riccati recursion over the horizon, with the model linearised along the reference and the
+    second derivatives of the cost. L is zero unless the cost weighs the change of the inputs from stage to stage. Bounds are left
+    out: near the reference they bind nowhere. An end that must be met, C x_N = 0, enters exactly, by its multiplier,
+
+        V_k(x) = x' P_k x / 2 + x' E_k mu + mu' G_k mu / 2,      E_N = C',  G_N = 0,      mu = -G_0^-1 E_0' x.
+
+    Args:
+        problem: with a cost.
+        horizon: of the plan.
+        states_at: times (m,) -> states (m, nx) at which the model is linearised; None: those of the reference. Of a plant with
+            outputs only the first counts: the model's own motion begins there.
+    """
+    plant, believed, n = problem.plant, problem.plant.approximate, horizon.stages
+    assert problem.cost is not None
+    ends = [] if plant.outputs else [plant.state.elements.index(name) for name in horizon.terminal]
+    horizon = replace(horizon, margins={}, terminal=horizon.terminal if plant.outputs else ())
+    start = problem.start_state if plant.outputs else None
+    ocp = transcribe(plant, problem.reference, horizon, problem.cost, Limits(), start=start)
+    data = np.asarray(stage_data(plant, problem.reference, horizon, problem.cost)(0.0, believed).full())
+    clock = horizon.nodes
+    followed, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(n)(clock[None, :-1]))
+    wanted = responses[controlled_places(plant)]
+    if plant.outputs and states_at is not None:
+        begin = states_at(clock[:1])[0]
+        data = np.asarray(shifted_reference(plant, ocp.data, n + 1)(data, begin, followed[:, 0], believed).full())
+        states, inputs = _motion(ocp, plant.equations.inverse, begin, wanted, data, believed)
+    else:
+        states = data[ocp.data.slice("reference")] if states_at is None else states_at(clock).T
+        repeated = np.repeat(believed[:, None], n, axis=1)
+        inputs = np.asarray(plant.equations.inverse.map(n)(states[:, :-1], wanted, repeated).full())
+        if ocp.state.size > plant.state.size:
+            states = np.vstack([states, np.hstack([inputs[:, :1], inputs])])
+    first = _first_gain(ocp, states, inputs, data, np.eye(ocp.state.size)[:, ends])
+    size = plant.state.size + plant.input.size
+    return np.hstack([first, np.zeros((len(first), size - first.shape[1]))])
+
+
+def _longer(horizon: Horizon) -> Horizon:
+    """The horizon with twice as many stages, and its blocks repeated."""
+    lengths = (*horizon.lengths, *horizon.lengths[-1:] * horizon.stages)
+    return replace(horizon, stages=2 * horizon.stages, blocks=2 * horizon.blocks, lengths=lengths)
+
+
+def _motion(
+    ocp: OptimalControl, inverse: ca.Function, state: np.ndarray, responses: np.ndarray, data: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (ns, N + 1) and inputs (nu, N) of the model with the responses of the reference."""
+    inputs = [np.asarray(inverse(state, responses[:, 0], p).full()).ravel()]
+    columns = [np.asarray(ocp.start(state, inputs[0]).full()).ravel()]
+    for k in range(ocp.stages):
+        if k:
+            inputs.append(np.asarray(inverse(columns[k][: len(state)], responses[:, k], p).full()).ravel())
+        columns.append(np.asarray(ocp.dynamics(columns[k], inputs[k], data[:, k]).full()).ravel())
+    return np.column_stack(columns), np.column_stack(inputs)
+
+
+def _first_gain(
+    ocp: OptimalControl, states: np.ndarray, inputs: np.ndarray, data: np.ndarray, met: np.ndarray
+) -> np.ndarray:
+    """First gain of the recursion, shape (nu, ns); `met` (ns, rows) selects the states that must be zero at the end."""
+    linear, curved, end = linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp)
+    value = np.asarray(end(states[:, -1], data[:, -1])[2].full())
+    tied, pulled = met, np.zeros((met.shape[1], met.shape[1]))  # E and G
+    gain, pull = np.zeros((len(inputs), len(states))), np.zeros((len(inputs), met.shape[1]))
+    for k in reversed(range(inputs.shape[1])):
+        at = (states[:, k], inputs[:, k], data[:, k])
+        a, b = (np.asarray(m.full()) for m in linear(*at)[2:4])
+        q, s, r = (np.asarray(m.full()) for m in curved(*at, np.zeros(len(states))))
+        coupled = s + b.T @ value @ a
+        curvature = r + b.T @ value @ b
+        gain, pull = -np.linalg.solve(curvature, coupled), -np.linalg.solve(curvature, b.T @ tied)
+        value = q + a.T @ value @ a + coupled.T @ gain
+        pulled = pulled + (b.T @ tied).T @ pull
+        tied = a.T @ tied + coupled.T @ pull
+    if not met.shape[1]:
+        return gain
+    return gain - pull @ np.linalg.lstsq(pulled, tied.T, rcond=None)[0]
+
+
 def _advice(plant: Plant, change: float) -> str:
     """What to change where the model diverges under the plan's feedback."""
     if change <= _SAME:
@@ -70,7 +160,7 @@ def _slowest(grid: ReviewGrid) -> float:
     return float(1 / rates.min()) if rates.min() > 1e-9 else float("inf")
 
 
-def _growth(grid: ReviewGrid, gain: PlanGain) -> float:
+def _growth(grid: ReviewGrid, feedback: np.ndarray) -> float:
     """Growth rate of the model's fastest mode, per unit of time, where every stage begins with a new plan.
 
     It is ln(rho) / step with the spectral radius rho of the state and the held input over one stage, and 0 where rho is 1.
@@ -81,7 +171,6 @@ def _growth(grid: ReviewGrid, gain: PlanGain) -> float:
     nx, nu = b.shape
     rates = np.block([[a, b], [np.zeros((nu, nx + nu))]])
     held = _transition(grid.problem.plant, rates, step)[:nx]
-    feedback = np.hstack([gain.state, gain.before])
     stage = np.vstack([held[:, :nx] @ np.eye(nx, nx + nu) + held[:, nx:] @ feedback, feedback])
     radius = float(np.abs(np.linalg.eigvals(stage)).max())
     return 0.0 if abs(radius - 1) < _STILL else math.log(radius) / step

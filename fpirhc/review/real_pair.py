@@ -3,6 +3,8 @@
 At a point of the reference the reality's own states z are where they settle, and the input is what the reference needs then,
 
     0 = z'(x^N, z, u),        r^N = y^(r)(x^N, z, u).
+
+States that do not settle move along, as a motor behind a spring turns with its load: see `_carrying`.
 """
 
 from __future__ import annotations
@@ -14,20 +16,25 @@ from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import null_space
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
-from fpirhc.review.carried import carrying
+from fpirhc.plant.chain import derivatives_function
+from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Points, thinned, usable
-from fpirhc.review.reduced import outer_slopes, reduced
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.task.problem import Problem
 from fpirhc.task.reality import Reality
 
+Carrying: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
 Settling: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
 _STEPS = 60  # of Newton's method
+_CARRYING_STEPS = 30  # of Newton's method
+_SMALL = 1e-10  # last step, relative
+_LEFT = 1e-6  # of an equation, relative to the size of its terms
 _POINTS = 5  # of the reference
 _SLOW = 0.05  # frequency of slow requests, as a share of the slowest of the poles that the model lacks
 _MOVES = 1e-9  # rate, as a share of the fastest, below which a pole is an integrator's
@@ -68,7 +75,7 @@ def real_points(grid: ReviewGrid) -> tuple[RealPoint, ...]:
     assert grid.real is not None
     reality, model = _reality(grid.real), grid.problem.plant
     known = reality.shared(model)
-    carried = carrying(reality, model) if len(known) < model.state.size else None
+    carried = _carrying(reality, model) if len(known) < model.state.size else None
     solve = _settling(grid.real, [k for k in range(reality.plant.state.size) if k not in known.values()])
     places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
     points, guess = [], (grid.real.real_start, grid.real.inputs_before)
@@ -112,7 +119,7 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     values = ca.Function("fpirhc_modes", [x, u, p], slopes)(point.real, point.command, plant.exact)
     a, b, c, d = (np.asarray(m.full()) for m in values)
     modes = _beyond(
-        np.linalg.eigvals(a), np.linalg.eigvals(reduced(a, outer_slopes(reality, model, point.real, point.command)))
+        np.linalg.eigvals(a), np.linalg.eigvals(_reduced(a, _outer_slopes(reality, model, point.real, point.command)))
     )
     slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
     gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
@@ -164,3 +171,84 @@ def _beyond(every: np.ndarray, settled: np.ndarray) -> np.ndarray:
 def _reality(problem: Problem) -> Reality:
     assert problem.symbolic_reality is not None
     return problem.symbolic_reality
+
+
+def _carrying(reality: Reality, model: Plant) -> Carrying | None:
+    """The function (first guess of state, of input, wanted y ... y^(r)) -> state and input where all moves along, or None.
+
+        y^(k) = y^N(k)  for k <= r,        y^(k) = 0  for r < k <= m,
+
+    with as many derivatives as the reality has states and inputs, and the input held.
+
+    Args:
+        reality: the plant that moves.
+        model: of the controllers; the wanted values are in the order of its state, then its controlled responses.
+
+    Returns:
+        None where the numbers of derivatives and of states do not match, or the model has coordinates that are not controlled.
+    """
+    plant, names = reality.plant, model.names
+    count, rest = divmod(plant.state.size, len(names))
+    if model.outputs or rest or len(model.controlled_names) != len(names) or len(plant.inputs) != len(names):
+        return None
+    if min(model.orders) != max(model.orders) or count < max(model.orders):
+        return None
+    x, u, p = plant.symbols()
+    wanted = ca.SX.sym("wanted", model.state.size + len(names))
+    places = [(reality.true_name(c), k) for k in range(count + 1) for c in names]
+    chain = derivatives_function(plant, places)(x, u, p, ca.SX.zeros(len(plant.names)))
+    left = chain - ca.vertcat(wanted, ca.SX.zeros(len(places) - wanted.numel()))
+    slope = ca.densify(ca.jacobian(left, ca.vertcat(x, u)))
+    newton = ca.Function("fpirhc_carried", [x, u, p, wanted], [left, slope])
+
+    def solve(state: np.ndarray, command: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        at = np.concatenate([state, command]).astype(float)
+        for _ in range(_CARRYING_STEPS):
+            error, by = (np.asarray(m.full()) for m in newton(at[: state.size], at[state.size :], plant.exact, values))
+            if not (np.isfinite(error).all() and np.isfinite(by).all()):
+                return None
+            sizes = np.abs(by).max(axis=1)  # rows differ by powers of the fastest rate
+            sizes[sizes == 0] = 1.0
+            step = np.linalg.lstsq(by / sizes[:, None], -error.ravel() / sizes, rcond=None)[0]
+            at += step
+            if np.abs(step).max() <= _SMALL * (1 + np.abs(at).max()):
+                solved = np.abs(error.ravel() / sizes).max() <= _LEFT * (1 + np.abs(at).max())
+                return (at[: state.size], at[state.size :]) if solved else None
+        return None
+
+    return solve
+
+
+def _outer_slopes(reality: Reality, model: Plant, state: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Return the slopes of the model's states by the reality's, shape (count, nx of the reality).
+
+    Where the reality lacks a state of the model, or the model has outputs, they are those of its coordinates of the same names.
+
+    Args:
+        reality: the plant that moves.
+        model: of the controllers.
+        state: of the reality, shape (nx,).
+        command: shape (nu,).
+    """
+    plant, known = reality.plant, sorted(reality.shared(model).values())
+    if model.outputs or len(known) == model.state.size or len(reality.shown(model)) < model.state.size:
+        return np.eye(plant.state.size)[known]
+    x, u, p = plant.symbols()
+    shown = reality.function(reality.shown(model))(x, u, p, ca.SX.zeros(len(plant.names)))
+    slopes = ca.Function("fpirhc_outer", [x, u, p], [ca.densify(ca.jacobian(shown, x))])
+    return np.asarray(slopes(state, command, plant.exact).full())
+
+
+def _reduced(a: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    """Return the matrix of the motion of `outer` x, shape (count, count), where all else settles.
+
+    Args:
+        a: of the motion, shape (nx, nx).
+        outer: independent rows, shape (count, nx).
+    """
+    if not len(outer):
+        return np.zeros((0, 0))
+    count, change = len(outer), np.vstack([outer, null_space(outer).T])
+    straight = change @ a @ np.linalg.inv(change)
+    settle = np.linalg.pinv(straight[count:, count:])
+    return np.asarray(straight[:count, :count] - straight[:count, count:] @ settle @ straight[count:, :count])

@@ -13,7 +13,6 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.plant.parameter import EXAMPLES, TAILS
-from fpirhc.review.grid import parameter_box
 from fpirhc.studies.scenarios.draws import COMPARING, draw
 
 
@@ -65,7 +64,7 @@ def test_the_option_scales_spreads_and_keeps_its_meaning_elsewhere():
 def test_a_review_covers_what_scenarios_draw():
     """Draws fill the box of the review and never leave it; the stream of one parameter does not depend on another's spread."""
     task = abroad.load("cstr", "wrong")
-    box = parameter_box(task.problem, 100.0)
+    box = exact_ranges(task.problem.plant, 100.0)
     assert box["alpha"] == pytest.approx((0.95, 1.05))
     assert box["beta"] == pytest.approx((0.9, 1.1))
     both = plant(a=parameter(2.0, fp.Normal(absolute=0.1)))

@@ -19,12 +19,12 @@ from fpirhc.controllers import contract
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.forms import forms_of
-from fpirhc.review.grid import parameter_box, review_grid
+from fpirhc.review.grid import review_grid
+from fpirhc.review.horizon import plan_gain
 from fpirhc.review.loops import loops_along
 from fpirhc.review.margins import margins
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.null_test import leaves_right_model_alone
-from fpirhc.review.plan_feedback import plan_gains
 from fpirhc.review.question import Case
 from fpirhc.review.review import predict
 
@@ -173,13 +173,12 @@ def test_feedback_of_a_plan_is_that_of_the_riccati_equation():
     import scipy.linalg
 
     assert problem.horizon is not None
-    assert problem.cost is not None
-    [result] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    result = plan_gain(problem, problem.horizon)
     m, k = problem.plant.approximate
     whole = scipy.linalg.expm(np.array([[0, 1, 0], [-k / m, 0, 1 / m], [0, 0, 0]]) * 1e-2)
     stationary, *_ = control.dlqr(whole[:2, :2], whole[:2, 2:], np.diag([1e3, 1.0]), np.array([[1e-2]]))
-    assert result.state == pytest.approx(-stationary, rel=1e-3)
-    assert not result.before.any()
+    assert result[:, :2] == pytest.approx(-stationary, rel=1e-3)
+    assert not result[:, 2:].any()
 
 
 def test_a_good_problem_is_ready():
@@ -256,11 +255,10 @@ def test_unstable_zero_dynamics_are_found():
 
 def test_box_spans_model_and_plant_and_a_margin():
     """From the approximate to the exact value, and P percent around the latter."""
-    box = parameter_box(mass(), 20.0)
-    assert box == {"m": pytest.approx((0.8, 1.5)), "k": pytest.approx((6.0, 12.0))}
     grid = review_grid(mass(), 20.0, 0)
     assert grid.draws[0] == pytest.approx([1.0, 10.0])
     assert grid.draws.min(axis=0) == pytest.approx([0.8, 6.0])
+    assert grid.draws.max(axis=0) == pytest.approx([1.5, 12.0])
     wide = answers(mass(), torque(gain=-2.2), mismatch=40.0)
     assert about(wide, "one sign").numbers["largest_over_box"] == pytest.approx(1.5 / 0.6)
     assert (

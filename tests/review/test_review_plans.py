@@ -13,8 +13,8 @@ import scipy.linalg
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.review.grid import review_grid
+from fpirhc.review.horizon import plan_gain
 from fpirhc.review.loops import loops_along
-from fpirhc.review.plan_feedback import plan_gains
 
 STEP = 0.05  # s
 
@@ -71,10 +71,9 @@ def test_rate_weights_make_the_input_before_part_of_the_feedback():
     """The gains of a long plan are those of the Riccati equation of state and input before."""
     problem = oscillator()
     assert problem.horizon is not None
-    assert problem.cost is not None
-    [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    first = plan_gain(problem, problem.horizon)
     gain, _, _ = rate_weighted_gain()
-    assert np.hstack([first.state, first.before]) == pytest.approx(gain, rel=1e-4)
+    assert first == pytest.approx(gain, rel=1e-4)
 
 
 def test_loop_of_a_rate_weighted_plan_has_the_poles_of_its_closed_form():
@@ -122,11 +121,10 @@ def test_an_end_that_must_be_met_is_in_the_feedback():
         cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, effort={"u": 1e-3}),
     )
     assert problem.horizon is not None
-    assert problem.cost is not None
-    [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    first = plan_gain(problem, problem.horizon)
     a, b = model_of_a_stage()
     deadbeat = -np.linalg.solve(np.hstack([a @ b, b]), a @ a)[:1]
-    assert first.state == pytest.approx(deadbeat, rel=1e-4)
+    assert first[:, :2] == pytest.approx(deadbeat, rel=1e-4)
 
 
 def test_an_end_that_must_be_met_with_weighted_rates():
@@ -134,8 +132,7 @@ def test_an_end_that_must_be_met_with_weighted_rates():
     stages, weight = 5, 0.5
     problem = oscillator(horizon=fp.Horizon(stages=stages, step=STEP, terminal=("q",)))
     assert problem.horizon is not None
-    assert problem.cost is not None
-    [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    first = plan_gain(problem, problem.horizon)
     a, b = model_of_a_stage()
     u = ca.SX.sym("u", stages)
     for place, start in enumerate(np.eye(3)):
@@ -148,7 +145,7 @@ def test_an_end_that_must_be_met_with_weighted_rates():
             "reference", "qrqp", {"x": u, "f": cost, "g": x[0]}, {"print_iter": False, "print_header": False}
         )
         solution = solver(lbg=0, ubg=0)["x"]
-        assert np.hstack([first.state, first.before])[0, place] == pytest.approx(float(solution[0]), rel=1e-3, abs=1e-6)
+        assert first[0, place] == pytest.approx(float(solution[0]), rel=1e-3, abs=1e-6)
 
 
 def test_blocks_have_a_feedback():
@@ -159,7 +156,6 @@ def test_blocks_have_a_feedback():
     sizes = []
     for problem in (free, blocked):
         assert problem.horizon is not None
-        assert problem.cost is not None
-        [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
-        sizes.append(np.linalg.norm(first.state))
+        first = plan_gain(problem, problem.horizon)
+        sizes.append(np.linalg.norm(first))
     assert sizes[1] < 0.5 * sizes[0]
