@@ -155,9 +155,14 @@ def probe(
             why = "" if candidates else "no setting that keeps its margins makes the error clearly less"
         except FpirhcError as error:
             why = f"the plant as estimated cannot be run ({error})"
-    results = tried(problem, bare, candidates, seed=seed + 1) if trials and recording is None and candidates else {}
-    name = best(results) if results else "cautious" if "cautious" in candidates else None
-    if results and name is None:
+    try_them = trials and recording is None and bool(candidates)
+    outcomes = tried(problem, bare, candidates, seed=seed + 1) if try_them else {}
+    results = {name: one for name, one in outcomes.items() if isinstance(one, Trial)}
+    notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
+    name = best(results) if try_them else "cautious" if "cautious" in candidates else None
+    if try_them and not results:
+        why = "the loop refuses every candidate"
+    elif try_them and name is None:
         why = "in trials on the plant no candidate made the error clearly less, and that of no coordinate larger"
     elif candidates and name is None:
         why = "no candidate bears twice the gain, which one that is not tried has to"

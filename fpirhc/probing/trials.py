@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation
+from fpirhc.errors import FpirhcError
 from fpirhc.probing.rule import mean_ratio
 from fpirhc.simulation.error_pair import errors_of
 from fpirhc.simulation.model_as_plant import shortened
@@ -41,8 +42,8 @@ class Trial:
 
 def tried(
     problem: Problem, controller: Controller, candidates: Mapping[str, Deformation], *, seed: int
-) -> dict[str, Trial]:
-    """Return the trial of every candidate, beside one of the controller alone.
+) -> dict[str, Trial | str]:
+    """Return the trial of every candidate, beside one of the controller alone; of one that the loop refuses, the reason.
 
     Args:
         problem: of which the first 2000 cycles are run.
@@ -55,12 +56,16 @@ def tried(
     def run(one: Controller) -> Run:
         return simulator(short, one, compiled=False).run(seed=seed)
 
-    alone, found = run(bare), {}
-    for name, deformation in candidates.items():
-        again = run(bare.with_deformation(deformation))
+    def trial(deformation: Deformation) -> Trial | str:
+        try:
+            again = run(bare.with_deformation(deformation))
+        except FpirhcError as error:
+            return str(error)
         pair = errors_of(short, (alone, again), names)
-        found[name] = Trial(mean_ratio(short, alone, again, names), max(pair.ratio(n) for n in pair.without))
-    return found
+        return Trial(mean_ratio(short, alone, again, names), max(pair.ratio(n) for n in pair.without))
+
+    alone = run(bare)
+    return {name: trial(deformation) for name, deformation in candidates.items()}
 
 
 def best(trials: Mapping[str, Trial]) -> str | None:

@@ -150,9 +150,10 @@ def test_inputs_that_are_exchanged_are_refused():
 def test_trials_keep_none_that_is_worse():
     """A gain far beyond the limit is tried, fails, and nothing is kept; nor is one that makes one coordinate worse."""
     problem = replace(body_problem(1.0, 3, 0.0, 0.05), duration=3.0)
-    trials = tried(problem, RHC, {"wild": fp.ModelReferenced(fp.Affine(gain=-1.2))}, seed=1)
-    assert trials["wild"].error > 1
-    assert best(trials) is None
+    wild = tried(problem, RHC, {"wild": fp.ModelReferenced(fp.Affine(gain=-1.2))}, seed=1)["wild"]
+    assert isinstance(wild, Trial)
+    assert wild.error > 1
+    assert best({"wild": wild}) is None
     assert best({"a": Trial(0.5, 1.04), "b": Trial(0.7, 1.0), "c": Trial(0.97, 0.97)}) == "b"
 
 
@@ -236,3 +237,14 @@ def test_wrong_arguments_are_refused(arguments, words):
     """Each with what was expected."""
     with pytest.raises(fp.FpirhcError, match=words):
         fp.probe(body_problem(1.0), RHC, **arguments)
+
+
+def test_a_candidate_that_the_loop_refuses_is_not_tried_and_the_others_are():
+    """The motor's derivative is two cycles late: a filtered gain that is too large for it is refused before a run."""
+    task = fp.load_problem("noisy_motor")
+    controller = next(iter(task.controllers.values()))
+    fast = fp.ModelReferenced(map=fp.Filtered(map=fp.Affine(gain=-0.991), pole=0.75))
+    slow = fp.ModelReferenced(map=fp.Filtered(map=fp.Affine(gain=-0.1), pole=0.75))
+    outcomes = tried(task.problem, controller, {"fast": fast, "slow": slow}, seed=0)
+    assert "use 0 < |gain| < 0.413" in str(outcomes["fast"])
+    assert isinstance(outcomes["slow"], Trial)

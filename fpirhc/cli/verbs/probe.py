@@ -52,22 +52,22 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
         print(to_json(found.plain))
     else:
-        _show(task.title, found)
+        _show(task.name, found)
     return ExitCode.FINISHED if found.deformation is not None else ExitCode.ANSWERED_NO
 
 
-def _show(title: str, found: Probe) -> None:
+def _show(name: str, found: Probe) -> None:
     from fpirhc.report.terminal import say, show_table
     from fpirhc.summary import Column, Table
 
-    estimates = Table(f"{title}: probe", [Column("estimate", left=True), Column("value (interval)")])
-    for name, value in found.facts:
-        estimates.add([name, value])
+    estimates = Table(f"{name}: probe", [Column("estimate", left=True), Column("value (interval)")])
+    for estimate, value in found.facts:
+        estimates.add([estimate, value])
     show_table(estimates)
     if found.trials:
         tried = Table("trials on the plant", [Column("candidate", left=True), Column("error"), Column("worst")])
-        for name, one in found.trials.items():
-            tried.add([name, f"{one.error:.3g}", f"{one.worst:.3g}"])
+        for candidate, one in found.trials.items():
+            tried.add([candidate, f"{one.error:.3g}", f"{one.worst:.3g}"])
         show_table(tried)
         say("Errors are those with adaptation over those of the controller alone.")
     for note in found.notes:
