@@ -34,10 +34,9 @@ from fpirhc.review.pays import pays
 from fpirhc.review.planned import is_planned
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
 from fpirhc.review.rates import rates_inside
-from fpirhc.review.reach import range_enough
 from fpirhc.review.schedule import schedule_stable
 from fpirhc.review.signs import one_sign
-from fpirhc.review.slew import slew_enough
+from fpirhc.review.slew import range_enough, slew_enough
 from fpirhc.review.speed import bears_lag, fast_enough
 from fpirhc.review.two_cycles import free_of_two_cycles
 from fpirhc.review.well_posed import well_posed

@@ -1,7 +1,8 @@
-"""Is the map fast enough? Its largest step per cycle is compared with the change of the request.
+"""Is the map fast enough, and its range large enough? Its largest step per cycle is compared with the change of the request.
 
 Along the reference the request changes by |d r*/dt|. After a start off the reference a plan changes it faster: the step must also
 B^ (v_{k+1} - v_k), with the commands v of the linear loop of plant = model from this start, within the limits of the inputs.
+Some maps are valid only for requests that are much smaller than a constant of theirs.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from fpirhc.review.state_slopes import state_slopes
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
+RANGE = "Is the map's range large enough for the requests?"
+_ROOM = 10.0  # times the largest request
 SPARE = 2.0  # how many times faster than the reference the map should be
 _POINTS = 2001
 _CYCLES = 1000  # after the start
@@ -117,3 +120,20 @@ def _effect_of_state(grid: ReviewGrid, name: str) -> float:
     at = grid.states[0], np.nan_to_num(grid.commands[0, 0]), plant.exact
     unit = np.array([1.0 if n == name else 0.0 for n in plant.names])
     return float(np.linalg.norm((function(*at, unit) - function(*at, 0 * unit)).full()))
+
+
+def range_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray) -> Answer | None:
+    """Return the ratio of the map's constant to the largest request; None for a map without such a constant."""
+    reach = deformation.iteration.reach
+    if reach is None:
+        return None
+    size, name = reach.size, reach.name
+    requests = grid.requests(believed)
+    largest = float(np.nan_to_num(np.linalg.norm(np.hstack([requests, grid.responses]), axis=1)).max())
+    ratio = size / max(largest, 1e-300)
+    text = f"{name} {size:.3g} is {ratio:.3g} times the largest request and response, {largest:.3g}"
+    change = f"Use {name} = {_ROOM * largest:.2g} or more."
+    if ratio < 1:
+        return Answer(RANGE, Verdict.NO, text, change, {"ratio": ratio})
+    good = ratio >= _ROOM
+    return Answer(RANGE, Verdict.YES if good else Verdict.UNKNOWN, text, "" if good else change, {"ratio": ratio})
