@@ -114,7 +114,7 @@ def test_a_slow_compartment_is_not_the_deformation_s():
         one = about(review, "Does the deformation converge", name)
         assert one.verdict == "yes"
         assert one.numbers["radius"] < 0.95
-        assert "decay by themselves" in one.evidence
+        assert "beside those of the states that move by themselves, 0.9994" in one.evidence
 
 
 def test_kinetics_of_states_without_a_task_are_not_missed():
