@@ -25,7 +25,7 @@ from fpirhc.review.stages import stiff_advice
 from fpirhc.review.state_slopes import state_slopes
 from fpirhc.summary import in_percent
 from fpirhc.task.limits import Limits
-from fpirhc.task.problem import Problem
+from fpirhc.task.problem import Problem, cycles_per_plan
 
 QUESTION = "Is the horizon long enough?"
 _SAME = 0.1  # relative change of the plan's feedback
@@ -161,12 +161,13 @@ def _slowest(grid: ReviewGrid) -> float:
 
 
 def _growth(grid: ReviewGrid, feedback: np.ndarray) -> float:
-    """Growth rate of the model's fastest mode, per unit of time, where every stage begins with a new plan.
+    """Growth rate of the model's fastest mode, per unit of time, under the plans' feedback.
 
-    It is ln(rho) / step with the spectral radius rho of the state and the held input over one stage, and 0 where rho is 1.
+    It is ln(rho) / T with the spectral radius rho of the state and the held input over the time T from plan to plan, and 0 where
+    rho is 1.
     """
     assert grid.problem.horizon is not None
-    step = grid.problem.horizon.step
+    step = cycles_per_plan(grid.problem.horizon, grid.problem.period) * grid.problem.period
     a, b = _model(grid)
     nx, nu = b.shape
     rates = np.block([[a, b], [np.zeros((nu, nx + nu))]])
