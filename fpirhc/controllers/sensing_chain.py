@@ -157,10 +157,10 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
     measured difference alone is left. A prediction without the last measured difference would keep the model's error for ever.
 
     Args:
-        plant: whose outputs are estimated.
+        plant: a map, or any other plant, whose estimator then stays alone.
         estimate: writes the signal of the outputs.
     """
-    if max(plant.chains.values()) == 1:
+    if plant.step is None or max(plant.chains.values()) == 1:
         return [estimate]
     measured = replace(plant.output, name=_MEASURED)
 

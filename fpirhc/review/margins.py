@@ -128,6 +128,26 @@ def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
     return min(factors, default=math.inf), least, min(delays, default=math.inf)
 
 
+def keeps_margins(loop: LinearLoop, place: int) -> bool:
+    """Whether the margins of one input's loop are the least that are wanted, without the search for their sizes."""
+    if len(loop.cycles) == 1:
+        gain, phase, _ = margins(loop, place)
+        return gain >= LEAST_GAIN and phase >= LEAST_PHASE
+    most, angle = math.log(LEAST_GAIN), math.radians(LEAST_PHASE)
+    factors = [
+        *np.exp(_up_to(most, _DECADES)),
+        *np.exp(-_up_to(most, _DECADES)),
+        *np.exp(-1j * _up_to(angle, math.pi)),
+    ]
+    return bool((np.abs(_turned(loop, place, np.array(factors))) < 1).all())
+
+
+def _up_to(end: float, most: float) -> np.ndarray:
+    """The steps at which margins up to `most` are looked for, as far as an end, and the end."""
+    steps = np.linspace(0, most, _STEPS + 1)
+    return np.append(steps[steps < end], end)
+
+
 def _roots(function: Callable[[float], float], at: np.ndarray, values: np.ndarray) -> list[float]:
     """Arguments at which a function is zero, one between each pair of neighbours of different signs."""
     changes = np.flatnonzero(np.sign(values[1:]) * np.sign(values[:-1]) < 0)

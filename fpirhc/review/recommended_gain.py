@@ -25,8 +25,7 @@ from fpirhc.contraction.large_errors import two_cycle_limit
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.loops_by_gain import LoopsByGain
-from fpirhc.review.margins import LEAST_GAIN, LEAST_PHASE, margins
-from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.review.margins import keeps_margins
 
 MARGIN = 2.0
 SECANT, TWO_CYCLE = "the map's steepest secant", "a two-cycle of the whole loop"
@@ -137,14 +136,10 @@ def _with_margins(loops: LoopsByGain, gain: float) -> float:
     """The size of the gain, or of the largest smaller one that keeps the margins; itself where smaller ones do not help."""
     pair = max(loops.along(_ALONG), key=lambda pair: loops.at(gain, pair).radius)
     for share in np.geomspace(1.0, 1 / MARGIN**2, 8):
-        if _keeps_margins(loops.at(float(share) * gain, pair)):
+        loop = loops.at(float(share) * gain, pair)
+        if all(keeps_margins(loop, i) for i in range(loop.cycles[0].entry.shape[1])):
             return abs(gain) * float(share)
     return abs(gain)
-
-
-def _keeps_margins(loop: LinearLoop) -> bool:
-    sizes = [margins(loop, i)[:2] for i in range(loop.cycles[0].entry.shape[1])]
-    return all(gain >= LEAST_GAIN and phase >= LEAST_PHASE for gain, phase in sizes)
 
 
 def _own_per_effective(deformation: Deformation) -> float:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import followed_units
-from fpirhc.simulation.metrics.base import Metric
+from fpirhc.simulation.metrics.base import Better, Metric
 from fpirhc.simulation.metrics.window import measured_cycles
 from fpirhc.simulation.pictures.base import Quantity, numbers
 from fpirhc.simulation.run import Run
@@ -134,10 +133,10 @@ def Norm(whats: Sequence[str], *, power: float = 2.0, name: str = "norm", headli
 def _figure(
     name: str,
     what: What,
-    figure: Callable[[np.ndarray, float], Any],
+    figure: Callable[[np.ndarray, float], float | np.floating],
     unit: Callable[[str, str], str],
     headline: bool,
-    **fields: Any,
+    better: Better = "smaller",
 ) -> Metric:
     """The metric of one signal: `figure` of its values and the period, `unit` of its unit and that of time."""
 
@@ -146,7 +145,7 @@ def _figure(
 
     whole = partial(_of_whole_runs, function)
     return Metric(
-        name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, finite=True, **fields
+        name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, finite=True, better=better
     )
 
 

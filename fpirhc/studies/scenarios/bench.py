@@ -15,7 +15,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller, checked, resolved
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.plant.mismatch import exact_ranges
@@ -197,7 +197,7 @@ class Bench:
             try:
                 ready = simulator(problem, controller, compiled=compile_it, live=live)
                 self._shared[name] = None if ready.remembers else ready
-            except NotSupported:
+            except FpirhcError:  # what is wrong for every dead time is said by the loops of their own
                 self._shared[name] = None
         return self._shared[name]
 

@@ -1,0 +1,37 @@
+"""Whether a loop keeps its margins is answered without their sizes, and the answers agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fpirhc.review.margins import LEAST_GAIN, LEAST_PHASE, keeps_margins, margins
+from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
+
+
+def loop(seed: int, cycles: int) -> LinearLoop:
+    """A random loop that converges: two states of the plant, four of the controller, one input."""
+    random = np.random.default_rng(seed)
+    parts = [
+        LinearCycle(random.normal(size=(6, 6)), random.normal(size=(6, 1)), random.normal(size=(1, 6)), np.eye(2, 6))
+        for _ in range(cycles)
+    ]
+    whole = LinearLoop(tuple(parts), np.eye(6), np.eye(6, 2), 0.1)
+    share = random.uniform(0.3, 0.95) / whole.radius
+    parts = [
+        LinearCycle(share * one.dynamics, share * one.entry, random.uniform(0.02, 3.0) * one.arriving, one.state)
+        for one in parts
+    ]
+    return LinearLoop(tuple(parts), np.eye(6), np.eye(6, 2), 0.1)
+
+
+@pytest.mark.parametrize("cycles", [1, 3])
+def test_the_short_answer_is_that_of_the_sizes(cycles):
+    answers = set()
+    for seed in range(60):
+        one = loop(seed, cycles)
+        assert one.radius < 1
+        gain, phase, _ = margins(one, 0)
+        answers.add(keeps_margins(one, 0))
+        assert keeps_margins(one, 0) == (gain >= LEAST_GAIN and phase >= LEAST_PHASE), seed
+    assert answers == {True, False}  # the loops are of both kinds
