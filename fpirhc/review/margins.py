@@ -134,11 +134,7 @@ def keeps_margins(loop: LinearLoop, place: int) -> bool:
         gain, phase, _ = margins(loop, place)
         return gain >= LEAST_GAIN and phase >= LEAST_PHASE
     most, angle = math.log(LEAST_GAIN), math.radians(LEAST_PHASE)
-    factors = [
-        *np.exp(_up_to(most, _DECADES)),
-        *np.exp(-_up_to(most, _DECADES)),
-        *np.exp(-1j * _up_to(angle, math.pi)),
-    ]
+    factors = [*np.exp(_up_to(most, _DECADES)), *np.exp(-_up_to(most, _DECADES)), *np.exp(-1j * _up_to(angle, math.pi))]
     return bool((np.abs(_turned(loop, place, np.array(factors))) < 1).all())
 
 
