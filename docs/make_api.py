@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import ModuleType
 
 import fpirhc as fp
 from fpirhc.members import FAMILIES, member_classes
@@ -90,13 +91,20 @@ def page() -> str:
     for title, names in by_section().items():
         lines += [title, "-" * len(title), ""]
         for name in names:
-            kind = "autoclass" if isinstance(getattr(fp, name), type) else "autofunction"
-            lines += [f".. {kind}:: fpirhc.{name}"] + (["   :members:"] if name in WITH_MEMBERS else []) + [""]
+            lines += [*_entry(name, getattr(fp, name)), ""]
     lines += ["Beside the top level", "--------------------", "", "These are imported from their modules.", ""]
     for name, module in BESIDE.items():
         kind = "autoclass" if name[0].isupper() else "autofunction"
         lines += [f".. {kind}:: {module}.{name}"] + (["   :members:"] if name in WITH_MEMBERS else []) + [""]
     return "\n".join(lines)
+
+
+def _entry(name: str, member: object) -> list[str]:
+    """What the page has of a public name: a class, a function, or a module with all of its own."""
+    if isinstance(member, ModuleType):
+        return [f".. automodule:: {member.__name__}", "   :members:"]
+    kind = "autoclass" if isinstance(member, type) else "autofunction"
+    return [f".. {kind}:: fpirhc.{name}", *(["   :members:"] if name in WITH_MEMBERS else [])]
 
 
 if __name__ == "__main__":
