@@ -279,7 +279,8 @@ class AskedLoop:
             one, other = start, memory
             for k in range(2 * self._longest):
                 one, other = self._step(one, w if k == 0 else 0.0)[0], self._step(other)[0]
-                deviation = np.abs(one - other)
+                with np.errstate(invalid="ignore"):  # both may have run away
+                    deviation = np.abs(one - other)
                 largest = np.maximum(largest, np.where(np.isfinite(deviation), deviation, 0.0))
         scales = np.maximum(largest / _SHARE, _SMALLEST * np.abs(memory))
         for places in self._alike:

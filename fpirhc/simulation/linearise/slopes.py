@@ -72,11 +72,17 @@ class Step:
         def move(deviations: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             sizes = np.sqrt(np.maximum((deviations**2).sum(axis=0), (w**2).sum(axis=0)))
             moved, traces = np.zeros_like(deviations), np.zeros((self.loop.trace.size, w.shape[1]))
-            for k in np.flatnonzero(sizes):
-                h = _STEP / sizes[k]
-                by_memory, by_input = h * scales * deviations[:, k], h * w[:, k]
-                ahead, behind = self(memory + by_memory, by_input), self(memory - by_memory, -by_input)
-                moved[:, k], traces[:, k] = (ahead[0] - behind[0]) / (2 * h * scales), (ahead[1] - behind[1]) / (2 * h)
+            with np.errstate(
+                invalid="ignore", over="ignore"
+            ):  # a loop that runs away has infinite values on both sides
+                for k in np.flatnonzero(sizes):
+                    h = _STEP / sizes[k]
+                    by_memory, by_input = h * scales * deviations[:, k], h * w[:, k]
+                    ahead, behind = self(memory + by_memory, by_input), self(memory - by_memory, -by_input)
+                    moved[:, k] = (ahead[0] - behind[0]) / (2 * h * scales)
+                    traces[:, k] = (ahead[1] - behind[1]) / (2 * h)
+            if not np.isfinite(moved).all():
+                raise NotSupported("the loop has no finite slope at a point of its run")
             return np.where(np.abs(moved) > _ROUNDING * sizes, moved, 0.0), traces
 
         return move
