@@ -34,6 +34,7 @@ _LEARNED = re.compile(r"(^|\.)(tuner|delay_weights|_gains|_?learned|window|least
 _SHARE = 0.01  # of their sizes, by which states and inputs are moved to find the scales of all else
 _SMALLEST = 1e-5  # scale of an entry, as a share of its value
 _ROOM = 0.01  # share of the range between an input's limits, nearer than which a command stands at one
+_AWAY = 1e100  # of an entry, from which a run has run away: squares of what is larger overflow
 _STILL = 1e-7  # change of a command from period to period, as a share of the largest
 
 
@@ -131,7 +132,7 @@ class AskedLoop:
     def run(
         self, memory: np.ndarray, cycles: int, led: np.ndarray | None = None, request: np.ndarray | None = None
     ) -> Passage:
-        """Return the run from a memory; it ends before the first cycle that is not finite, or where it is led and has come to rest.
+        """Return the run from a memory; it ends before the first cycle that runs away, or where it is led and has come to rest.
 
         Args:
             memory: at its start.
@@ -145,7 +146,7 @@ class AskedLoop:
         leads = None if led is None else np.isfinite(led)
         for k in range(cycles):
             memory_next, trace = self._step(memories[-1])
-            if not (np.isfinite(memory_next).all() and np.isfinite(trace[self._arriving]).all()):
+            if not ((np.abs(memory_next) < _AWAY).all() and np.isfinite(trace[self._arriving]).all()):
                 break
             if led is not None and leads is not None:
                 np.copyto(memory_next[self._state], led[k], where=leads[k])
@@ -281,7 +282,7 @@ class AskedLoop:
                 one, other = self._step(one, w if k == 0 else 0.0)[0], self._step(other)[0]
                 with np.errstate(invalid="ignore"):  # both may have run away
                     deviation = np.abs(one - other)
-                largest = np.maximum(largest, np.where(np.isfinite(deviation), deviation, 0.0))
+                largest = np.maximum(largest, np.where(deviation < _AWAY, deviation, 0.0))
         scales = np.maximum(largest / _SHARE, _SMALLEST * np.abs(memory))
         for places in self._alike:
             scales[places] = scales[places].max()

@@ -139,5 +139,8 @@ class LinearLoop:
 
 def _seen(rows: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Largest share of a row, of length 1, in each vector."""
+    rows = rows / np.maximum(
+        np.abs(rows).max(axis=1, keepdims=True), 1e-300
+    )  # squares of a loop that runs away overflow
     lengths = np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     return np.asarray(np.abs((rows / lengths) @ vectors).max(axis=0))
