@@ -135,11 +135,11 @@ def numbers_written_out(text: str) -> str:
     return _WITH_POWER.sub(_as_written, text)
 
 
-def _as_written(found: re.Match[str]) -> str:
-    value, digits = found["number"], sum(c.isdigit() for c in found["number"].partition("e")[0])
+def _as_written(match: re.Match[str]) -> str:
+    value, digits = match["number"], sum(c.isdigit() for c in match["number"].partition("e")[0])
     text = written_out(float(value), max(digits, 1))
     text = f"+{text}" if value.startswith("+") else text
-    return found["before"] + (text.replace(" ", "") if "=" in found["before"] else text)
+    return match["before"] + (text.replace(" ", "") if "=" in match["before"] else text)
 
 
 def _escaped(text: str) -> str:

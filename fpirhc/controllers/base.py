@@ -465,9 +465,9 @@ def _settling(plant: Plant, deformation: Deformation, block: Block) -> Block:
         settling = s.settling > 0.5
         before = {m: getattr(s, m) for m in names}
         stays = before | (deformation.held(getattr(s, _REQUEST), before) if deformation.mirror is None else {})
-        kept = {f"{m}_next": v for m, v in stays.items()}
-        kept |= {"_deformed_unclipped": s.desired + getattr(s, _HELD), "_deformation": getattr(s, _HELD)}
-        values |= {name: ca.if_else(settling, value, values[name]) for name, value in kept.items()}
+        held = {f"{m}_next": v for m, v in stays.items()}
+        held |= {"_deformed_unclipped": s.desired + getattr(s, _HELD), "_deformation": getattr(s, _HELD)}
+        values |= {name: ca.if_else(settling, value, values[name]) for name, value in held.items()}
         return {**values, f"{_HELD}_next": values["_deformation"]}
 
     own = block.memory + Layout((held,))

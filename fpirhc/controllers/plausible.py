@@ -108,8 +108,8 @@ def _largest_responses(problem: Problem) -> tuple[float, ...]:
     states = _plausible_states(task, along, generator)
     corners = np.where(generator.random((lower.size, _DRAWN)) < 0.5, lower[:, None], upper[:, None])
     parameters = np.repeat(plant.approximate[:, None], _DRAWN, axis=1)
-    found = np.abs(plant.equations.controlled_response.map(_DRAWN)(states, corners, parameters).full())
-    over = _OVER_STATES * np.where(np.isfinite(found), found, 0.0).max(axis=1)
+    sizes = np.abs(plant.equations.controlled_response.map(_DRAWN)(states, corners, parameters).full())
+    over = _OVER_STATES * np.where(np.isfinite(sizes), sizes, 0.0).max(axis=1)
     return tuple(float(v) for v in np.maximum(along, over))
 
 

@@ -304,15 +304,15 @@ def first_plan(
     flows out as before, whatever the pump adds to nothing.
     """
     layout = optimiser.memory(ocp)
-    found = improved(optimiser, ocp, state, data, layout.start(), calls=calls)
+    first = improved(optimiser, ocp, state, data, layout.start(), calls=calls)
     lower, upper = (np.asarray(b)[:, None] for b in (ocp.input_lower, ocp.input_upper))
     reach = upper - lower
-    if not np.isfinite(reach).all() or not (np.minimum(found[0] - lower, upper - found[0]) <= _AT_LIMIT * reach).all():
-        return found
+    if not np.isfinite(reach).all() or not (np.minimum(first[0] - lower, upper - first[0]) <= _AT_LIMIT * reach).all():
+        return first
     memory = layout.start()
     memory[layout.slice("plan_inputs")] = np.tile(lower + reach / 2, ocp.stages).ravel(order="F")
     other = improved(optimiser, ocp, state, data, memory, calls=calls)
-    return other if other[1][4] == Status.OK and other[1][0] < found[1][0] else found
+    return other if other[1][4] == Status.OK and other[1][0] < first[1][0] else first
 
 
 class _Same:

@@ -270,8 +270,8 @@ class Equations(MotionEquations):
         """
         if not self.motion.outputs:
             return dict(zip(self.motion.names, self.motion.orders, strict=True))
-        found = {name: output_order(self.motion, name) for name in self.motion.outputs}
-        return {name: 1 if order is None else order for name, order in found.items()}
+        orders = {name: output_order(self.motion, name) for name in self.motion.outputs}
+        return {name: 1 if order is None else order for name, order in orders.items()}
 
     @cached_property
     def output(self) -> ca.Function:

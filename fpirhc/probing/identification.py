@@ -165,7 +165,7 @@ def _profile(
     rows = np.array([delayed(m, d, tau, period).T for d, tau in points])  # (points, n, cycles)
     counts = good.copy()
     counts[: min(max(deads) + _SETTLED, len(f) // 3)] = False
-    found = []
+    channels = []
     for p, c in _NOISES:
         x, y = (np.diff(one, p, axis=-1) for one in (rows, f))
         some = counts[p:]
@@ -180,11 +180,11 @@ def _profile(
             rest = np.maximum(yw @ yw - np.sum(gains * mixed, axis=1), 1e-300) / total
             spread = np.sqrt(rest[:, None] * np.diagonal(inverse, axis1=1, axis2=2))
             likelihood = -0.5 * total * np.log(rest)
-            found += [
+            channels += [
                 _Fit(float(value), d, tau, (p, c), float(ratio), gain, std, float(s))
                 for (d, tau), value, gain, std, s in zip(points, likelihood, gains, spread, rest, strict=True)
             ]
-    return found
+    return channels
 
 
 def _near(fits: Sequence[_Fit], distance: float) -> list[_Fit]:

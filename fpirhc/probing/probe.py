@@ -213,11 +213,11 @@ def _notes(record: Record) -> list[str]:
 def _check(
     problem: Problem, amplitude: float | Mapping[str, float] | None, chatter: float | Mapping[str, float] | None
 ) -> None:
-    for what, given, names, least in (
+    for what, setting, names, least in (
         ("amplitude", amplitude, problem.plant.controlled_names, "of at least 0"),
         ("chatter", chatter, tuple(problem.plant.inputs), "above 0"),
     ):
-        entries = given if isinstance(given, Mapping) else {"": given}
+        entries = setting if isinstance(setting, Mapping) else {"": setting}
         for name, value in entries.items():
             if name and name not in names:
                 raise InvalidName(f"probe({what}=...): '{name}' is unknown.{nearest(name, names)}")

@@ -142,8 +142,8 @@ class Rule:
         # A small gain delays the desired response in the plain form: it is searched whatever its error is there.
         mirrored, plain = ([one for one in forms if one.setting.referenced is kind] for kind in (True, False))
         searched = mirrored[:_FORMS] + plain[:1]
-        found = [self._predicted(s) for one in searched for s in _around(one.setting)]
-        calm = sorted((one for one in found if one.steps <= 1 and one.error < _WORTH), key=lambda one: one.error)
+        settings = [self._predicted(s) for one in searched for s in _around(one.setting)]
+        calm = sorted((one for one in settings if one.steps <= 1 and one.error < _WORTH), key=lambda one: one.error)
         safe: list[Predicted] = []
         for one in calm:
             if safe and one.error > _NEAR * safe[0].error:
@@ -166,11 +166,11 @@ class Rule:
             "long lag": self._long(),
             "bold": min(safe, key=lambda one: one.steps, default=None),
         }
-        kept: dict[str, Predicted] = {}
+        different: dict[str, Predicted] = {}
         for name, candidate in chosen.items():
-            if candidate is not None and all(candidate.deformation != one.deformation for one in kept.values()):
-                kept[name] = candidate
-        return kept
+            if candidate is not None and all(candidate.deformation != one.deformation for one in different.values()):
+                different[name] = candidate
+        return different
 
     def _safe(self, one: Predicted) -> bool:
         return self._margins.safe(one.deformation)
@@ -239,8 +239,8 @@ class Rule:
         usual = np.maximum(_STEPS * _steps(self._alone), _OF_RANGE * width)
         if chatter is None:
             return np.asarray(np.maximum(usual, 1e-300))
-        given = chatter if isinstance(chatter, Mapping) else dict.fromkeys(plant.inputs, chatter)
-        return np.array([float(given.get(name, own)) for name, own in zip(plant.inputs, usual, strict=True)])
+        limits = chatter if isinstance(chatter, Mapping) else dict.fromkeys(plant.inputs, chatter)
+        return np.array([float(limits.get(name, own)) for name, own in zip(plant.inputs, usual, strict=True)])
 
 
 def mean_ratio(problem: Problem, alone: Run, run: Run, names: frozenset[str] | None) -> float:
@@ -256,10 +256,10 @@ def _around(form: Setting) -> Iterator[Setting]:
             yield replace(form, share=share, pole=pole)
 
 
-def _one_filter_each(found: Iterable[Predicted]) -> Iterator[Predicted]:
+def _one_filter_each(settings: Iterable[Predicted]) -> Iterator[Predicted]:
     """The first of those that differ in their filter alone: the best one, where they are in the order of their errors."""
     passed = set()
-    for one in found:
+    for one in settings:
         form = replace(one.setting, pole=0.0)
         if form not in passed:
             passed.add(form)

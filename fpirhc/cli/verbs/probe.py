@@ -37,7 +37,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.comparison.compare import select
 
     controllers = select(task, None if options.controller is None else [options.controller])
-    found = probe(
+    answer = probe(
         task.problem,
         next(iter(controllers.values())),
         cycles=options.cycles,
@@ -50,31 +50,31 @@ def _run(options: argparse.Namespace) -> ExitCode:
     if options.json:
         from fpirhc.studies.view import to_json
 
-        print(to_json(found.plain))
+        print(to_json(answer.plain))
     else:
-        _show(task.name, found)
-    return ExitCode.FINISHED if found.deformation is not None else ExitCode.ANSWERED_NO
+        _show(task.name, answer)
+    return ExitCode.FINISHED if answer.deformation is not None else ExitCode.ANSWERED_NO
 
 
-def _show(name: str, found: Probe) -> None:
+def _show(name: str, answer: Probe) -> None:
     from fpirhc.report.terminal import say, show_table
     from fpirhc.summary import Column, Table
 
     estimates = Table(f"{name}: probe", [Column("estimate", left=True), Column("value (interval)")])
-    for estimate, value in found.facts:
+    for estimate, value in answer.facts:
         estimates.add([estimate, value])
     show_table(estimates)
-    if found.trials:
+    if answer.trials:
         tried = Table("trials on the plant", [Column("candidate", left=True), Column("error"), Column("worst")])
-        for candidate, one in found.trials.items():
+        for candidate, one in answer.trials.items():
             tried.add([candidate, f"{one.error:.3g}", f"{one.worst:.3g}"])
         show_table(tried)
         say("Errors are those with adaptation over those of the controller alone.")
-    for note in found.notes:
+    for note in answer.notes:
         say(f"note: {note}")
-    say(f"chosen: {found.why}" if found.deformation is not None else f"no adaptation: {found.why}", "bold")
-    if found.deformation is not None:
-        print(f"\nfor the controller:\n\n{found.lines}")
+    say(f"chosen: {answer.why}" if answer.deformation is not None else f"no adaptation: {answer.why}", "bold")
+    if answer.deformation is not None:
+        print(f"\nfor the controller:\n\n{answer.lines}")
 
 
 VERB = Verb(

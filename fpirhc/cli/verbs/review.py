@@ -54,10 +54,10 @@ def _probed(problem: Problem, controllers: Mapping[str, Controller], seed: int) 
     from fpirhc.errors import NotSupported
     from fpirhc.probing.probe import probe
 
-    found = probe(problem, next(iter(controllers.values())), trials=False, seed=seed)
-    if found.problem is None:
-        raise NotSupported(f"review --probe: {found.why}")
-    return found.problem
+    answer = probe(problem, next(iter(controllers.values())), trials=False, seed=seed)
+    if answer.problem is None:
+        raise NotSupported(f"review --probe: {answer.why}")
+    return answer.problem
 
 
 def _show(title: str, review: Review) -> None:
