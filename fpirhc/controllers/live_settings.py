@@ -26,12 +26,18 @@ from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, copied, live_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in, opened, paths_to
+from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances")
 _ALWAYS_DATA = "Parameters (exact and approximate) and the start are data of every loop; they need no live setting"
 _IN_TABLES = ("sensing", "disturbances")  # of what Python makes tables before a run
 _NUDGES, _SMALLEST = (0.07, 2.0), 1e-3  # shares by which a number is changed to see whether the loop depends on it
+_OF_INPUTS = "limits.inputs."
+_REACHES, _CLOSE = (
+    (1.0, 1e1, 1e2, 1e4, 1e8, 1e16, 1e32, 1e64, 1e128, 1e256),
+    1e-6,
+)  # of the search for bounds, in the number's size
 Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
 
 
@@ -173,6 +179,27 @@ class LiveSettings:
             values[path] = float(cast(float, content_at(controller, path)))
         return problem, checked(problem, controller, numbers_only=True), values
 
+    def bounds(self, path: str) -> Interval:
+        """Return the interval around the number of the build in which a setting is accepted while the others stay.
+
+        An end is the last number that was accepted of a bisection, to a millionth; infinite: every larger one is accepted. A limit
+        of an input is a fact of the machine: it ends at that of the build.
+        """
+        value = self._content(path)
+        size = max(abs(value), _SMALLEST)
+        lower, upper = (_farthest(lambda number: self._accepts(path, number), value, side * size) for side in (-1, 1))
+        return (
+            max(lower, value) if path.startswith(_OF_INPUTS) and path.endswith(".0") else lower,
+            min(upper, value) if path.startswith(_OF_INPUTS) and path.endswith(".1") else upper,
+        )
+
+    def _accepts(self, path: str, value: float) -> bool:
+        try:
+            self.changed({path: value})
+        except FpirhcError:
+            return False
+        return True
+
     def flat(self, numbers: Numbers) -> dict[str, float]:
         """Return numbers by path, with the ends of intervals one by one.
 
@@ -257,6 +284,22 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
             f"setting '{path}' is {content}: there is no limit that could change; give it a finite number"
         )
     return [path]
+
+
+def _farthest(accepts: Callable[[float], bool], value: float, size: float) -> float:
+    """The last accepted number on the side of `size`, whose sign and magnitude the steps have; infinite where none is refused."""
+    inside = value
+    for reach in _REACHES:
+        outside = value + reach * size
+        if not accepts(outside):
+            break
+        inside = outside
+    else:
+        return math.copysign(math.inf, size)
+    while abs(outside - inside) > _CLOSE * max(abs(inside), abs(size)):
+        middle = (inside + outside) / 2
+        inside, outside = (middle, outside) if accepts(middle) else (inside, middle)
+    return inside
 
 
 def _is_structure(owner: object, path: str) -> bool:

@@ -29,6 +29,7 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
+from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 NOTHING = np.zeros(0)
@@ -197,6 +198,10 @@ class NumbersNow:
             return self._refuse(error)
         self.numbers = numbers
         return True
+
+    def bounds(self) -> dict[str, Interval]:
+        """Return for each live setting the interval in which it is accepted while the others stay as in the build, by path."""
+        return {path: self._live.bounds(path) for path in self._live.paths}
 
     def set_reference(self, setpoints: SetpointsNow) -> bool:
         """Put set-points in force, by coordinate or output, and return whether they were accepted.

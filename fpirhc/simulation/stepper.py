@@ -7,6 +7,7 @@ from math import isnan, nan
 from time import perf_counter
 from typing import TYPE_CHECKING, NoReturn
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.by_name import ByName
@@ -75,6 +76,11 @@ class Stepper(Checked):
     the memory of the build, and SATURATED is judged by the limits of the build. Set-points of the reference change in the same way,
     `stepper.step(..., setpoints={"q1": 2.5})`, and need no live setting; `setpoints` are in force.
 
+    `function` is the step itself, a CasADi Function (memory, each of `reads`) -> (memory, trace, command), for code generation of
+    one's own. `reads`, `memory`, `signals` and `settings` are the layouts of what it takes and gives: names, units, and start
+    values, which are the numbers of the build for parameters, settings and set-points. It has gate and monitor inside; not inside
+    are missed cycles, a solver that raises, and the check of settings (`bounds`).
+
     A controller that does better without its adaptation is warned of once, `HarmfulAdaptation`, after four runs of 300 cycles on
     the problem's plant and on its own model. `warnings.simplefilter("ignore", fpirhc.HarmfulAdaptation)` spares these runs.
     """
@@ -128,18 +134,20 @@ class Stepper(Checked):
             refuse_unbounded(ready)
         ranges = plausible_range(problem, plausible)
         self._composite, self.memory = composed_step(settings, ready, ranges, max_age, monitor or RunMonitor(), bridged)
-        backend = native(self._composite.function, required=bool(live)) if compiled else None
+        self.function: ca.Function = self._composite.function
+        backend = native(self.function, required=bool(live)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
         self.signals: Layout = self._composite.trace
         self.measures = measures(problem, ready)  # names of the raw measurements
         self.why_failed = ""
         self._title = f"{problem.name}, {name_in_task(controller)}"
         self._may_fail = self._composite.opaque  # scalar code cannot fail
-        function = backend.function if backend else self._composite.function
+        function = backend.function if backend else self.function
         model = ready.plant_model(problem)
         parameters = model.parameters(model.plant)
         arguments = StepArguments(function, self._composite, problem, parameters, ages=max_age is not None)
         self._now = NumbersNow(settings, self._composite, arguments.settings, arguments.setpoints)
+        self.reads: Layout = self._composite.reads.starting_at(np.concatenate(arguments.evaluator.arguments[1:]))
         self.estimates, self.beside = arguments.estimates, arguments.beside
         self._tokens = [True]
         self._fingerprint = float(self.memory[FINGERPRINT].start[0])
@@ -283,6 +291,19 @@ class Stepper(Checked):
             InvalidShape: neither one number nor one per node.
         """
         return self._now.set_reference(setpoints)
+
+    @property
+    def settings(self) -> Layout:
+        """The live settings among `reads`, 'setting.PATH', and what follows from them, 'setting.derived.NAME'."""
+        return self._composite.settings
+
+    def bounds(self) -> dict[str, Interval]:
+        """Return for each live setting the interval of the numbers that a device without Python may accept, by path.
+
+        It is the interval around the number of the build in which the setting is accepted while the others stay, found by trials of
+        Python's own check, to a millionth of the number; a limit of an input ends at that of the build. An infinite end refuses nothing.
+        """
+        return ByName(self._now.bounds(), "Stepper.bounds()")
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -1,0 +1,126 @@
+"""The step as a CasADi Function: what a user's own loop and code generation from it do is what the stepper does, bit by bit."""
+
+from __future__ import annotations
+
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.symbolic.native import find_compiler
+
+CASES = {
+    "CTC+FPI": ("two_mass", "CTC+FPI (eq 6)", ["deformation.gain", "limits.inputs.Q1"]),
+    "RHC+FPI": ("two_mass", "RHC+FPI", ["deformation.gain", "cost.states.q1"]),
+    "outputs": ("anaesthesia", "CTC+FPI", []),
+    "map": ("fishery", "RHC+FPI", []),
+}
+CYCLES = 40
+
+
+@cache
+def case(name: str) -> tuple[fp.Stepper, np.ndarray]:
+    """A stepper, and rows of what it reads: a run's samples, with faults in some of them."""
+    of, controller, live = CASES[name]
+    task = fp.load_problem(of)
+    stepper = fp.Stepper(task.problem, task.controllers[controller], live=live, compiled=False)
+    run = fp.simulate(task.problem, task.controllers[controller], seed=0, compiled=False)
+    rows = np.tile(stepper.reads.start(), (CYCLES, 1))
+    for signal in stepper.reads.signals:
+        if signal.name in ("time", "state", "output", "realised", "measured"):
+            values = run.time if signal.name == "time" else run[signal.name]
+            rows[:, stepper.reads.slice(signal.name)] = np.reshape(values[:CYCLES], (CYCLES, -1))
+    first = stepper.reads.slice("time").stop
+    rows[10, first], rows[15, first], rows[20:22, first] = np.nan, np.inf, 1e9
+    return stepper, rows
+
+
+def stepped(stepper: fp.Stepper, row: np.ndarray, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The stepper's own cycle with one row of what it reads."""
+    measured = row[stepper.reads.slice("time").stop :][
+        : len(stepper.measures)
+    ]  # samples come first, in the order of `measures`
+    return stepper.step_measured(row[stepper.reads.slice("time")][0], measured, memory)
+
+
+def same(one: np.ndarray, other: np.ndarray) -> bool:
+    return np.array_equal(one, other, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_loop_of_ones_own_is_the_stepper_bit_by_bit(name):
+    """Command, memory and every signal, with faults; start values stand for parameters, settings and set-points."""
+    stepper, rows = case(name)
+    own = memory = stepper.start()
+    for k, row in enumerate(rows):
+        arguments = stepper.reads.unpack(row).values()
+        own, trace, command = (v.full().ravel() for v in stepper.function(own, *arguments))
+        expected, memory = stepped(stepper, row, memory)
+        assert same(command, expected), k
+        assert same(own, memory), k
+        assert same(trace, np.concatenate(list(stepper.trace().values()))), k
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("name", ["CTC+FPI", "outputs"])
+def test_code_generation_of_ones_own_gives_the_stepper_bit_by_bit(name, tmp_path: Path, monkeypatch):
+    """CasADi's own generator, a compiler, and flat arrays in the order of `reads`."""
+    stepper, rows = case(name)
+    monkeypatch.chdir(tmp_path)  # CasADi writes into the current folder alone
+    stepper.function.generate("step.c", {"with_header": False})
+    compiler = str(find_compiler())
+    flags = ("-shared", "-fPIC", "-O2", "-ffp-contract=off")
+    subprocess.run([compiler, *flags, "step.c", "-o", "step.so", "-lm"], check=True, capture_output=True)
+    function = ca.external(stepper.function.name(), str(tmp_path / "step.so"))
+    own = memory = stepper.start()
+    for k, row in enumerate(rows):
+        own, _, command = (v.full().ravel() for v in function(own, *stepper.reads.unpack(row).values()))
+        expected, memory = stepped(stepper, row, memory)
+        assert same(command, expected), k
+        assert same(own, memory), k
+
+
+def test_a_setting_written_as_an_argument_acts_as_a_change():
+    """'setting.PATH' is an argument of the Function; so is what Python computes from it, which a change computes anew."""
+    stepper, rows = case("RHC+FPI")
+    numbers = {"deformation.gain": -0.7, "cost.states.q1": 900.0}
+    assert {f"setting.{path}" for path in numbers} <= set(stepper.settings.names)
+    other = fp.Stepper(*_of("RHC+FPI"), live=list(numbers), compiled=False)
+    assert other.change(numbers)
+    row = rows[3].copy()
+    row[stepper.reads.slice("setting.deformation.gain")] = -0.7
+    row[stepper.reads.slice("setting.cost.states.q1")] = 900.0
+    derived = [s.name for s in stepper.settings.signals if ".derived." in s.name]
+    assert set(derived) == set(stepper.outdated())
+    for name in derived:
+        row[stepper.reads.slice(name)] = other._arguments.settings[name]
+    command = stepper.function(other.start(), *stepper.reads.unpack(row).values())[2]
+    assert same(command.full().ravel(), stepped(other, row, other.start())[0])
+
+
+def _of(name: str):
+    task = fp.load_problem(CASES[name][0])
+    return task.problem, task.controllers[CASES[name][1]]
+
+
+def test_bounds_are_where_the_check_begins_to_refuse():
+    """Every number inside is accepted, and one a little beyond an end is refused; limits of inputs end at those of the build."""
+    stepper = fp.Stepper(
+        *_of("CTC+FPI"), live=["deformation.gain", "tracking.rate", "limits.inputs.Q1"], compiled=False
+    )
+    bounds, build = stepper.bounds(), dict(stepper.numbers)
+    assert list(bounds) == ["deformation.gain", "tracking.rate", "limits.inputs.Q1.0", "limits.inputs.Q1.1"]
+    for path in ("deformation.gain", "tracking.rate"):
+        for end, away in zip(bounds[path], (-1, 1), strict=True):
+            size = max(abs(build[path]), abs(end)) if np.isfinite(end) else 1.0
+            assert stepper.change({path: end if np.isfinite(end) else away * 1e200})
+            assert np.isinf(end) or not stepper.change({path: end + away * 1e-5 * size}), (path, end)
+            assert stepper.change({path: build[path]})
+    assert bounds["limits.inputs.Q1.0"][0] == build["limits.inputs.Q1.0"]
+    assert bounds["limits.inputs.Q1.1"][1] == build["limits.inputs.Q1.1"]
+    assert bounds["limits.inputs.Q1.0"][1] == pytest.approx(build["limits.inputs.Q1.1"], rel=1e-4)
+    assert bounds["deformation.gain"][1] == pytest.approx(0.0, abs=1e-5)
