@@ -301,7 +301,8 @@ class Stepper(Checked):
         """Return for each live setting the interval of the numbers that a device without Python may accept, by path.
 
         It is the interval around the number of the build in which the setting is accepted while the others stay, found by trials of
-        Python's own check, to a millionth of the number; a limit of an input ends at that of the build. An infinite end refuses nothing.
+        Python's own check, to a millionth of the number. A limit of an input ends at that of the build; infinite ends refuse
+        nothing.
         """
         return ByName(self._now.bounds(), "Stepper.bounds()")
 
