@@ -11,7 +11,7 @@ from tempfile import mkdtemp
 import numpy as np
 
 import fpirhc.optimisers
-from fpirhc.symbolic.finite import FINITE
+from fpirhc.symbolic.driver import OF_TYPE
 from fpirhc.symbolic.native import find_compiler
 
 FOLDER = Path(fpirhc.optimisers.__file__).parent
@@ -37,11 +37,11 @@ def library(
     """
     signature = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
     stubs = [f"static int {n}{signature}" + (";" if n in written.split() else " { return 1; }") for n in _STAGES]
-    definitions = [f"#define {name} {value}" for name, value in {"FINITE": repr(FINITE), **dict(constants)}.items()]
+    definitions = [f"#define {name} {value}" for name, value in constants]
     parts = [(FOLDER / f"{name}.c").read_text(encoding="utf-8") for name in texts]
     folder = Path(mkdtemp())
     source, built = folder / "alone.c", folder / "alone.so"
-    source.write_text("\n".join([_BEFORE, *definitions, *stubs, *parts, own]), encoding="utf-8")
+    source.write_text("\n".join([_BEFORE, OF_TYPE, *definitions, *stubs, *parts, own]), encoding="utf-8")
     compiler = find_compiler()
     assert compiler is not None
     command = [compiler, "-shared", "-fPIC", "-O1", "-w", "-ffp-contract=off", str(source), "-o", str(built), "-lm"]

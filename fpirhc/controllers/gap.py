@@ -17,12 +17,12 @@ import casadi as ca
 
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.expression import FINITE, Signals, expression
 from fpirhc.symbolic.gap import GAP, LONG, SETTLING
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.problem import Problem
 
-AGAIN = 1e305  # time of a cycle that is given once more: no number that fits, and no cycle that is missing
+AGAIN = 100 * FINITE  # time of a cycle that is given once more: no number that fits, and no cycle that is missing
 BRIDGED = 50  # cycles: the longest gap that is bridged, where nobody states another
 MISSING = Signal(
     "missing_cycles", start=(-1.0,)

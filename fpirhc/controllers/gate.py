@@ -34,8 +34,8 @@ from fpirhc.controllers.gap import Gap
 from fpirhc.controllers.step_outcome import FAILED, counted, is_trial, outcome
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Derived, Values, call
-from fpirhc.symbolic.expression import Signals, expression, kind
-from fpirhc.symbolic.finite import FINITE, every_finite, finite
+from fpirhc.symbolic.expression import FINITE, Signals, expression, kind
+from fpirhc.symbolic.finite import every_finite, finite
 from fpirhc.symbolic.gap import GAPS
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.limits import Interval

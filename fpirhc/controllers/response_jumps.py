@@ -24,8 +24,7 @@ from fpirhc.controllers.reference_states import Scale, response_scale
 from fpirhc.controllers.sensing_chain import raw_signal
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.finite import FINITE
+from fpirhc.symbolic.expression import FINITE, Signals
 from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem

@@ -13,8 +13,8 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import Expression, expression
-from fpirhc.symbolic.finite import FINITE, every_finite, kept_if_finite
+from fpirhc.symbolic.expression import FINITE, Expression, expression
+from fpirhc.symbolic.finite import every_finite, kept_if_finite
 from fpirhc.symbolic.layout import Layout
 
 FAILED = "not_finite"  # in the memory: steps in a row that were not finite, of samples that fit

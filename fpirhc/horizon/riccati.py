@@ -13,7 +13,7 @@ import numpy as np
 
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.symbolic.expression import is_finite, kind
+from fpirhc.symbolic.expression import TINY, is_finite, kind
 from fpirhc.symbolic.live import Number
 
 _SCALAR_CODE = 1000  # multiplications of one stage up to which scalar code is faster than matrix calls
@@ -114,7 +114,7 @@ def solve_free(hessian: ca.SX, free: ca.SX, right: ca.SX) -> ca.SX:
     for j in range(n):
         known = sum((lower[j, k] ** 2 * pivots[k] for k in range(j)), start=ca.SX(0))
         pivot = free[j] * (hessian[j, j] - known) + (1 - free[j])
-        size = ca.fabs(hessian[j, j]) + 1e-300
+        size = ca.fabs(hessian[j, j]) + TINY
         pivots.append(ca.if_else(pivot > BOX_PIVOT * size, pivot, size))
         for i in range(j + 1, n):
             known = sum((lower[i, k] * lower[j, k] * pivots[k] for k in range(j)), start=ca.SX(0))

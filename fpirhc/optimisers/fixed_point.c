@@ -126,7 +126,7 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
 INLINE void factorise(In matrix, const int* free, Out lower, Out pivots) {
   int i, j, k;
   for (j = 0; j < NU; ++j) {
-    casadi_real size = fabs(matrix[j * NU + j]) + 1e-300, pivot = matrix[j * NU + j];
+    casadi_real size = fabs(matrix[j * NU + j]) + TINY, pivot = matrix[j * NU + j];
     for (k = 0; k < j; ++k) pivot -= lower[k * NU + j] * lower[k * NU + j] * pivots[k];
     if (!free[j]) pivot = 1;
     pivots[j] = pivot > PIVOT * size ? pivot : size;

@@ -6,6 +6,9 @@
 #define INLINE static inline
 #endif
 
+#ifdef PORTABLE
+#define WIDE 0
+#else /* PORTABLE */
 /* Whether the machine has wide registers; ALWAYS_WIDE is defined where that is known. */
 #if defined(ALWAYS_WIDE)
 #define WIDE 1
@@ -14,6 +17,7 @@
 #else
 #define WIDE 0
 #endif
+#endif /* PORTABLE */
 
 typedef const casadi_real* In;
 typedef casadi_real* Out;

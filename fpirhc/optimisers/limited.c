@@ -212,7 +212,7 @@ static int rewarmed(Machine* m) {
 
 static int passes(Machine* m, casadi_real theta, casadi_real phi) {
   int k, falls, descends;
-  casadi_real slack = 1e-12 * (COST + fabs(m->phi));
+  casadi_real slack = ROUNDING * (COST + fabs(m->phi));
   for (k = 0; k < m->filtered; ++k)
     if (theta > (1 - 1e-5) * m->filter[k][0] && phi > m->filter[k][1] - 1e-5 * m->filter[k][0] * COST) return 0;
   if (theta <= m->theta && phi <= m->phi + slack) return 1;
@@ -225,7 +225,7 @@ static int passes(Machine* m, casadi_real theta, casadi_real phi) {
 
 /* A descent must lower phi by a share of its slope, and by a share of the move itself: the exact Hessian may be nearly singular. */
 static int falls_enough(const Machine* m, casadi_real phi) {
-  return phi <= m->phi + 1e-4 * m->alpha * m->dphi + 1e-12 * (COST + fabs(m->phi));
+  return phi <= m->phi + 1e-4 * m->alpha * m->dphi + ROUNDING * (COST + fabs(m->phi));
 }
 
 static void trial_duals(const Machine* m, const Point* p, Duals* y) {

@@ -136,9 +136,9 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "BOUNDARY": BOUNDARY,
         "HAIR": HAIR,
         "PIVOT": PIVOT,
-        "FINITE": FINITE,
         "NEAR_LIMIT": FEASIBLE,
         "KEPT_SHARE": KEPT,
+        "ROUNDING": f"OF_TYPE({numbers.ROUNDING}, 1e-5)",
         "DAMPING": repr(float(settings.damping)),
         "TOLERANCE": repr(float(settings.tolerance)),
         "FEASIBLE": repr(float(settings.feasible)),
@@ -150,4 +150,5 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
 
 def _row(values: np.ndarray) -> str:
     """A C initialiser; infinities become numbers beyond every finite one."""
-    return "{" + ", ".join(repr(v) for v in np.clip(values, -10 * FINITE, 10 * FINITE).tolist()) + "}"
+    texts = (repr(v) if abs(v) <= FINITE else "-10 * FINITE" if v < 0 else "10 * FINITE" for v in values.tolist())
+    return "{" + ", ".join(texts) + "}"

@@ -32,6 +32,7 @@ from fpirhc.optimisers.limited_settings import (
     NEARLY,
     POOR,
     REFERENCE,
+    ROUNDING,
     LimitedSettings,
 )
 from fpirhc.symbolic.expression import FINITE
@@ -286,7 +287,7 @@ def _passes_filter(call: Call, s: State, theta: ca.MX, phi: ca.MX) -> tuple[ca.M
     Sources: R. Fletcher, S. Leyffer, Math. Program. 91, 2002; A. Waechter, L. T. Biegler, Math. Program. 106, 2006, section 2.3.
     """
     cost, old = call.scales.cost, s["filter"]
-    slack = 1e-12 * (cost + ca.fabs(s["phi"]))
+    slack = ROUNDING * (cost + ca.fabs(s["phi"]))
     used = ca.DM(np.arange(FILTER)) < s["filtered"]
     worse = ca.logic_and(theta > (1 - 1e-5) * old[:, 0], phi > old[:, 1] - 1e-5 * old[:, 0] * cost)
     dominated = ca.mmax(ca.logic_and(used, worse))
@@ -352,7 +353,7 @@ def box(call: Call, s: State) -> tuple[ca.MX, ca.MX]:
 
 def _falls_enough(s: State, phi: ca.MX, cost: float) -> ca.MX:
     """Whether psi falls by a share of its slope, and of the move itself: the exact Hessian may be nearly singular."""
-    return phi <= s["phi"] + 1e-4 * s["alpha"] * s["dphi"] + 1e-12 * (cost + ca.fabs(s["phi"]))
+    return phi <= s["phi"] + 1e-4 * s["alpha"] * s["dphi"] + ROUNDING * (cost + ca.fabs(s["phi"]))
 
 
 def priced(call: Call, s: State, p: Expansion) -> State:

@@ -22,6 +22,7 @@ FILTER = 64  # pairs that the filter holds
 POOR = 0.1  # share of a step from a remembered plan below which its barrier is raised, at most so often in a call
 MOST_REWARMS = 3
 MOST_RAISES = 12  # of the Levenberg-Marquardt term before another first plan is tried
+ROUNDING = 1e-12  # of the cost: smaller differences are rounding
 LEAST_DAMPING = 1e-7  # of the Levenberg-Marquardt term of descents, and of the fall that a plan of theirs must bring
 NEARLY, ABOVE = (
     1.1,

@@ -23,7 +23,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import is_finite
+from fpirhc.symbolic.expression import TINY, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _HISTORY = 5  # values that the non-monotone line search compares with
@@ -31,7 +31,6 @@ _DECREASE = 1e-4
 _SHORTER = 0.25  # factor of the step length after a rejected step
 _SHORTEST, _LONGEST = 1e-6, 1e6  # bounds of the spectral step length
 _FIRST = 0.25  # below 1, because inputs of neighbouring stages add up
-_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ def _choose(condition: ca.MX, yes: ca.MX, no: ca.MX) -> ca.MX:
 def _spectral_length(move: ca.MX, scale: ca.MX, change: ca.MX, before: ca.MX) -> ca.MX:
     """Barzilai-Borwein: <move, move / D> / <move, change>, kept where the curvature is not positive."""
     curvature, size = ca.dot(move, change), ca.dot(move, move / scale)
-    usable = ca.logic_and(curvature > _TINY, size > _TINY)
+    usable = ca.logic_and(curvature > TINY, size > TINY)
     length = size / ca.if_else(usable, curvature, 1)
     return ca.if_else(usable, ca.fmin(ca.fmax(length, _SHORTEST), _LONGEST), before)
 

@@ -15,7 +15,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import backward_sweep, in_reverse
 from fpirhc.horizon.stage_data import STEEPEST, settings_in
 from fpirhc.optimisers.base import clip
-from fpirhc.symbolic.expression import is_finite
+from fpirhc.symbolic.expression import FINITE, TINY, is_finite
 from fpirhc.symbolic.live import PREFIX, Number
 
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is required
@@ -24,8 +24,7 @@ SHORTER = 0.25  # factor of the step after a plan that did not decrease the enve
 DRAWN_IN = 0.01  # least factor of gamma after a plain step that was rejected
 SHORTEST = 0.05  # below it the plain fixed-point step is taken
 ROUNDING = 1e-13  # relative to the cost: smaller differences are rounding
-UNTRIED = 1e299  # a cost from which on an anchor counts as not evaluated
-_TINY = 1e-300
+UNTRIED = FINITE / 16  # a cost from which on an anchor counts as not evaluated
 
 
 class Arguments(NamedTuple):
@@ -248,7 +247,7 @@ def _accepted(
     promised = old.value + ca.dot(old.slope, old.plain - old.inputs)
     bounded = value <= promised + SHARE * reach + slack
     accepted = ca.logic_and(finite, ca.logic_or(untried, ca.if_else(bold, decreases, bounded)))
-    return accepted, (value - promised) / (SHARE * reach + _TINY)
+    return accepted, (value - promised) / (SHARE * reach + TINY)
 
 
 def _retreat(metric: _Metric, old: Anchor, finite: ca.MX, excess: ca.MX, flags: tuple[ca.MX, ca.MX]) -> Anchor:

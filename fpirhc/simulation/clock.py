@@ -23,8 +23,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.finite import FINITE
+from fpirhc.symbolic.expression import FINITE, Signals
 from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem

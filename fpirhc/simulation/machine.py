@@ -26,8 +26,7 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
 from fpirhc.symbolic.block import Block, Composite, compose
-from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.finite import FINITE
+from fpirhc.symbolic.expression import FINITE, Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.limits import Interval

@@ -26,14 +26,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.symbolic.expression import Expression, Matrix, Signals, Value, expression, kind
+from fpirhc.symbolic.expression import FINITE, Expression, Matrix, Signals, Value, expression, kind
 from fpirhc.symbolic.gap import GAPS
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX as SETTING
 
 Step = Callable[[Signals], Mapping[str, Value]]
 Values = Mapping[str, float]
-_NO_SAMPLE = 1e305  # beyond the finite numbers, and no NaN, which is the mark of a live setting that was lost
+_NO_SAMPLE = 10 * FINITE  # beyond the finite numbers, and no NaN, which is the mark of a live setting that was lost
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
 
 

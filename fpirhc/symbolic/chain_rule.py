@@ -26,6 +26,9 @@ _Edges = list[dict[int, ca.SX]]  # for every result, its partial derivatives by 
 _WIDE = 4  # numbers of a wide register
 # The lines are many. Apart from the loops around them they are compiled several times as fast, and less optimising is enough.
 _TEXT = """
+#ifdef PORTABLE
+#define APART
+#else /* PORTABLE */
 #if defined(__GNUC__) && !defined(__clang__)
 #define APART __attribute__((noinline, optimize("O2", "tree-vectorize")))
 #elif defined(__GNUC__)
@@ -33,6 +36,7 @@ _TEXT = """
 #else
 #define APART
 #endif
+#endif /* PORTABLE */
 
 INLINE int {name}_lines(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
   casadi_real e[{count}], t[{rows}][{width}];
@@ -50,6 +54,10 @@ INLINE int {name}_lines(const casadi_real** arg, casadi_real** res, casadi_int* 
   return 0;
 }}
 
+#ifdef PORTABLE
+#define {name}_wide {name}_lines
+#define {name}_plain {name}_lines
+#else /* PORTABLE */
 #ifdef ALWAYS_WIDE
 #define {name}_plain {name}_wide
 #else
@@ -66,6 +74,7 @@ static int {name}_wide(const casadi_real** arg, casadi_real** res, casadi_int* i
 #else
 #define {name}_wide {name}_plain
 #endif
+#endif /* PORTABLE */
 
 INLINE int {name}(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {{
   (void)mem;

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from fpirhc.symbolic.expression import FINITE, TINY
 from fpirhc.symbolic.latest import Latest
 
 SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
@@ -24,6 +25,13 @@ _CALL = re.compile(r"\bcasadi_f\d+\b")
 _FAST = """#if defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize ("O3", "no-ipa-ra")
 #endif"""
+# Constants of the type that computes: a float is not a double with fewer digits. Compilers fold them.
+OF_TYPE = """#include <float.h>
+#define OF_TYPE(of_double, of_float) ((casadi_real)(sizeof(casadi_real) == sizeof(float) ? (of_float) : (of_double)))
+#define FINITE (OF_TYPE(DBL_MAX, FLT_MAX) / 134217728)
+#define TINY (OF_TYPE(DBL_MIN, FLT_MIN) * 67108864)
+"""
+_LARGE_OR_SMALL = re.compile(r"(?<![\w.])\d\.\d{16}e[+-](?:[3-9]\d|\d{3})\b")
 _drivers: dict[str, str] = {}
 _LATEST: Latest[ca.Function] = Latest(16)
 _BODY = re.compile(
@@ -65,7 +73,7 @@ class Driver:
         ]
         # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
         generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
-        return "\n".join([generated, *lines, _FAST, self.text])
+        return "\n".join([of_type(generated), *lines, _FAST, self.text])
 
 
 def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
@@ -74,6 +82,20 @@ def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) 
     unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     _drivers[unique] = source
     return _LATEST.of((), (unique,), lambda: build(unique))
+
+
+def of_type(source: str) -> str:
+    """Return generated C in which multiples of `FINITE` and `TINY` are written as such, so that they are those of its type."""
+    return OF_TYPE + _LARGE_OR_SMALL.sub(_multiple, source)
+
+
+def _multiple(number: re.Match[str]) -> str:
+    value = float(number[0])
+    for name, unit in (("FINITE", FINITE), ("TINY", TINY)):
+        share = value / unit
+        if 2**-10 <= share <= 2**10 and share * unit == value:
+            return f"({share!r} * {name})"
+    return number[0]
 
 
 def substitute(source: str) -> tuple[str, list[str]]:

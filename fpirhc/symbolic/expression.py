@@ -9,6 +9,7 @@ optimisers) is typed as MX. This module is the only place where one kind passes 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias, TypeVar, cast
 
@@ -21,7 +22,10 @@ Expression: TypeAlias = ca.SX  # a CasADi SX, MX or DM
 Value: TypeAlias = ca.SX | ca.DM | float  # a result of a step: numbers become expressions
 Matrix = TypeVar("Matrix", ca.SX, ca.MX, ca.DM)  # for functions whose result is of the same kind as their argument
 
-FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity, in a form that CasADi does not simplify away
+# Numbers of the type that computes. In C they are those of its own type: see `driver.OF_TYPE`.
+# |v| <= FINITE is false for NaN and infinity, in a form that CasADi does not simplify away.
+FINITE = sys.float_info.max / 2**27  # 1.3e300
+TINY = sys.float_info.min * 2**26  # 1.5e-300; added to what may be zero
 
 
 class Signals:

@@ -8,23 +8,22 @@ which compilers vectorise:
 
 from __future__ import annotations
 
-import sys
 from functools import cache
 
 import casadi as ca
 
 from fpirhc.symbolic.driver import SIGNATURE, Driver, with_driver
-from fpirhc.symbolic.expression import Expression, graph
+from fpirhc.symbolic.expression import FINITE, Expression, graph
 
-FINITE = sys.float_info.max / 2**27  # 1.3e300; |v| <= FINITE is false for NaN and infinity
 _TEXT = f"""
 int ENTRY{SIGNATURE} {{
-  double sums[8] = {{0, 0, 0, 0, 0, 0, 0, 0}}, total = 0;
-  const double* x = arg[0];
+  casadi_real sums[8] = {{0, 0, 0, 0, 0, 0, 0, 0}}, total = 0;
+  const casadi_real large = 134217728;
+  const casadi_real* x = arg[0];
   int k = 0, j;
   for (; k + 8 <= SIZE; k += 8)
-    for (j = 0; j < 8; ++j) sums[j] += x[k + j] * 134217728. - x[k + j] * 134217728.;
-  for (; k < SIZE; ++k) total += x[k] * 134217728. - x[k] * 134217728.;
+    for (j = 0; j < 8; ++j) sums[j] += x[k + j] * large - x[k + j] * large;
+  for (; k < SIZE; ++k) total += x[k] * large - x[k] * large;
   for (j = 0; j < 8; ++j) total += sums[j];
   if (res[0]) res[0][0] = total == 0;
   return 0;
@@ -33,13 +32,14 @@ int ENTRY{SIGNATURE} {{
 
 _KEPT = f"""
 int ENTRY{SIGNATURE} {{
-  double sums[8] = {{0, 0, 0, 0, 0, 0, 0, 0}}, total = 0;
-  const double *x = arg[0], *old = arg[1];
-  double* kept = res[0];
+  casadi_real sums[8] = {{0, 0, 0, 0, 0, 0, 0, 0}}, total = 0;
+  const casadi_real large = 134217728;
+  const casadi_real *x = arg[0], *old = arg[1];
+  casadi_real* kept = res[0];
   int k = 0, j;
   for (; k + 8 <= SIZE; k += 8)
-    for (j = 0; j < 8; ++j) {{ kept[k + j] = x[k + j]; sums[j] += x[k + j] * 134217728. - x[k + j] * 134217728.; }}
-  for (; k < SIZE; ++k) {{ kept[k] = x[k]; total += x[k] * 134217728. - x[k] * 134217728.; }}
+    for (j = 0; j < 8; ++j) {{ kept[k + j] = x[k + j]; sums[j] += x[k + j] * large - x[k + j] * large; }}
+  for (; k < SIZE; ++k) {{ kept[k] = x[k]; total += x[k] * large - x[k] * large; }}
   for (j = 0; j < 8; ++j) total += sums[j];
   if (res[1]) res[1][0] = total == 0;
   if (!(total == 0 && arg[2][0]))

@@ -31,7 +31,7 @@ from pathlib import Path
 import casadi as ca
 
 from fpirhc.errors import CompileError, NotSupported
-from fpirhc.symbolic.driver import substitute, with_less_work
+from fpirhc.symbolic.driver import of_type, substitute, with_less_work
 from fpirhc.symbolic.private_folder import BUILDING, own_name, private_folder, read_own
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
@@ -120,7 +120,7 @@ def generate(function: ca.Function) -> tuple[str, ...]:
     except RuntimeError as error:
         raise NotSupported(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
     _check_self_contained(source)
-    source, drivers = substitute(source)
+    source, drivers = substitute(of_type(source))
     if drivers:
         # Of Functions with the same name the largest counts.
         ordered = sorted(wrapped.find_functions(), key=lambda f: f.sz_w())

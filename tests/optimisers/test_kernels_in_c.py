@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from c_alone import call, columns, defined, library
 
-from fpirhc.symbolic.finite import FINITE
+from fpirhc.symbolic.expression import FINITE
 from fpirhc.symbolic.native import find_compiler
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import pickle
+import re
 import stat
+import subprocess
 import time
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 
+import fpirhc as fp
 from fpirhc.symbolic import native as module
 from fpirhc.symbolic import private_folder
 from fpirhc.symbolic.driver import SIGNATURE, Driver, with_driver
 from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.finite import finite
 from fpirhc.symbolic.native import find_compiler, native
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
@@ -383,3 +390,61 @@ def test_what_killed_processes_left_behind_is_removed(cache):
         os.utime(cache / name, (then, then))
     module.cache_folder()
     assert sorted(p.name for p in cache.iterdir()) == ["building-new", "mine"]
+
+
+# Constants of the type that computes
+
+
+@pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC+FPI", "limits"])
+def test_generated_code_has_no_number_that_a_float_cannot_hold(name):
+    """1e300 is infinite in float, and then |v| <= 1e300 holds for an infinite v."""
+    task = fp.load_problem("two_mass")
+    problem, controller = task.problem, task.controllers["RHC+FPI" if name == "limits" else name]
+    if name == "limits":
+        problem = replace(problem, limits=replace(problem.limits, states={"q1": (1.85, 2.35)}))
+    single = np.finfo(np.float32)
+    for text in module.generate(fp.Stepper(problem, controller, compiled=False).function):
+        numbers = re.findall(r"(?<![\w.])\d+\.?\d*(?:e[+-]?\d+)?", re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL))
+        assert "FINITE" in text
+        assert not [n for n in numbers if float(n) and not single.tiny <= float(n) <= single.max]
+
+
+@needs_compiler
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_a_column_is_finite_in_either_type(real, tmp_path):
+    """The passes over a column in C read numbers of the type that they are compiled for; one bad entry is found at every place."""
+    size = 19
+    column = ca.MX.sym("x", size)
+    function = ca.Function("fpirhc_fine", [column], [graph(finite(expression(column), opaque=True))])
+    texts = [tmp_path / f"{k}.c" for k in range(2)]
+    for path, text in zip(texts, module.generate(function), strict=True):
+        path.write_text(text)
+    built = str(tmp_path / "fine.so")
+    command = [
+        str(find_compiler()),
+        "-shared",
+        "-fPIC",
+        "-O2",
+        f"-Dcasadi_real={real}",
+        *map(str, texts),
+        "-o",
+        built,
+        "-lm",
+    ]
+    subprocess.run(command, check=True)
+    kind = np.dtype({"double": np.float64, "float": np.float32}[real])
+    called = ctypes.CDLL(built).fpirhc_native
+
+    def fine(values: np.ndarray) -> float:
+        row, answer, work = values.astype(kind), np.zeros(1, kind), np.zeros(64, kind)
+        arguments, results = ((ctypes.c_void_p * 8)(one.ctypes.data) for one in (row, answer))
+        assert called(arguments, results, None, ctypes.c_void_p(work.ctypes.data), 0) == 0
+        return float(answer[0])
+
+    good = np.array([(-1.0) ** k for k in range(size)]) * float(np.finfo(kind.type).max) / 2**28
+    assert fine(good) == 1
+    for k in range(size):
+        for bad in (np.nan, np.inf, -np.inf):
+            values = good.copy()
+            values[k] = bad
+            assert fine(values) == 0, (k, bad)

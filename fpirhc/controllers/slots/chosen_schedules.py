@@ -24,14 +24,14 @@ from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.horizon.nominal import reference_state
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import FINITE, Signals
 from fpirhc.symbolic.following import following
 from fpirhc.symbolic.functions import rounded
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
-_NEVER = -1e300  # score of a slot that may not be chosen
+_NEVER = -FINITE  # score of a slot that may not be chosen
 Scores = Callable[[Signals], list[Expression]]
 
 
