@@ -15,7 +15,7 @@ import fpirhc as fp
 task = fp.load_problem("hodgkin_huxley")
 runs = {
     name: fp.simulate(task.problem, task.controllers[name], seed=0)
-    for name in ("CTC", "RHC", "RHC+FPI")
+    for name in ("CTC", "RHC", "RHC+FPI, model-referenced")
 }
 for name, run in runs.items():
     print(name, f"{fp.measure(task.problem, run).rms_error['V']:.3g} mV")
@@ -33,7 +33,7 @@ portrait.draw(plt.figure(figsize=(8, 3), layout="constrained"), runs)
 # is the one that is furthest off.
 
 silent = fp.load_problem("hodgkin_huxley_silent")
-for name in ("CTC", "RHC", "RHC+FPI", "RHC exact model"):
+for name in ("CTC", "RHC", "RHC+FPI, model-referenced", "RHC exact model"):
     run = fp.simulate(silent.problem, silent.controllers[name], seed=0)
     error = fp.measure(silent.problem, run).rms_error["V"]
-    print(f"{name:16s} {error:.2g} mV, highest {run['state.V'].max():.1f} mV")
+    print(f"{name:25s} {error:.2g} mV, highest {run['state.V'].max():.1f} mV")

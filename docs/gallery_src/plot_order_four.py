@@ -24,8 +24,9 @@ def rms(problem, controller):
     return 1e3 * fp.measure(problem, run).rms_error["q"]
 
 
-for name in ("CTC", "CTC+FPI", "RHC", "RHC+FPI", "RHC offset-free"):
-    print(f"{name:16s} {rms(problem, controllers[name]):.3g} mm")
+names = ("CTC", "CTC+FPI", "RHC", "RHC+FPI, model-referenced", "RHC+FPI")
+for name in (*names, "RHC offset-free"):
+    print(f"{name:25s} {rms(problem, controllers[name]):.3g} mm")
 
 # %%
 # The limit is a = 2/3. Eq. (3) with K_c = 1e6 reaches it with A_c = 6.7e-7. Below it

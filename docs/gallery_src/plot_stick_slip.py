@@ -16,11 +16,11 @@ task = fp.load_problem("stick_slip")
 problem, controllers = task.problem, task.controllers
 runs = {
     name: fp.simulate(problem, controllers[name], seed=0)
-    for name in ("RHC", "RHC+FPI", "RHC exact model")
+    for name in ("RHC", "RHC+FPI, model-referenced", "RHC exact model")
 }
 for name, run in runs.items():
     error = fp.measure(problem, run).rms_error["x"]
-    print(f"{name:16s} {1e3 * error:.3g} mm")
+    print(f"{name:25s} {1e3 * error:.3g} mm")
 
 # %%
 # At each reversal the bristles bend the other way before they slip: friction lags

@@ -7,11 +7,12 @@ The patient and the model are those of `anaesthesia`. A stimulation adds to the 
 
 Errors count from 5 min on:
 
-    rms error, seed 0    bis [1]
-    RHC                     0.65
-    RHC+FPI               0.0094
-    RHC offset-free        0.011
-    RHC exact model         0.31
+    rms error, seed 0          bis [1]
+    RHC                           0.65
+    RHC+FPI, model-referenced   0.0092
+    RHC+FPI                     0.0094
+    RHC offset-free              0.011
+    RHC exact model               0.31
 
 The exact model does not know the stimulation, so it is no bound here: its plan holds the distance of the bis over the
 horizon, and the distance moves. The offset-free horizon has the information and the rate of the deformation: a filter of
@@ -44,8 +45,9 @@ estimator = fp.DisturbanceKalman(
 )
 controllers = {
     "RHC": calm.controllers["RHC"],
+    "RHC+FPI, model-referenced": calm.controllers["RHC+FPI, model-referenced"],
     "RHC+FPI": calm.controllers["RHC+FPI"],
     "RHC offset-free": fp.Estimating(calm.controllers["RHC"], estimator),
     "RHC exact model": calm.controllers["RHC exact model"],
 }
-headline = ("RHC", "RHC+FPI")
+headline = ("RHC", "RHC+FPI, model-referenced")

@@ -3,13 +3,14 @@
 Task: V stays at rest, -65 mV, while 10 uA/cm^2 flow from 10 ms on, which no controller measures; without control the cell
 fires 68 times a second. The error of V counts from 20 ms on. The largest current is 11 uA/cm^2, little more than is needed.
 
-    rms error, seed 0     V [mV]
-    CTC                    0.011
-    CTC+FPI              1.6e-06
-    RHC                     0.58
-    RHC+FPI              1.1e-08
-    RHC offset-free      1.2e-06
-    RHC exact model         0.97
+    rms error, seed 0           V [mV]
+    CTC                          0.011
+    CTC+FPI                    1.6e-06
+    RHC                           0.58
+    RHC+FPI, model-referenced  1.1e-08
+    RHC+FPI                    1.1e-08
+    RHC offset-free            1.2e-06
+    RHC exact model               0.97
 
 Adaptation is not needed to silence the cell: an integral is enough (CTC). The exact model is the worst: it has everything
 but the current. The unit of time is the millisecond.
