@@ -216,7 +216,8 @@ class Variant:
         if self.nudge:
             start = {name: value * (1 + self.nudge) for name, value in problem.start.items()}
             elsewhere = replace(problem, start=start)
-            return elsewhere if problem.foreign else with_exact(elsewhere, problem.real_plant.exact * (1 + self.nudge))
+            exact = np.array([one.exact for one in problem.moved.parameters.values()])
+            return with_exact(elsewhere, exact * (1 + self.nudge)) if exact.size else elsewhere
         if self.finer > 1:
             finer = problem.real_integrator.finer(self.finer) or problem.real_integrator
             if problem.symbolic_reality is not None:

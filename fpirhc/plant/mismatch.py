@@ -10,12 +10,22 @@ covers the whole range, and the values between it and the approximate parameter.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Protocol
 
 from fpirhc.errors import InvalidValue, Mistakes
-from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.plant.plant import Parameter
 
 
-def exact_ranges(plant: Plant, mismatch: float) -> dict[str, tuple[float, float]]:
+class Parametric(Protocol):
+    """What has exact parameters: a plant, or a body outside."""
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """By name."""
+
+
+def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, float]]:
     """Return the least and the largest value of every exact parameter.
 
     Args:
@@ -40,7 +50,7 @@ def exact_ranges(plant: Plant, mismatch: float) -> dict[str, tuple[float, float]
     return ranges
 
 
-def check_mismatch(plant: Plant, mismatch: float) -> None:
+def check_mismatch(plant: Parametric, mismatch: float) -> None:
     """Raise if no range belongs to this mismatch.
 
     Raises:

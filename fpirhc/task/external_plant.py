@@ -3,6 +3,8 @@
     measurements = body.reset(seed)                    at the start
     measurements = body.step(time, command)            in every cycle: apply the command for one period, then measure
 
+`ExternalPlant(make=...)` makes the body anew for every run, with values of its parameters, which studies draw.
+
 The measurements are quantities of the model, in the order that `ExternalPlant(measures=...)` says. A bad answer - an exception,
 another shape, a number that is not finite, an answer after the deadline - is held or ends the run. Nothing before it is lost.
 """
@@ -13,17 +15,18 @@ import queue
 import threading
 import time as wall
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Positive, finite_number
-from fpirhc.plant.plant import Plant
+from fpirhc.plant.parameter import check_parameters, with_exact_values
+from fpirhc.plant.plant import Parameter, Plant
 
 _LONGEST = 60  # characters of an answer that are shown
 
@@ -36,6 +39,10 @@ class Body(Protocol):
 
     def step(self, time: float, command: np.ndarray) -> npt.ArrayLike:
         """Hold the command from `time` on for one period, and return the measurements at its end."""
+
+
+Make = Callable[[Mapping[str, float], int], Body]
+"""Function (values of the parameters by name, seed) -> body."""
 
 
 @dataclass(frozen=True)
@@ -56,34 +63,52 @@ class ExternalPlant(Checked):
     """A reality outside: `Problem(reality=ExternalPlant(body, measures=...))`.
 
     Args:
-        body: object with `reset(seed)` and `step(time, command)`, see `Body`.
+        body: object with `reset(seed)` and `step(time, command)`, see `Body`; None: `make` makes it.
         measures: name -> unit of every measured quantity, in the order of its answers: elements of the model's state ("q1", "q1'"),
             outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled ("q1''").
         holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
-        deadline: longest wall time of an answer, s; a later one is bad. With a deadline the body is called by a thread of its own:
-            where it does not return, it is given up, and called again when it has returned. None: it may take its time, as a
+        deadline: longest wall time of a step's answer, s; a later one is bad. With a deadline the body is called by a thread of its
+            own: where it does not return, it is given up, and called again when it has returned. None: it may take its time, as a
             simulator does.
+        reset_deadline: longest wall time of making and resetting the body, s, where there is a deadline.
         clock: function that returns the wall time, s.
         dead_time: by input, in the model's unit of time: how late the body acts. Controllers and reviews know it as that of the
             problem; the body has it already, so it is not simulated.
+        make: function (parameters, seed) -> body, called before every reset with the exact values of `parameters` by name.
+        parameters: of the body. Scenarios draw their exact values as those of a plant; a controller knows none of them.
 
     Raises:
         InvalidField: all wrong arguments together. `Problem` checks the quantities against the model and its sensing.
     """
 
-    body: Body
-    measures: Mapping[str, str]
+    body: Body | None = None
+    measures: Mapping[str, str] = field(default_factory=dict)
     holds: CountOrZero = 0
     deadline: Positive | None = None
+    reset_deadline: Positive = 10.0
     clock: Callable[[], float] = field(default=wall.perf_counter, metadata={"setting": False})
     dead_time: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
 
+    make: Make | None = field(default=None, metadata={"setting": False})
+    parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
+
     def __post_init__(self) -> None:
-        for name in ("reset", "step"):
-            if not callable(getattr(self.body, name, None)):
-                raise InvalidValue(
-                    f"ExternalPlant: its body {type(self.body).__name__} has no method {name}(...); it needs reset and step"
-                )
+        if (self.body is None) == (self.make is None):
+            raise InvalidValue("ExternalPlant: expected either a body or make=lambda parameters, seed: body")
+        if self.parameters and self.make is None:
+            raise InvalidValue(
+                "ExternalPlant: a body that stands cannot take parameters; write make=lambda parameters, seed: body"
+            )
+        mistakes = Mistakes("ExternalPlant")
+        check_parameters(self.parameters, mistakes)
+        mistakes.raise_if_any()
+        if self.body is not None:
+            _check_body(self.body)
+
+    @property
+    def name(self) -> str:
+        """What messages and tables call the body."""
+        return type(self._present[0]).__name__ if self._present else "the body that make returns"
 
     @property
     def remedy(self) -> str:
@@ -100,6 +125,20 @@ class ExternalPlant(Checked):
     def foreign(self) -> ExternalPlant:
         """Itself."""
         return self
+
+    def with_exact(self, exact: np.ndarray) -> ExternalPlant:
+        """Return it with other exact parameters, shape (number of parameters,).
+
+        Raises:
+            InvalidProblem: a value that is not finite or outside its bounds.
+            NotSupported: it has no parameters.
+        """
+        if not self.parameters:
+            raise NotSupported(
+                "the external plant has no exact parameters that a study could draw; state them, "
+                "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare without scenarios"
+            )
+        return replace(self, parameters=with_exact_values(self.parameters, exact))
 
     def check(self, model: Plant, needed: tuple[str, ...]) -> None:
         """Raise if it does not measure what the model's sensing needs.
@@ -131,14 +170,27 @@ class ExternalPlant(Checked):
         Raises:
             InvalidProblem: a bad answer.
         """
-        reading = self._answer(lambda: self.body.reset(seed), "reset", None)
+        reading = self._answer(lambda: self._begun(seed).reset(seed), "reset", self.reset_deadline)
         if reading.values is None:
             raise InvalidProblem(f"reality: {reading.mistake}")
         return reading.values
 
     def read(self, time: float, command: np.ndarray) -> Reading:
         """Return the answer to a command; with a deadline it is waited for no longer."""
-        return self._answer(lambda: self.body.step(time, command), "step", self.deadline)
+        return self._answer(lambda: self._present[0].step(time, command), "step", self.deadline)
+
+    def _begun(self, seed: int) -> Body:
+        """The body of the run that begins."""
+        if self.make is not None:
+            body = self.make({name: one.exact for name, one in self.parameters.items()}, seed)
+            _check_body(body)
+            self._present[:] = [body]
+        return self._present[0]
+
+    @cached_property
+    def _present(self) -> list[Body]:
+        """The body of the present run."""
+        return [] if self.body is None else [self.body]
 
     @cached_property
     def _caller(self) -> _Caller:
@@ -147,17 +199,18 @@ class ExternalPlant(Checked):
 
     def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, deadline: float | None) -> Reading:
         if self.deadline is None:
-            return self._judged(ask, method, deadline)
-        who = f"{method} of {type(self.body).__name__}"
+            return self._judged(ask, method, None)
+        who = f"{method} of {self.name}"
         try:
             return self._caller.call(lambda: self._judged(ask, method, deadline), deadline, free_within=self.deadline)
         except _GaveUp as end:
             what = "did not return" if end.begun else "was not called, because its last call has not returned"
-            return Reading(None, f"{who} {what} within {self.deadline:.3g} s, its deadline; it was given up")
+            patience = deadline if end.begun else self.deadline
+            return Reading(None, f"{who} {what} within {patience:.3g} s, its deadline; it was given up")
 
     def _judged(self, ask: Callable[[], npt.ArrayLike], method: str, deadline: float | None) -> Reading:
         """The answer of a stranger's object, of which every part may raise: its numbers, its length, its words, its errors."""
-        who, begin = f"{method} of {type(self.body).__name__}", self._now()
+        who, begin = f"{method} of {self.name}", self._now()
         try:
             returned = ask()
         except KeyboardInterrupt:
@@ -190,6 +243,14 @@ class ExternalPlant(Checked):
                 f"ExternalPlant(clock=...): it returned {_short(time)}, expected the wall time as a number, in s"
             )
         return float(time)
+
+
+def _check_body(body: object) -> None:
+    for name in ("reset", "step"):
+        if not callable(getattr(body, name, None)):
+            raise InvalidValue(
+                f"ExternalPlant: its body {type(body).__name__} has no method {name}(...); it needs reset and step"
+            )
 
 
 def _real_numbers(answer: object) -> np.ndarray | None:

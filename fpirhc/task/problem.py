@@ -203,6 +203,11 @@ class Problem(Checked):
         """The plant that a run moves, with its exact parameters: the reality's, or the model's own."""
         return self.truth.plant
 
+    @property
+    def moved(self) -> Plant | ExternalPlant:
+        """What a run moves, and whose exact parameters studies draw."""
+        return self.foreign or self.real_plant
+
     @cached_property
     def disturbed_outputs(self) -> Mapping[str, int]:
         """Relative orders of the disturbed outputs by name; a name of a coordinate of the moving plant is none."""
@@ -522,7 +527,7 @@ def _other_rows(problem: Problem) -> list[tuple[str, str]]:
     if problem.symbolic_reality is not None:
         rows.append(("reality", "; ".join(plant_facts(problem.real_plant))))
     if problem.foreign is not None:
-        rows.append(("reality", f"{type(problem.foreign.body).__name__}, outside"))
+        rows.append(("reality", f"{problem.foreign.name}, outside"))
     if not problem.sensing.ideal:
         rows.append(("sensing", "with sensors or an estimator"))
     believed = problem.sensing.believed(problem.plant)

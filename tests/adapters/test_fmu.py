@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -69,16 +71,16 @@ def test_the_unit_moves_as_the_same_equation_does(unit):
 
 
 def test_a_parameter_is_set_and_a_run_begins_anew(unit):
-    outside = fmu_body(
+    body: Any = fmu_body(
         unit, TANK, period=0.05, measures={"h": "level"}, inputs={"q": "inflow"}, parameters={"outlet": 0.8}
-    )
+    ).body
     answers = []
     for _ in range(2):
-        outside.body.reset(0)
-        answers.append(outside.body.step(0.0, np.array([0.8])))
+        body.reset(0)
+        answers.append(body.step(0.0, np.array([0.8])))
     assert answers == [pytest.approx([1.0]), pytest.approx([1.0])]
-    outside.body.reset(0)
-    assert float(np.ravel(outside.body.step(0.0, np.array([0.5])))[0]) < 0.99
+    body.reset(0)
+    assert float(np.ravel(body.step(0.0, np.array([0.5])))[0]) < 0.99
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,8 @@ def test_names_may_differ():
         "joints": {"a": "shoulder", "b": "elbow"},
         "actuators": {"a_torque": "M1", "b_torque": "M2"},
     }
-    one, other = mujoco_body(REAL, turned, period=PERIOD, **names).body, mujoco_body(REAL, MODEL, period=PERIOD).body
+    one: Any = mujoco_body(REAL, turned, period=PERIOD, **names).body
+    other: Any = mujoco_body(REAL, MODEL, period=PERIOD).body
     assert np.array_equal(one.reset(0), other.reset(0))
     assert np.array_equal(one.step(0.0, np.array([3.0, 1.0])), other.step(0.0, np.array([3.0, 1.0])))
 

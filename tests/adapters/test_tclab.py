@@ -48,7 +48,8 @@ def problem(reality: fp.ExternalPlant) -> fp.Problem:
 
 
 def test_the_twin_is_the_packages_own_model():
-    body, same = tclab_body(LAB, period=PERIOD).body, tclab.tclab.TCLabModel(synced=False)
+    body: Any = tclab_body(LAB, period=PERIOD).body
+    same = tclab.tclab.TCLabModel(synced=False)
     same.tstart = same.tlast = 0.0
     body.reset(0)
     for k in range(50):

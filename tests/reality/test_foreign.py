@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from unittest.mock import DEFAULT, Mock
 
@@ -14,6 +15,7 @@ from test_reality import CONTROLLERS, PAIRS, SENSING, TAU, lagged, run, task
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.foreign_run import Patch, run_foreign
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.simulate import simulator
@@ -250,6 +252,26 @@ def test_a_body_that_blocks_is_given_up():
     )
 
 
+class Reluctant(Blocking):
+    """The same, and its reset waits until it is released."""
+
+    def reset(self, seed):
+        """The start, which may never come."""
+        self.released.wait()
+        return super().reset(seed)
+
+
+def test_a_body_whose_reset_blocks_is_given_up():
+    """A start may take longer than a step, and not for ever."""
+    body = Reluctant(task())
+    with pytest.raises(
+        InvalidProblem,
+        match=re.escape("reset of Reluctant did not return within 0.02 s, its deadline; it was given up"),
+    ):
+        run(task(reality=fp.ExternalPlant(body, MEASURES, deadline=1.0, reset_deadline=0.02)))
+    body.released.set()
+
+
 def test_a_body_that_blocks_is_not_called_before_it_has_returned():
     """Two calls at the same time would be two masters of one device: answers are held meanwhile, and a new run waits."""
     problem = task(duration=0.2)
@@ -367,6 +389,84 @@ def test_nothing_is_drawn_and_no_model_is_exact():
         with_exact(problem, np.array([1.0]))
     with pytest.raises(NotSupported, match="no equations"):
         run(problem, fp.ExactModel(CONTROLLERS["computed torque"]))
+
+
+# A body that is made from parameters
+
+
+class Driven(Wrapped):
+    """The linear plant with a gain of its own."""
+
+    def __init__(self, problem, gain) -> None:
+        super().__init__(problem)
+        self.gain = gain
+
+    def _rate(self, x, u):
+        return np.array([x[1], self.gain * u[0]])
+
+
+GAIN = {"b": fp.Parameter(approximate=1.0, exact=2.0, unit="1/kg", bounds=(0.1, 10.0))}
+
+
+def made(problem: fp.Problem, seeds: list[int] | None = None, **settings) -> fp.Problem:
+    """The problem with a body that is made for every run."""
+
+    def make(parameters, seed):
+        if seeds is not None:
+            seeds.append(seed)
+        return Driven(problem, parameters["b"])
+
+    return replace(problem, reality=fp.ExternalPlant(make=make, parameters=GAIN, measures=MEASURES, **settings))
+
+
+def test_scenarios_around_a_made_body_are_those_of_the_plant_itself(tmp_path):
+    """The same draws, the same mismatch, the same errors and the same pairs as where the equations are known."""
+    inside = task(duration=0.1)
+    loops = {"plain": CONTROLLERS["computed torque"], "adapted": CONTROLLERS["plain form"]}
+    studies = []
+    for name, problem in {
+        "inside": replace(inside, plant=replace(inside.plant, parameters=GAIN)),
+        "made": made(inside),
+    }.items():
+        whole = Task("gain", Path(__file__), "", "", problem, loops)
+        settings: dict[str, Any] = {"count": 6, "percent": 40.0, "seed": 2, "compiled": False}
+        studies.append(fp.compare_scenarios(whole, folder=tmp_path / name, **settings))
+    for name in loops:
+        one, other = (study[name] for study in studies)
+        assert np.array_equal(other.mismatch, one.mismatch)
+        assert other.errors == pytest.approx(one.errors, rel=1e-9)
+        assert len(set(other.errors)) == 6
+        assert (other.better, other.outcomes) == (one.better, one.outcomes)
+
+
+def test_a_made_body_is_new_in_every_run_and_has_its_seed():
+    """The function is called once per run, with the seed of the run and the exact values."""
+    seeds: list[int] = []
+    problem = made(task(), seeds)
+    first = run(problem)
+    weaker = run(with_exact(problem, np.array([1.0])))
+    assert seeds == [0, 0]
+    assert np.array_equal(first["plant_state"], run(outside(task()))["plant_state"])
+    assert not np.array_equal(first["plant_state"], weaker["plant_state"])
+
+
+def test_wrong_ways_to_make_a_body_are_named():
+    """What, where and how it is mended."""
+    body, law = Wrapped(task()), CONTROLLERS["computed torque"]
+    number: Any = lambda parameters, seed: parameters["c"]  # noqa: E731
+    nobody: Any = lambda parameters, seed: object()  # noqa: E731
+    wrongs: list[dict[str, Any]] = [{}, {"body": body, "make": lambda parameters, seed: body}]
+    for wrong in wrongs:
+        with pytest.raises(InvalidValue, match="expected either a body or make=lambda parameters, seed: body"):
+            fp.ExternalPlant(measures=MEASURES, **wrong)
+    with pytest.raises(InvalidValue, match="a body that stands cannot take parameters"):
+        fp.ExternalPlant(body, MEASURES, parameters=GAIN)
+    with pytest.raises(InvalidProblem, match=r"reset of the body that make returns raised .*'c'"):
+        run(task(reality=fp.ExternalPlant(make=number, measures=MEASURES)), law)
+    with pytest.raises(InvalidProblem, match="its body object has no method reset"):
+        run(task(reality=fp.ExternalPlant(make=nobody, measures=MEASURES)), law)
+    with pytest.raises(InvalidProblem, match="outside its bounds"):
+        with_exact(made(task()), np.array([20.0]))
 
 
 def test_contraction_is_identified_where_the_response_is_measured():

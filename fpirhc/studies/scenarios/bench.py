@@ -93,7 +93,7 @@ class Bench:
     """
 
     def __init__(self, task: Task, conditions: Conditions, live: Mapping[str, Sequence[str]] | None = None) -> None:
-        exact_ranges(task.problem.real_plant, conditions.percent)
+        exact_ranges(task.problem.moved, conditions.percent)
         self._live = live or {}
         self._task, self._conditions = task, conditions
         self._ranges = ranges(task.problem)
@@ -131,7 +131,7 @@ class Bench:
         if self._drawn is None or self._drawn[0] != number:
             conditions, problem = self._conditions, self._task.problem
             scenario = draw(
-                problem.real_plant,
+                problem.moved,
                 seed=conditions.seed,
                 use=conditions.use,
                 number=number,

@@ -13,10 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.errors import NotSupported
-from fpirhc.plant.mismatch import drawn
+from fpirhc.plant.mismatch import Parametric, drawn
 from fpirhc.plant.motion import with_exact_parameters
-from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
 
 COMPARING, TUNING = 0, 1  # uses: a controller is never compared on the scenarios on which it was tuned
@@ -39,7 +37,9 @@ class Scenario:
     lateness: int = 0
 
 
-def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float, model: Plant | None = None) -> Scenario:
+def draw(
+    plant: Parametric, *, seed: int, use: int, number: int, percent: float, model: Parametric | None = None
+) -> Scenario:
     """Return a scenario; its exact parameters lie in `exact_ranges(plant, percent)`.
 
     Args:
@@ -51,7 +51,7 @@ def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float, mode
         model: the controllers' model, where it is another plant. The mismatch is then that of the parameters which both have.
     """
     parameters, noise, late = np.random.SeedSequence(seed, spawn_key=(use, number)).spawn(3)
-    shares = np.random.default_rng(parameters).random(plant.exact.size)
+    shares = np.random.default_rng(parameters).random(len(plant.parameters))
     values = [drawn(p, percent, float(s)) for p, s in zip(plant.parameters.values(), shares, strict=True)]
     exact = np.array(values, dtype=float)
     believed = _believed(model or plant)
@@ -61,8 +61,8 @@ def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float, mode
     return Scenario(int(noise.generate_state(1)[0]), exact, mismatch_of(assumed, exact[shared]), lateness)
 
 
-def _believed(model: Plant) -> dict[str, float]:
-    return dict(zip(model.parameters, model.approximate, strict=True))
+def _believed(model: Parametric) -> dict[str, float]:
+    return {name: parameter.approximate for name, parameter in model.parameters.items()}
 
 
 def mismatch_of(approximate: np.ndarray, exact: np.ndarray) -> float:
@@ -77,12 +77,8 @@ def with_exact(problem: Problem, exact: np.ndarray) -> Problem:
 
     Raises:
         InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
-        NotSupported: a foreign reality, whose parameters nobody can set.
+        NotSupported: an external plant without parameters.
     """
-    if problem.foreign is not None:
-        raise NotSupported(
-            "a foreign reality has no exact parameters that a study could draw; compare without scenarios"
-        )
-    if problem.symbolic_reality is not None:
-        return replace(problem, reality=problem.symbolic_reality.with_exact(exact))
+    if problem.reality is not None:
+        return replace(problem, reality=problem.reality.with_exact(exact))
     return replace(problem, plant=with_exact_parameters(problem.plant, exact))
