@@ -13,6 +13,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.evaluate import require_unsolved
 from fpirhc.symbolic.expression import kind
 
 Array: TypeAlias = np.ndarray
@@ -200,7 +201,8 @@ def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Arra
     assumed = np.broadcast_to(model, (count, model.shape[-1]))
     try:
         stacked = function.map(count)(states.T, deformed.T, exact.T, assumed.T).full()
-    except RuntimeError:  # Newton's method has no derivative where the inputs have no effect
+    except RuntimeError as error:  # Newton's method has no derivative where the inputs have no effect
+        require_unsolved(error)
         stacked = np.hstack([_value(function, n, row) for row in zip(states, deformed, exact, assumed, strict=True)])
     return np.asarray(stacked).reshape((n, count, n)).transpose(1, 0, 2)
 
@@ -209,7 +211,8 @@ def _value(function: ca.Function, n: int, row: tuple[Array, ...]) -> Array:
     """The Jacobian of one row; NaN where it cannot be computed."""
     try:
         return np.asarray(function(*row).full())
-    except RuntimeError:
+    except RuntimeError as error:
+        require_unsolved(error)
         return np.full((n, n), np.nan)
 
 

@@ -22,6 +22,7 @@ from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.given import described
 from fpirhc.fields.kinds import real_number
 from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
+from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, copied, live_number
@@ -94,7 +95,8 @@ class LiveSettings:
         try:
             composite = compose(problem, controller)
         except (ArithmeticError, AttributeError, FpirhcError, RuntimeError, TypeError, ValueError) as error:
-            raise self._refusal(error) from None
+            interruption = unwrapped(error)
+            raise (self._refusal(error) if isinstance(interruption, Exception) else interruption) from None
         read = {s.name for b in composite.blocks for s in b.inputs.signals}
         for path in self.paths:
             if PREFIX + path not in read:
@@ -125,7 +127,7 @@ class LiveSettings:
         try:
             again = compose(*apart.planted())
             same = again.function.serialize() == composite.function.serialize()
-        except (ArithmeticError, AttributeError, FpirhcError, RuntimeError, TypeError, ValueError):
+        except (ArithmeticError, FpirhcError, ValueError):  # another number may be refused
             return False
         return same and np.array_equal(again.memory.start(), composite.memory.start())
 

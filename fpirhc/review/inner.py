@@ -17,6 +17,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.horizon.nominal import output_feedback
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.chain import nominal_responses
+from fpirhc.symbolic.evaluate import require_unsolved
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.limits import Limits
@@ -78,7 +79,8 @@ def _motion_of_map(
 def _motion(steps: ca.Function, start: np.ndarray, parameters: np.ndarray) -> np.ndarray | None:
     try:
         rows = np.asarray(steps(x0=start, p=parameters)["xf"].full()).T
-    except RuntimeError:  # CVODES gives up where the motion leaves every bound
+    except RuntimeError as error:  # CVODES gives up where the motion leaves every bound
+        require_unsolved(error)
         return None
     return np.vstack([start, rows]) if np.isfinite(rows).all() else None
 

@@ -2,10 +2,10 @@
 
 Over cycle k, w_k acts on the deviation (`prediction.ResponseErrors`). It is bounded by
 
-    e+_k = |I - a J| e+_{k-1} + |e_k - (I - a J) e_{k-1}|,        w+_k = e+_k + |w_k - e_k|,
+    p_k = e_k - (I - a J_k) e_{k-1},        e+_k = |p_k| + |I - a J_k| |p_{k-1}| + |(I - a J_k) (I - a J_{k-1})| |p_{k-2}| + ...,
 
-with absolute values entry by entry, so that |e_k| <= e+_k whatever the signs of the parts are. The loop of plant = model without
-deformation has the impulse response h_j from w. With the largest h_j at some points of the reference,
+and w+_k = e+_k + |w_k - e_k|, with absolute values entry by entry, so that |e_k| <= e+_k whatever the signs of the parts p are. The
+loop of plant = model without deformation has the impulse response h_j from w. With the largest h_j at some points of the reference,
 
     |x_k - x^_k| <= sum_j |h_j| w+_{k-1-j}.
 
@@ -30,6 +30,8 @@ from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 _POINTS = 5  # of the reference, whose impulse responses are compared
 _GONE = 1e-6  # share of its largest value below which an impulse response is over
+_ROUNDING = 1e-15  # entry of a product of I - a J, which adds nothing any more
+_LOST = 1e6  # entry of a product of I - a J, from which errors grow
 
 
 def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.ndarray | None = None) -> np.ndarray:
@@ -64,20 +66,25 @@ def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.nda
 
 
 def majorant(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.ndarray | None = None) -> np.ndarray:
-    """Return e+ (cycles, n); the size of the errors where |I - a J| does not contract; arguments as in `tube`."""
+    """Return e+ (cycles, n); the size of the errors where products of I - a J do not decay; arguments as in `tube`."""
     plant = nominal.problem.plant
     rows = np.tile(plant.exact if exact is None else exact, (nominal.cycles, 1))
     jacobians = response_jacobians(plant, nominal.states[:-1], nominal.desired, rows, nominal.believed)
-    factors = np.eye(jacobians.shape[1]) - gain * jacobians
-    sizes, size = np.abs(factors), np.abs(errors.error)
-    if gain == 0 or not np.isfinite(sizes).all() or np.abs(np.linalg.eigvals(sizes)).max() >= 1:
+    factors, size = np.eye(jacobians.shape[1]) - gain * jacobians, np.abs(errors.error)
+    if gain == 0 or not np.isfinite(factors).all():
         return size
-    parts = np.abs(errors.error[1:] - np.einsum("kij,kj->ki", factors[1:], errors.error[:-1]))
-    bound = np.empty_like(size)
-    bound[0] = size[0]
-    for k, part in enumerate(parts):
-        bound[k + 1] = sizes[k + 1] @ bound[k] + part
-    return bound
+    parts = size.copy()
+    parts[1:] = np.abs(errors.error[1:] - np.einsum("kij,kj->ki", factors[1:], errors.error[:-1]))
+    bound, carried = parts.copy(), factors.copy()
+    for late in range(1, nominal.cycles):  # cycles after which a part is still felt
+        bound[late:] += np.einsum("kij,kj->ki", np.abs(carried[late:]), parts[:-late])
+        largest = np.abs(carried[late:]).max()
+        if largest < _ROUNDING:
+            return bound
+        if largest > _LOST:
+            break
+        carried[late + 1 :] = carried[late + 1 :] @ factors[1:-late]
+    return size
 
 
 def _effect(grid: ReviewGrid, nominal: NominalRun, place: int) -> np.ndarray:

@@ -144,6 +144,17 @@ def unwrapped(error: Exception) -> BaseException:
     return cause if isinstance(cause, KeyboardInterrupt) else error
 
 
+def require_unsolved(error: RuntimeError) -> None:
+    """Return where a solver inside a Function found no solution; raise every other error, and Ctrl-C as what it is."""
+    text = str(error)
+    if not any(words in text for words in _UNSOLVED) or _BROKEN_INSIDE in text:
+        raise unwrapped(error) from None
+
+
+# How CasADi says that CVODES, or a rootfinder, gave up; and that the equations that it integrates raised an error.
+_UNSOLVED, _BROKEN_INSIDE = ("CVode returned", "Evaluation failed"), "CV_RHSFUNC_FAIL"
+
+
 def _array(size: tuple[int, int]) -> np.ndarray:
     rows, columns = size
     return np.zeros(rows if columns == 1 else (columns, rows))

@@ -12,6 +12,7 @@ from chains import chain
 
 import fpirhc as fp
 from fpirhc.contraction.large_errors import least_product
+from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.review.prediction import nominal_run, response_errors
 from fpirhc.review.tube import majorant, tube
@@ -157,6 +158,25 @@ def test_majorant_is_above_the_error(gain):
     bound = majorant(model, errors, sigmoid.effective_gain())
     assert (bound >= np.abs(errors.error) - 1e-12).all()
     assert bound.max() < 10 * np.abs(errors.error).max()
+
+
+def test_majorant_is_the_largest_error_of_all_signs():
+    """Parts p_k of alternating signs give errors below it, and the signs of the products of I - a J reach it in the last cycle."""
+    model, gain = nominal("two_link_arm", "RHC"), -0.5
+    sigmoid = fp.Sigmoid(gain=gain, shift=0.3, scale=50.0)
+    errors = response_errors(model, deformation=sigmoid)
+    bound = majorant(model, errors, sigmoid.effective_gain())
+    rows = np.tile(model.problem.plant.exact, (model.cycles, 1))
+    jacobians = response_jacobians(model.problem.plant, model.states[:-1], model.desired, rows, model.believed)
+    factors = np.eye(2) - sigmoid.effective_gain() * jacobians
+    parts, last = errors.error.copy(), model.cycles - 1
+    parts[1:] -= np.einsum("kij,kj->ki", factors[1:], errors.error[:-1])
+    carried, worst = np.eye(2), np.zeros(2)
+    for k in range(last, last - 200, -1):
+        worst += np.abs(carried) @ np.abs(parts[k])
+        carried = carried @ factors[k]
+    np.testing.assert_allclose(bound[last], worst, rtol=1e-4)
+    assert (bound[last] <= (np.abs(factors[last]) @ bound[last - 1] + np.abs(parts[last])) * (1 + 1e-9)).all()
 
 
 def test_box_widens_the_tube():

@@ -20,6 +20,9 @@ import fpirhc as fp
 from fpirhc.broken import attempted
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
+from fpirhc.contraction import spectrum
+from fpirhc.controllers.live_settings import live_settings
+from fpirhc.errors import NotSupported
 from fpirhc.symbolic.evaluate import Evaluator
 
 COMMAND = [
@@ -204,3 +207,47 @@ def test_ctrl_c_in_scenarios_keeps_what_is_finished(folder, capfd):
     assert all(json.loads(line)["controller"] in ("CTC", "RHC") for line in finished[1:])
     assert main([*words[:3], "1", *words[4:], "--controllers", "CTC"]) == ExitCode.FINISHED
     assert Path("out/scenarios.jsonl").read_text().splitlines()[: len(finished)] == finished
+
+
+class _Raising(ca.Callback):
+    """A Function of a user's own that raises where it is evaluated."""
+
+    def __init__(self, error: BaseException) -> None:
+        ca.Callback.__init__(self)
+        self.error = error
+        self.construct("raising", {})
+
+    def get_n_in(self) -> int:
+        return 4
+
+    def eval(self, _: object) -> list[float]:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "expected", "words"),
+    [(ZeroDivisionError("of my own"), RuntimeError, "of my own"), (KeyboardInterrupt(), KeyboardInterrupt, None)],
+    ids=["own error", "interruption"],
+)
+def test_a_solver_that_gives_up_hides_no_other_error(error, expected, words, monkeypatch):
+    """Response Jacobians are not finite where Newton's method has no derivative; an error of the equations is raised."""
+    plant = fp.load_problem("two_mass").problem.plant
+    row = (np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), np.zeros(1))
+    raising = _Raising(error)
+    monkeypatch.setattr(spectrum, "response_jacobian", lambda plant: raising)
+    with pytest.raises(expected, match=words):
+        spectrum.response_jacobians(plant, *row)
+    z, p = ca.MX.sym("z"), ca.MX.sym("p")
+    root = ca.rootfinder("root", "fast_newton", ca.Function("f", [z, p], [z**2 - p]))
+    unsolved = ca.Function("unsolved", [*(ca.MX.sym(n) for n in "abc"), p], [ca.jacobian(root(0.0, p), p)])
+    monkeypatch.setattr(spectrum, "response_jacobian", lambda plant: unsolved)
+    assert np.isnan(spectrum.response_jacobians(plant, *row)).all()
+
+
+def test_an_interruption_while_a_loop_with_live_settings_is_built_is_no_setting_that_cannot_be_live():
+    task = fp.load_problem("two_mass")
+    live = live_settings(task.problem, task.controllers["CTC"], ["tracking.rate"])
+    with pytest.raises(KeyboardInterrupt):
+        live.composed(Mock(side_effect=RuntimeError("in a solver: KeyboardInterrupt")))
+    with pytest.raises(NotSupported, match="of my own"):
+        live.composed(Mock(side_effect=RuntimeError("of my own")))
