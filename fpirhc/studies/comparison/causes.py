@@ -1,6 +1,7 @@
 """Known reasons why adaptation does not help in a run, in sentences.
 
-They stand in the order in which they act: a cost that weighs absolute effort, plans that did not converge, a gain that is too large
+They stand in the order in which they act: a cost that weighs absolute effort, plans that did not converge or stay in a local
+optimum, a gain that is too large
 by the response Jacobian's eigenvalues or too small by the review, a step limit below the slew of the desired response, commands
 that stand at their limits, and commands that move far more than those of the pair. What is a fact of the runs alone is stated where
 the share of the cycles is no start or single event. Where the gain is the cause, limits that are reached are its effect.
@@ -37,6 +38,7 @@ def causes(plain: Entry, adaptive: Entry) -> str:
     sentences = (
         effort_cause(adaptive),
         plan_cause(plain, adaptive),
+        stuck_cause(adaptive),
         gain,
         _slew_cause(plain, adaptive),
         "" if gain else limit_cause(plain, adaptive),
@@ -89,6 +91,20 @@ def plan_cause(plain: Entry, adaptive: Entry) -> str:
     return (
         f"Its plans did not converge in {in_percent(after)} of the cycles (those of {plain.name} in {in_percent(before)}), so this "
         "is not the optimum of its cost: give the optimiser more iterations, then compare."
+    )
+
+
+def stuck_cause(entry: Entry) -> str:
+    """Return a sentence where plans that count as solved stay in a local optimum at their limits; else nothing."""
+    known = entry.optimality
+    if known is None or not known.stuck:
+        return ""
+    first = f"{known.stuck[0]:.4g}{with_space(entry.run.unit('time'))}"
+    return (
+        f"Its plans stay in a local optimum: {len(known.stuck)} of the {known.plans} that were solved again, the first at "
+        f"t = {first}, count as solved with every input at a limit, while a plan from the middle of the limits is cheaper; the "
+        "next plan begins where they end. Keep the plant where its inputs act, by Limits(states=...), or slow the reference "
+        "down."
     )
 
 

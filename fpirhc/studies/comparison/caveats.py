@@ -15,7 +15,7 @@ from fpirhc.plant.units import with_space
 from fpirhc.simulation.held_input import HeldInput
 from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.simulate import judged_run, simulator
-from fpirhc.studies.comparison.causes import chatter_cause, limit_cause, plan_cause
+from fpirhc.studies.comparison.causes import chatter_cause, limit_cause, plan_cause, stuck_cause
 from fpirhc.studies.comparison.changes import quarter_turns, ranges, scales
 from fpirhc.task.problem import Problem
 
@@ -103,6 +103,7 @@ def caveats(plain: Entry, adaptive: Entry, names: list[str], yardstick: Yardstic
     sentences = (
         left_alone_is_better(plain, adaptive, names, yardstick),
         plan_cause(plain, adaptive),
+        stuck_cause(adaptive),
         limit_cause(plain, adaptive),
         chatter_cause(plain, adaptive),
     )

@@ -249,7 +249,7 @@ def _entry(entry: Entry) -> dict[str, Any]:
         **_numbers(entry.metrics),
         "cycle_us": _fields(entry.cycle, times),
         "statuses": dict(entry.metrics.statuses),
-        "optimality": _fields(entry.optimality, ("median", "worst", "plans")),
+        "optimality": _fields(entry.optimality, ("median", "worst", "plans", "stuck")),
         "price_us": _fields(entry.price, ("beside", "difference", "noise")),
         "notes": entry.notes,
         "measures": entry.information.uses if entry.information else None,

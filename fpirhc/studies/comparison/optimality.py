@@ -25,6 +25,8 @@ from fpirhc.task.exogenous import model_values, previewed_values, rows_of, signa
 from fpirhc.task.problem import Problem, cycles_per_plan
 
 SAMPLES = 25  # plans of a run that are solved again
+_LESS = 0.9  # of the cost of a plan at its limits, from which another plan is clearly cheaper
+_AT_LIMIT = 1e-9  # of the range
 _OTHER = 1e-6  # relative; closer to the optimum a negative excess is the accuracy of the solves
 _ACCURATE = 1e-8  # of the input's range
 _BREAK_EVEN = 5000  # iterations that take the virtual machine as long as a compiler takes
@@ -40,11 +42,14 @@ class Optimality:
         median: median excess.
         worst: largest excess.
         plans: number of plans that were compared.
+        stuck: times of those that count as solved with every input at a limit, while one from the middle of the limits is
+            clearly cheaper: they are in a local optimum, and the next plan begins there again.
     """
 
     median: float
     worst: float
     plans: int
+    stuck: tuple[float, ...] = ()
 
 
 def measure_optimality(
@@ -54,7 +59,8 @@ def measure_optimality(
 
     The result is None where plans do not start from a state in the run, where no plan was solved, for a controller that learns,
     because the models of its plans are not in the run, and towards set-points, because what its plans knew of them is not either.
-    A negative excess is that of another local optimum, which the controller reached and the solve from rest did not.
+    The optimum is the one found from no input; where the plan stands at limits alone, the cheaper one of this and the one from the
+    middle of the limits. A negative excess is that of another local optimum, which the controller reached and these solves did not.
     """
     ready = checked(problem, controller)
     planner, feeds = ready.planner, ready.feeds
@@ -90,9 +96,10 @@ def measure_optimality(
     times = np.ravel(times)
     parameters = rows_of(model_values(model, known), times + problem.period / 2, plant_model.parameters(model))
     seen = run[feeds["output"] if feeds.get("output") in run.layout.names else "output"] if of_measured else states
-    excess = []
+    excess, stuck = [], []
     for row in rows:
         shift = run["command_shift"][row - 1]
+        lower, upper = ocp.input_lower - shift, ocp.input_upper - shift
         state = states[row] if begin is None else begin(states[row], seen[row], parameters[row])
         first = ocp.start(state, run["command"][row - 1] - shift).full().ravel()
         data = np.asarray(data_of(times[row], parameters[row]).full())
@@ -100,11 +107,21 @@ def measure_optimality(
             data = np.asarray(of_measured(data, state, seen[row], parameters[row]).full())
         if offset is not None:
             data = np.asarray(offset(data, state, states[row]).full())
-        best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
-        cost_of_plan = run["solve.cost"][row]
-        if best is not None and run["status"][row] <= Status.NOT_CONVERGED:
-            excess.append((cost_of_plan - best) / max(abs(best), 1e-12))
-    return Optimality(float(np.median(excess)), float(np.max(excess)), len(excess)) if excess else None
+        best, cost_of_plan = solve(first, data, lower, upper), run["solve.cost"][row]
+        if best is None or run["status"][row] > Status.NOT_CONVERGED:
+            continue
+        if _at_limits(run["planned"][row], lower, upper):
+            best = min(best, solve(first, data, lower, upper, middle=True) or best)
+            if run["status"][row] == Status.OK and best < _LESS * cost_of_plan:
+                stuck.append(float(times[row]))
+        excess.append((cost_of_plan - best) / max(abs(best), 1e-12))
+    return Optimality(float(np.median(excess)), float(np.max(excess)), len(excess), tuple(stuck)) if excess else None
+
+
+def _at_limits(inputs: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
+    """Whether every input stands at one of its two limits."""
+    reach = upper - lower
+    return bool(np.isfinite(reach).all() and (np.minimum(inputs - lower, upper - inputs) <= _AT_LIMIT * reach).all())
 
 
 def gap(excess: float, digits: int) -> str:
@@ -113,7 +130,10 @@ def gap(excess: float, digits: int) -> str:
 
 
 class _Solver:
-    """Solves horizons from rest to high accuracy; in C from where its iterations have cost as much as a compiler."""
+    """Solves horizons from no input, or from the middle of the limits, to high accuracy.
+
+    It does so in C from where its iterations have cost as much as a compiler.
+    """
 
     def __init__(self, ocp: OptimalControl, compiled: bool) -> None:
         reach = ocp.input_upper - ocp.input_lower
@@ -122,11 +142,16 @@ class _Solver:
         optimiser.check(ocp)
         self._function, self._waiting = optimiser.converging(ocp), compiled
         self._evaluator = Evaluator(self._function)
-        self._start = optimiser.memory(ocp).start()
+        self._layout = optimiser.memory(ocp)
         self._iterations = 0.0
 
-    def __call__(self, first: np.ndarray, data: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> float | None:
-        memory = self._start
+    def __call__(
+        self, first: np.ndarray, data: np.ndarray, lower: np.ndarray, upper: np.ndarray, *, middle: bool = False
+    ) -> float | None:
+        memory = self._layout.start()
+        if middle:
+            inputs = self._layout.slice("plan_inputs")
+            memory[inputs] = np.resize((lower + upper) / 2, inputs.stop - inputs.start)
         for _ in range(20):
             if self._waiting and self._iterations > _BREAK_EVEN:
                 self._evaluator, self._waiting = Evaluator(native(self._function).function), False

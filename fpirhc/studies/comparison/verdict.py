@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fpirhc.plant.units import with_space
-from fpirhc.studies.comparison.causes import causes, effort_cause, movement
+from fpirhc.studies.comparison.causes import causes, effort_cause, movement, stuck_cause
 from fpirhc.studies.comparison.caveats import Yardstick, caveats, leaves_reference, left_alone_is_better, not_followed
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
@@ -52,6 +52,7 @@ def findings(
     judged = [_told_of_partner(judge(*pair, measure), pair[0] in partners) for pair in ordered] or [_no_pair(entries)]
     left = (leaves_reference(entry, measure) for entry in entries)
     judged += [Finding(text) for text in left if text]
+    judged += [Finding(_of(e, text)) for e in entries if not e.adaptive and (text := stuck_cause(e))]
     judged += [Finding(f"{name} is not judged: {why}.") for name, why in (unjudged or {}).items()]
     judged += remarks(entries, ordered[0] if ordered else None, measure.scales)
     if skipped:
