@@ -41,6 +41,7 @@ def cheaper(problem, run, row):
     data = stage_data(plant, problem.reference, problem.horizon, problem.cost)(run.time[row], plant.exact).full()
     first = np.asarray(ocp.start(run["state"][row], run["command"][row - 1]).full()).ravel()
     plan = fp.solve(ocp, fp.Ipopt(tolerance=1e-6), first, data, start=np.full((1, ocp.stages), 100.0))
+    assert plan.feasibility is not None
     assert plan.feasibility < 1e-6  # so its cost can be had, whether the last digit converged or not
     return plan.cost
 
@@ -65,7 +66,9 @@ def test_plans_that_stay_at_limits_are_counted_where_ipopt_finds_a_cheaper_one(t
 def test_the_verdict_says_so_of_a_run_whose_status_is_ok(task):
     """The tank stays empty: the sentence has the count, the first time, and what to do; a run that fills it again has none."""
     compared = fp.compare(task, seed=0, controllers=["RHC+FPI", EXACT], compiled=False)
-    stuck = compared[EXACT].optimality.stuck
+    known = compared[EXACT].optimality
+    assert known is not None
+    stuck = known.stuck
     [text] = [t for t in compared.verdict if "local optimum" in t]
     assert text.startswith(f"{EXACT}: its plans stay in a local optimum: {len(stuck)} of the ")
     assert f"the first at t = {stuck[0]:g} s" in text
