@@ -58,7 +58,7 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant.algebraic import Algebraic
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
-from .plant.output import Output
+from .plant.motion import Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
 from .plant.plant import Parameter, Plant
 from .plant.regressor import linear_parameters

@@ -15,7 +15,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import Mistakes
-from fpirhc.plant.output import Output
+from fpirhc.plant.motion import Output
 from fpirhc.plant.parameter import Parameter
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.stepper import Stepper

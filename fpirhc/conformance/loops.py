@@ -15,7 +15,7 @@ from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.plant.output import Output
+from fpirhc.plant.motion import Output
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing

@@ -20,7 +20,12 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
-from fpirhc.controllers.beside_plan import (
+from fpirhc.controllers.contract import Planner
+from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
+from fpirhc.controllers.online_reference import motion_of, own_signals, own_values, preview_of
+from fpirhc.controllers.replanning import (
+    FromMeasurement,
+    Replanning,
     as_planned,
     at_consistent_start,
     built_first_memory,
@@ -28,10 +33,6 @@ from fpirhc.controllers.beside_plan import (
     first_memory,
     held_model,
 )
-from fpirhc.controllers.contract import Planner
-from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
-from fpirhc.controllers.online_reference import motion_of, own_signals, own_values, preview_of
-from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.sigmoid import Sigmoid
@@ -71,7 +72,7 @@ class RecedingHorizon(Controller):
         cost: of the plan; None: the problem's.
         margins: by name of a state, the distances that plans keep from the state's limits; see `Horizon`. None: the horizon's.
         follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
-            `fpirhc.controllers.beside_plan` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
+            `fpirhc.controllers.replanning` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
     """
 
     optimiser: Optimiser

@@ -24,10 +24,27 @@ from fpirhc.fields.checked import Checked, missing
 from fpirhc.fields.kinds import Few
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.algebraic import Algebraic
-from fpirhc.plant.output import Output
 from fpirhc.plant.parameter import Parameter, with_exact_values
 from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
+
+
+@dataclass(frozen=True, eq=False)
+class Output(Checked):
+    """One output of a plant: y = h(q, q', ..., p), or h(x, p) of a plant that is given by its states.
+
+    Args:
+        unit: of the output.
+        expression: function of the arguments of the response, with or without the inputs; it returns one scalar.
+        response_disturbance: name of a parameter that a model believes to add to the response y^(r) and to nothing else, as
+            estimators of disturbances do; empty: none. The inverse has it in every cycle. A plan is made without it, as if the
+            response were the model's, which is how a plan is made behind a deformation.
+    """
+
+    unit: str
+    expression: Callable[..., Expression]
+    response_disturbance: str = field(default="", kw_only=True, metadata={"setting": False})
+
 
 _Motion = TypeVar("_Motion", bound="Motion")
 

@@ -33,8 +33,7 @@ from fpirhc.plant.lie_derivatives import (
     structural_order,
 )
 from fpirhc.plant.maps import Differences, check_map
-from fpirhc.plant.motion import Motion, MotionEquations, controlled_places, followed_units
-from fpirhc.plant.output import Output
+from fpirhc.plant.motion import Motion, MotionEquations, Output, controlled_places, followed_units
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
 from fpirhc.plant.units import derivative_unit

@@ -18,12 +18,12 @@ import numpy as np
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.nominal import known_on_reference
-from fpirhc.plant.behind_actuators import behind_actuators
 from fpirhc.plant.parameter import Parameter, outside
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.sensing.sensor import Sensor
+from fpirhc.simulation.model_as_plant import behind_actuators
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Noise

@@ -20,7 +20,7 @@ from fpirhc.errors import InvalidName
 from fpirhc.report.figures import contraction_figure, lyapunov_figure, mismatch_figure, pair_figures
 from fpirhc.report.series import chart_data
 from fpirhc.simulation.drawing import BANDS, PALETTE
-from fpirhc.simulation.picture import Drawing, png
+from fpirhc.simulation.pictures.base import Drawing, png
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import Column, Table
 from fpirhc.whole_file import write_whole

@@ -25,7 +25,7 @@ _TALL = 20  # largest over usual size from which the range of a panel is cut, so
 
 def new_figure(width: float, height: float, title: str) -> Figure:
     """Return an empty figure of this size in inches, with the title as literal text."""
-    from fpirhc.simulation.picture import Drawing
+    from fpirhc.simulation.pictures.base import Drawing
 
     figure = Drawing(figsize=(width, height), layout="constrained")
     if title:

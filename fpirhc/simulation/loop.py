@@ -20,8 +20,7 @@ from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.response_jumps import response_jumps
 from fpirhc.controllers.sensing_chain import compose_seeing, seeing_blocks
 from fpirhc.plant.motion import time_signal
-from fpirhc.simulation.exogenous_blocks import outside_blocks
-from fpirhc.simulation.path import acting_blocks, disturbance_signals, moving, sensing_blocks
+from fpirhc.simulation.path import acting_blocks, disturbance_signals, moving, outside_blocks, sensing_blocks
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar

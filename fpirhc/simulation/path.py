@@ -16,18 +16,19 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Response, error_signal, like, rename
+from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.online_reference import own_signals
 from fpirhc.controllers.sensing_chain import first_estimates, first_shown
 from fpirhc.plant.chain import measured_signals
-from fpirhc.plant.motion import forcing_units, time_signal
+from fpirhc.plant.motion import forcing_units, outside_names, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import backward_difference, combine, response_names
-from fpirhc.simulation.exogenous_blocks import real_name
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.dead_time import MEASUREMENT, delay_block
+from fpirhc.task.exogenous import model_values, real_values
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, logged_signal
 from fpirhc.task.problem import Problem
@@ -408,3 +409,50 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
 
 def _difference(samples: Sequence[Expression], order: int) -> Expression:
     return combine(backward_difference(order), samples)
+
+
+_REAL_HELD, _REAL_NOW = "_exact", "_exact_now"
+
+
+def real_name(problem: Problem) -> str:
+    """Return the signal of the parameters with which the plant moves in this cycle."""
+    return (
+        _REAL_HELD
+        if problem.foreign is not None or real_values(problem.real_plant, problem.signals) is None
+        else _REAL_NOW
+    )
+
+
+def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
+    """Return blocks that write the real parameters of this cycle, 'signals' and 'signals_told'; none without signals."""
+    real, known = problem.real_plant, controller.plant_model(problem)
+    model = known.plant
+    blocks = []
+    if real_name(problem) == _REAL_NOW:
+        values = real_values(real, problem.signals)
+        assert values is not None
+        blocks.append(_block("outside", problem, real, values, "signals", (_REAL_HELD, _REAL_NOW)))
+    if outside_names(model):
+        believed = model_values(model, known.signals) or _unchanged(model)
+        blocks.append(_block("told", problem, model, believed, "signals_told", ("parameters", "")))
+    return blocks
+
+
+def _block(name: str, problem: Problem, plant: Plant, values: ca.Function, shown: str, ends: tuple[str, str]) -> Block:
+    """Block (time, parameters `ends[0]`) -> their signals `shown`, and the parameters `ends[1]` where these have a name."""
+    places, half = [plant.parameter.elements.index(n) for n in outside_names(plant)], problem.period / 2
+    source, target = ends
+    units = tuple(plant.parameter.units[k] for k in places)
+    writes = (Signal(shown, outside_names(plant), units), *([like(plant.parameter, target)] if target else []))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now = values(s.time + half, getattr(s, source))
+        return {shown: now[places], **({target: now} if target else {})}
+
+    reads = Layout((time_signal(plant), like(plant.parameter, source)))
+    return Block(name, reads, Layout(writes), step, opaque=not values.is_a("SXFunction"))
+
+
+def _unchanged(plant: Plant) -> ca.Function:
+    t, p = ca.SX.sym("t"), ca.SX.sym("p", plant.parameter.size)
+    return ca.Function("fpirhc_signals", [t, p], [p])

@@ -16,9 +16,8 @@ from test_reality import CONTROLLERS, PAIRS, SENSING, TAU, lagged, run, task
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.simulation.foreign_run import Patch, run_foreign
 from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.simulate import simulator
+from fpirhc.simulation.simulate import Patch, run_foreign, simulator
 from fpirhc.studies.scenarios.draws import with_exact
 
 MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.plant.behind_actuators import behind_actuators
-from fpirhc.simulation.model_as_plant import with_believed_way
+from fpirhc.simulation.model_as_plant import behind_actuators, with_believed_way
 
 GALLERY = Path(__file__).parents[2] / "problems" / "gallery"
 LAG = 0.02  # s

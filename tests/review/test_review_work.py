@@ -1,7 +1,7 @@
 """A review composes a loop, plans and linearises no more often than its controllers differ."""
 
 import fpirhc as fp
-from fpirhc.controllers import beside_plan
+from fpirhc.controllers import replanning
 from fpirhc.simulation import loop
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.slopes import Step
@@ -23,7 +23,7 @@ def test_controllers_that_differ_in_their_deformation_share_what_a_review_builds
     task = fp.load_problem("two_mass")
     pair = {name: task.controllers[name] for name in ("RHC", "RHC+FPI")}
     loops = counted(monkeypatch, loop, "_closed")
-    plans = counted(monkeypatch, beside_plan, "first_memory")
+    plans = counted(monkeypatch, replanning, "first_memory")
     asked = counted(monkeypatch, AskedLoop, "__init__")
     linear = counted(monkeypatch, AskedLoop, "_among")
     steps = counted(monkeypatch, Step, "__call__")

@@ -17,7 +17,7 @@ from test_loop import swing
 
 import fpirhc as fp
 from fpirhc.errors import OutputError
-from fpirhc.simulation import run_file
+from fpirhc.simulation import run as run_module
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_four_hundred_flipped_bits_give_the_run_or_one_error(run, tmp_path):
 
 def test_a_file_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch):
     run.save(tmp_path / "run.npz")
-    monkeypatch.setattr(run_file, "MOST", run.log.nbytes // 2)
+    monkeypatch.setattr(run_module, "MOST", run.log.nbytes // 2)
     with pytest.raises(OutputError, match="unpacks to"):
         fp.load_run(tmp_path / "run.npz")
 

@@ -22,7 +22,7 @@ from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.run import load_run
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.symbolic.native import native
-from fpirhc.task.filter_bank import transition
+from fpirhc.task.set_point import transition
 
 TWO_MASS = fp.load_problem("two_mass")
 STEPS = {"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": [(0.0, 5.4), (0.1, 5.6), (0.2, 5.3)]}

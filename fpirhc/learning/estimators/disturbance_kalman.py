@@ -34,8 +34,7 @@ from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import Differences, response_age
-from fpirhc.plant.motion import controlled_places, followed_units, forcing_units
-from fpirhc.plant.output import Output
+from fpirhc.plant.motion import Output, controlled_places, followed_units, forcing_units
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import quantities, response_names
 from fpirhc.symbolic.expression import expression
