@@ -91,7 +91,7 @@ class Number(Expected):
         number = real_number(value)
         if number is None:  # a whole number beyond the largest float is a whole number
             return self.whole and type(value) is int and (self.within is None or self.within.holds(value))
-        return not math.isnan(number) and (self.within is None or self.within.holds(number))
+        return not math.isnan(number) if self.within is None else self.within.holds(number)
 
 
 @dataclass(frozen=True)

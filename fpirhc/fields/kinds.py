@@ -42,6 +42,15 @@ class Range:
         return above and below
 
 
+class _JudgedByOwner(Range):
+    """Any number, NaN among them: whoever holds it by name refuses what is not finite, with this name."""
+
+    def holds(self, value: float) -> bool:
+        del value
+        return True
+
+
+JudgedByOwner: TypeAlias = Annotated[float, _JudgedByOwner("a finite number")]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
 Deviation: TypeAlias = Annotated[  # its square is finite, and not zero
     float, Range("a positive number from 1e-100 to 1e100", low=1e-100, high=1e100)

@@ -15,7 +15,7 @@ from statistics import NormalDist
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import finite_number, real_number
+from fpirhc.fields.kinds import JudgedByOwner, finite_number, real_number
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Parameter(Checked):
         outside: whether it is a signal from outside, whose values over time are those of the problem; see `outside`.
     """
 
-    approximate: float
-    exact: float
+    approximate: JudgedByOwner
+    exact: JudgedByOwner
     unit: str
     bounds: tuple[float, float] = (-math.inf, math.inf)
     spread: Spread | None = field(default=None, metadata={"setting": False})
@@ -64,7 +64,10 @@ def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) ->
         for which in ("approximate", "exact"):
             value = getattr(parameter, which)
             if not finite_number(value):
-                mistakes.add(f"parameter '{name}': {which} must be a finite number, got {value!r}")
+                mistakes.add(
+                    f"parameter '{name}': {which} is {value!r}, expected a finite number; look at what computes it (a division by "
+                    "zero, a missing value), or write the number"
+                )
                 numbers = False
         mistake = (_bounds_mistake(parameter) or _spread_mistake(parameter)) if numbers else ""
         if mistake:

@@ -145,10 +145,22 @@ PLANTS = {
     "no input in the response": one(
         PENDULUM, "u.torque - ", "0 - ", "no input reaches coordinate 'angle'", "use torque in the response"
     ),
+    "parameters without a number": Wrong(
+        PENDULUM,
+        (("approximate=1.4, exact=1.0", 'approximate=float("nan"), exact=float("inf")'),),
+        (
+            "parameter 'mass': approximate is nan, expected a finite number; look at what computes it",
+            "parameter 'mass': exact is inf, expected a finite number",
+        ),
+    ),
     "two inputs for one coordinate": Wrong(
         PENDULUM,
         (('{"torque": "N m"}', '{"torque": "N m", "brake": "N m"}'), ("u.torque - ", "u.torque - u.brake - ")),
-        ("2 inputs (torque, brake) for 1 of the coordinates (angle): each input holds one", "leave an input out"),
+        (
+            "2 inputs (torque, brake) for 1 of the coordinates (angle): each input holds one",
+            "leave an input out",
+            "docs/models.md",
+        ),
     ),
     "controlled by one name": Wrong(
         TANKS,
@@ -443,7 +455,7 @@ FILES = {
             "line 19:",
             "no field 'units'. Did you mean 'unit'?",
             "line 20:",
-            "Parameter.exact: expected a number",
+            "Parameter.exact: expected a finite number",
             "line 24:",
             "Problem.period: expected a number",
             "write 1e-2 without quotes",

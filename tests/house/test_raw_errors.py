@@ -85,7 +85,9 @@ def pendulum(value):
 @pytest.mark.parametrize("value", [HUGE, np.timedelta64(1, "s"), np.bool_(True), "1", None, 1j])
 def test_what_is_no_number_is_no_parameter(value):
     """A whole number that is no float is none, too."""
-    with pytest.raises(InvalidField, match=r"(?s)approximate: expected a number.*exact: expected a number"):
+    with pytest.raises(
+        InvalidField, match=r"(?s)approximate: expected a finite number.*exact: expected a finite number"
+    ):
         pendulum(value)
 
 

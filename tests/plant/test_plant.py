@@ -167,7 +167,12 @@ def test_inputs_without_an_effect_of_their_own_are_told_where_they_act(second, s
 
 
 BAD: dict[str, dict[str, Any]] = {
-    "exact must be a finite number, got inf": {"parameters": {**TWO, "m": fp.Parameter(1.0, float("inf"), "kg")}},
+    "parameter 'm': exact is inf, expected a finite number": {
+        "parameters": {**TWO, "m": fp.Parameter(1.0, float("inf"), "kg")}
+    },
+    "parameter 'm': approximate is nan, expected a finite number": {
+        "parameters": {**TWO, "m": fp.Parameter(float("nan"), 1.0, "kg")}
+    },
     "has no unit": {"parameters": {**TWO, "m": fp.Parameter(1.0, 1.0, "")}},
     "Did you mean 'm'": {"response": lambda q, v, u, p: {"y": u.u / p.mm}},
     "does not give the derivative y''": {"response": lambda q, v, u, p: {}},
