@@ -8,6 +8,11 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.controllers.contract import resolved
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import loops_along
+from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.question import Case
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
 PERIOD = 1e-3  # s
@@ -43,6 +48,20 @@ def answers(problem: fp.Problem, controller=None, mismatch: float = 0.0) -> dict
 def about(result: dict[str, fp.Answer], words: str) -> fp.Answer:
     [question] = [q for q in result if words in q]
     return result[question]
+
+
+def case(problem: fp.Problem, controller: Any, mismatch: float = 0.0) -> Case:
+    """What one question of a review is asked with, without the other questions."""
+    grid = review_grid(problem, mismatch, 0)
+    ready = resolved(grid.problem, controller)
+    return Case(grid, ready, loops_along(grid, ready), NominalRuns(grid.problem))
+
+
+def case_of_runs(problem: fp.Problem, controller: Any) -> Case:
+    """The same without linear loops, for questions that runs alone answer."""
+    grid = review_grid(problem, 0.0, 0)
+    without: Any = None
+    return Case(grid, resolved(grid.problem, controller), without, NominalRuns(grid.problem))
 
 
 def linear(dynamics: Any, entry: Any, arriving: Any, state: Any, period: float) -> LinearLoop:

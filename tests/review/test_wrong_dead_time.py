@@ -8,6 +8,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from reviewed import about, answers, case, case_of_runs
 
 import fpirhc as fp
 from fpirhc.contraction.delayed import leaking_limit
@@ -15,6 +16,10 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation import Deformation
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.review.convergence import box_converges
+from fpirhc.review.questions.dead_time import bears_wrong_dead_time
+from fpirhc.review.questions.late_runs import pays_when_late
+from fpirhc.review.review import predict
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING
 
@@ -47,17 +52,6 @@ def told(deformation: Deformation, cycles: int = 20) -> Controller:
     return fp.Predicted(fp.ComputedTorque(fp.Exponential(rate=RATE), deformation), inputs=cycles * PERIOD)
 
 
-def asked(problem: fp.Problem, controller: Controller, mismatch: float = 0.0) -> dict[str, fp.Answer]:
-    """Answers about the controller by question."""
-    answers = fp.review(problem, {"it": controller}, mismatch=mismatch, seed=0).controllers["it"]
-    return {a.question: a for a in answers}
-
-
-def about(answers: dict[str, fp.Answer], words: str) -> fp.Answer:
-    [question] = [q for q in answers if words in q]
-    return answers[question]
-
-
 def grows(problem: fp.Problem, controller: Controller) -> bool:
     """Whether the response error of a run grows."""
     run = fp.simulate(problem, controller, seed=0, compiled=False)
@@ -81,9 +75,9 @@ def grows(problem: fp.Problem, controller: Controller) -> bool:
 def test_a_pairing_that_is_wrong_by_a_cycle(form, borne):
     """Without a leak it grows whatever the gain: a no although the loop converges with the true dead time. Runs agree."""
     controller = told(form)
-    answers = asked(mass(20), controller)
-    assert about(answers, "Does the deformation converge").verdict == "yes"
-    margin = about(answers, "wrong by a cycle")
+    assert predict(mass(20), controller).verdict == "yes"
+    margin = bears_wrong_dead_time(case(mass(20), controller))
+    assert margin is not None
     assert margin.verdict == ("yes" if borne else "no")
     assert (margin.numbers["borne"] >= 1) == borne
     assert borne or margin.numbers["delay_margin"] < 1
@@ -95,7 +89,7 @@ def test_a_pairing_that_is_wrong_by_a_cycle(form, borne):
 def test_what_survives_is_ready_and_what_grows_is_not():
     """The plant's dead time is one cycle longer than believed: no with certainty, and ready with an uncertainty of five."""
     for form in (fp.Increment, fp.Paired):
-        sure, unsure = (asked(mass(21), told(form(MAP, cycles=20, uncertainty=m))) for m in (0, 5))
+        sure, unsure = (answers(mass(21), told(form(MAP, cycles=20, uncertainty=m))) for m in (0, 5))
         assert about(sure, "Does the deformation converge").verdict == "no"
         assert about(sure, "gain admissible").verdict == "no"
         assert {q: a for q, a in unsure.items() if a.verdict == "no"} == {}
@@ -106,8 +100,9 @@ def test_the_box_contains_the_dead_time():
     """With 10 % of twenty cycles two cycles are in the box: a pairing without a leak is stable at the true dead time alone."""
     for uncertainty, verdict in ((0, "unknown"), (5, "yes")):
         controller = told(fp.Increment(MAP, cycles=20, uncertainty=uncertainty))
-        assert about(asked(mass(20), controller), "over the box").verdict == "yes"
-        boxed = about(asked(mass(20), controller, mismatch=10.0), "over the box")
+        narrow, wide = (case(mass(20), controller, mismatch) for mismatch in (0.0, 10.0))
+        assert box_converges(narrow.grid, narrow.loops).verdict == "yes"
+        boxed = box_converges(wide.grid, wide.loops)
         assert boxed.verdict == verdict
         assert (boxed.numbers["radius"] < 1) == (verdict == "yes")
 
@@ -133,13 +128,12 @@ def two_masses(second: int) -> fp.Problem:
 def test_dead_times_that_differ_are_judged():
     """Told each its own: yes and borne. Told the longer one for both: the shorter channel is wrong by seven cycles, and no."""
     law = fp.Exponential(rate=2.0)
-    both = asked(two_masses(12), fp.ComputedTorque(law, fp.Increment(MAP, cycles=(5.0, 12.0), uncertainty=2)))
+    both = answers(two_masses(12), fp.ComputedTorque(law, fp.Increment(MAP, cycles=(5.0, 12.0), uncertainty=2)))
     assert about(both, "gain admissible").verdict == "yes"
     assert about(both, "wrong by a cycle").verdict == "yes"
     assert about(both, "Does the deformation converge").verdict == "yes"
-    one = asked(two_masses(12), fp.ComputedTorque(law, fp.Increment(MAP, cycles=12.0, uncertainty=0)))
-    assert about(one, "gain admissible").verdict == "no"
-    assert about(one, "Does the deformation converge").verdict == "no"
+    wrong = fp.ComputedTorque(law, fp.Increment(MAP, cycles=12.0, uncertainty=0))
+    assert predict(two_masses(12), wrong).verdict == "no"
 
 
 @pytest.mark.parametrize(("late", "own", "width"), [(20, 20, 5), (21, 20, 5), (26, 20, 5), (4, 3, 1)])
@@ -185,7 +179,8 @@ def test_the_loop_is_asked_and_not_the_iteration_alone(weight, verdict):
     )
     controller = fp.Predicted(plan, inputs=60 * PERIOD)
     assert 0.75 * 1.3 < 1  # the product of gain and eigenvalue for which the leak is proved to be enough
-    answer = about(asked(problem, controller), "wrong by a tenth")
+    answer = pays_when_late(case_of_runs(problem, controller))
+    assert answer is not None
     assert answer.verdict == verdict
     for name, cycles in (("longer", 66), ("shorter", 54)):
         late = replace(problem, dead_time=fp.DeadTime(inputs={"u": cycles * PERIOD}))
@@ -196,19 +191,12 @@ def test_the_loop_is_asked_and_not_the_iteration_alone(weight, verdict):
 
 
 def test_no_question_without_dead_time():
-    """Nothing is late, nothing is paired: nothing to be wrong."""
+    """Nothing is late, nothing is paired: nothing to be wrong. Nor is an increment that is paired with the last request."""
     problem = replace(mass(20), dead_time=fp.DeadTime())
-    answers = asked(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), MAP))
-    assert not [q for q in answers if "wrong by" in q]
-
-
-def test_no_question_about_an_increment_without_dead_time():
-    """Its pairing is with the last request: on a yearly map nobody asks about a dead time of a year."""
-    problem = replace(mass(20), dead_time=fp.DeadTime())
-    answers = asked(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Increment(MAP, cycles=0)))
-    assert not [q for q in answers if "wrong by a cycle" in q]
-    believed = asked(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Increment(MAP, cycles=2)))
-    assert [q for q in believed if "wrong by a cycle" in q]
+    for form, applies in ((MAP, False), (fp.Increment(MAP, cycles=0), False), (fp.Increment(MAP, cycles=2), True)):
+        one = case(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), form))
+        assert (bears_wrong_dead_time(one) is not None) == applies
+        assert pays_when_late(one) is None
 
 
 def test_scenarios_draw_the_dead_time():
