@@ -8,21 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from abroad import load
+from reviewed import about as about_all
+from reviewed import answer, answers
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
 from fpirhc.review.forms import forms_of
-
-
-def asked(problem: fp.Problem, controller: Controller) -> dict[str, fp.Answer]:
-    """Answers about the controller by question."""
-    answers = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
-    return {a.question: a for a in answers}
-
-
-def about(answers: dict[str, fp.Answer], words: str) -> fp.Answer:
-    [question] = [q for q in answers if words in q]
-    return answers[question]
 
 
 def test_the_reactor_drifts_within_a_cycle():
@@ -32,8 +22,7 @@ def test_the_reactor_drifts_within_a_cycle():
     """
     task = load("cstr")
     adaptive = task.controllers["RHC+FPI"]
-    answers = asked(task.problem, adaptive)
-    null = about(answers, "right model alone")
+    null = answer(task.problem, adaptive, "right model alone")
     assert null.verdict == "no"
     assert null.numbers["response_with"] > 1e-3
     assert null.numbers["without"] < 1e-4
@@ -42,9 +31,9 @@ def test_the_reactor_drifts_within_a_cycle():
     late = run["error.C_b"][run.time >= task.problem.measure_from]
     assert null.numbers["with"] == pytest.approx(float(np.sqrt(np.mean(late**2))), rel=0.01)
     assert "model-referenced form passes" in null.change
-    assert about(answers, "lower the response error").verdict == "no"
+    assert answer(task.problem, adaptive, "lower the response error").verdict == "no"
     referenced = forms_of(task.problem, adaptive.deformation)["model-referenced"]
-    assert about(asked(task.problem, adaptive.with_deformation(referenced)), "right model alone").verdict == "yes"
+    assert answer(task.problem, adaptive.with_deformation(referenced), "right model alone").verdict == "yes"
 
 
 @pytest.mark.parametrize(
@@ -59,17 +48,21 @@ def test_a_map_of_one_s_own_behind_a_dead_time(name, verdict):
     task = load("own_map")
     unpaired = importlib.import_module("abroad.own_map").unpaired
     controller = task.controllers.get(name, unpaired)
-    answers = asked(task.problem, controller)
-    assert about(answers, "Does the deformation converge").verdict == verdict
-    assert (about(answers, "right model alone").verdict == "yes") == (verdict == "yes")
+
+    def about(words: str) -> fp.Answer:
+        one: fp.Answer = answer(task.problem, controller, words)
+        return one
+
+    assert about("Does the deformation converge").verdict == verdict
+    assert (about("right model alone").verdict == "yes") == (verdict == "yes")
     if name == "unpaired":
-        gain = about(answers, "gain admissible")
+        gain = about_all(answers(task.problem, controller), "gain admissible")
         assert gain.verdict == "no"
         assert 1.5 * gain.numbers["linear_limit"] == pytest.approx(2 * np.sin(np.pi / 18), rel=0.1)
     if name == "RHC+FPI":
-        assert about(answers, "keep up").verdict == "no"
+        assert about("keep up").verdict == "no"
     if verdict == "yes":
-        assert about(answers, "wrong by a cycle").numbers["borne"] == 0
+        assert about("wrong by a cycle").numbers["borne"] == 0
         later = fp.DeadTime(inputs={"F": task.problem.dead_time.inputs["F"] + task.problem.period})
         late = fp.simulate(replace(task.problem, dead_time=later), controller, seed=0, compiled=False)
         assert np.abs(late["realised"] - late["desired"])[-400:].max() > 20  # m/s^2; .53 with the dead time as it is

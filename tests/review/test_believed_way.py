@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import reviewed
 
 import fpirhc as fp
 from fpirhc.simulation.model_as_plant import behind_actuators, with_believed_way
@@ -42,9 +43,8 @@ def task(**changes) -> fp.Problem:
 
 
 def asked(problem: fp.Problem, deformation) -> fp.Answer:
-    answers = fp.review(problem, {"it": fp.ComputedTorque(LAW, deformation)}, mismatch=0.0, seed=0).controllers["it"]
-    [answer] = [a for a in answers if "right model alone" in a.question]
-    return answer
+    one: fp.Answer = reviewed.answer(problem, fp.ComputedTorque(LAW, deformation), "right model alone")
+    return one
 
 
 def test_inputs_act_through_their_lags():

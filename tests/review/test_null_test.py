@@ -8,6 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from reviewed import answer
 from test_review_laws import moving
 
 import fpirhc as fp
@@ -47,9 +48,8 @@ def planned(deformation: Deformation | None = None) -> fp.RecedingHorizon:
 
 def alone(problem: fp.Problem, controller: fp.RecedingHorizon | fp.ComputedTorque) -> fp.Answer:
     """The answer to the null test."""
-    answers = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
-    [answer] = [a for a in answers if "right model alone" in a.question]
-    return answer
+    one: fp.Answer = answer(problem, controller, "right model alone")
+    return one
 
 
 def rms(problem: fp.Problem, controller: fp.RecedingHorizon | fp.ComputedTorque) -> float:

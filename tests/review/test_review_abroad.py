@@ -4,26 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import abroad
 import numpy as np
 import pytest
+from reviewed import answer
 
 import fpirhc as fp
-from fpirhc.review.answer import Review
 
 
 @cache
-def reviewed(name: str, variant: str = "problem") -> Review:
+def about(name: str, words: str, controller: str = "RHC+FPI", variant: str = "problem") -> Any:
+    """The answer to the question with these words."""
     task = abroad.load(name, variant)
-    return fp.review(task.problem, task.controllers, mismatch=0.0, seed=0)
+    return answer(task.problem, task.controllers[controller], words)
 
 
-def about(review: Review, words: str, controller: str | None = None) -> fp.Answer:
-    """The answer to the question with these words, about the problem or a controller."""
-    answers = review.problem if controller is None else review.controllers[controller]
-    [one] = [a for a in answers if words in a.question]
-    return one
+@cache
+def reviewed(name: str) -> tuple[fp.Answer, ...]:
+    """All answers about RHC+FPI."""
+    task = abroad.load(name)
+    return fp.review(task.problem, {"RHC+FPI": task.controllers["RHC+FPI"]}, mismatch=0.0, seed=0).answers
 
 
 # The quadruple tank
@@ -31,7 +33,7 @@ def about(review: Review, words: str, controller: str | None = None) -> fp.Answe
 
 def test_upper_tanks_are_simulated_and_not_taken_from_the_reference():
     """They have no task: the commands follow the two pumps' balance over a swing and not that of levels at rest."""
-    commands = about(reviewed("quadruple_tank"), "commands")
+    commands = about("quadruple_tank", "commands")
     assert commands.verdict == "yes"
     problem = abroad.load("quadruple_tank").problem
     exact = fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=0.1)))
@@ -44,7 +46,7 @@ def test_upper_tanks_are_simulated_and_not_taken_from_the_reference():
 @pytest.mark.parametrize(("variant", "zero", "verdict"), [("problem", -0.018, "yes"), ("nonminimum", 0.013, "no")])
 def test_zeros_of_the_tanks_are_those_of_johansson(variant, zero, verdict):
     """The slower published zero of each point; the levels move by 2 cm, which moves it by some thousandths."""
-    one = about(reviewed("quadruple_tank", variant), "zero dynamics", "CTC+FPI")
+    one = about("quadruple_tank", "zero dynamics", "CTC+FPI", variant)
     assert one.verdict == verdict
     assert one.numbers["rate"] == pytest.approx(zero, abs=4e-3)
     assert one.evidence.startswith("stable" if zero < 0 else "unstable")
@@ -52,10 +54,10 @@ def test_zeros_of_the_tanks_are_those_of_johansson(variant, zero, verdict):
 
 def test_tanks_are_ready_and_their_run_agrees():
     """Every answer about RHC+FPI is yes or advice, and the run is better by a factor."""
-    review = reviewed("quadruple_tank")
-    assert all(a.verdict != "no" for a in review.answers)
-    assert about(review, "Does the deformation converge", "RHC+FPI").verdict == "yes"
-    assert about(review, "reach the wrong parameters", "RHC+FPI").verdict == "yes"
+    answers = {a.question: a.verdict for a in reviewed("quadruple_tank")}
+    assert "no" not in answers.values()
+    assert answers["Does the deformation converge?"] == "yes"
+    assert answers["Does the deformation reach the wrong parameters?"] == "yes"
     task = abroad.load("quadruple_tank")
     errors = [
         np.abs(fp.simulate(task.problem, task.controllers[n], seed=0)["error"][200:]).max() for n in ("RHC", "RHC+FPI")
@@ -68,12 +70,12 @@ def test_tanks_are_ready_and_their_run_agrees():
 
 def test_the_servo_has_nothing_to_adapt():
     """The Jacobian is 1, the load's parameters are named, and adaptation does not lower the response error."""
-    review = reviewed("flexible_servo")
-    signs = about(review, "one sign", "RHC+FPI")
+    review = {a.question: a for a in reviewed("flexible_servo")}
+    signs = review["Do the eigenvalues of the response Jacobian have one sign?"]
     assert (signs.numbers["smallest_over_box"], signs.numbers["largest_over_box"]) == pytest.approx((1.0, 1.0))
-    reach = about(review, "reach the wrong parameters", "RHC+FPI")
+    reach = review["Does the deformation reach the wrong parameters?"]
     assert (reach.verdict, reach.evidence) == ("no", "the response does not depend on J_L, b_L")
-    assert about(review, "lower the response error", "RHC+FPI").verdict == "no"
+    assert review["Does adaptation lower the response error?"].verdict == "no"
 
 
 def test_the_weighed_change_of_the_voltage_leaves_no_answer_out():
@@ -82,13 +84,12 @@ def test_the_weighed_change_of_the_voltage_leaves_no_answer_out():
     Plans are made every 10 cycles, and between them the deformation acts on: a voltage of half the size is too little for it
     (`test_plan_period`), where a plan in every cycle would bear a nineteenth.
     """
-    review = reviewed("flexible_servo")
     for words in ("margin", "sampling fast enough", "zero dynamics"):
         for controller in ("RHC", "RHC+FPI", "RHC exact model"):
             wanted = "unknown" if (words, controller) == ("margin", "RHC+FPI") else "yes"
-            assert about(review, words, controller).verdict == wanted, (words, controller)
-    assert about(review, "margin", "RHC+FPI").numbers["gain_margin"] == pytest.approx(1.74, rel=0.02)
-    assert about(review, "horizon long").verdict == "yes"
+            assert about("flexible_servo", words, controller).verdict == wanted, (words, controller)
+    assert about("flexible_servo", "margin", "RHC+FPI").numbers["gain_margin"] == pytest.approx(1.74, rel=0.02)
+    assert about("flexible_servo", "horizon long").verdict == "yes"
 
 
 # The infusion of propofol
@@ -96,7 +97,7 @@ def test_the_weighed_change_of_the_voltage_leaves_no_answer_out():
 
 def test_compartments_are_filled_by_the_plasma():
     """The largest share of the pump is that of the exact kinetics with compartments that begin empty."""
-    commands = about(reviewed("drug_infusion"), "commands")
+    commands = about("drug_infusion", "commands")
     problem = abroad.load("drug_infusion").problem
     exact = fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=2.0)))
     run = fp.simulate(replace(problem, start={**problem.start, "C1": 3.0}), exact, seed=0)
@@ -106,12 +107,11 @@ def test_compartments_are_filled_by_the_plasma():
 
 def test_a_slow_compartment_is_not_the_deformation_s():
     """Fat fills at 0.0035 1/min whatever the gain is; the deformation converges within the run all the same."""
-    review = reviewed("drug_infusion")
-    slow = about(review, "zero dynamics", "CTC+FPI")
+    slow = about("drug_infusion", "zero dynamics", "CTC+FPI")
     assert slow.verdict == "yes"
     assert slow.numbers["rate"] == pytest.approx(-0.836 / 238, rel=0.01)
     for name in ("CTC+FPI", "RHC+FPI"):
-        one = about(review, "Does the deformation converge", name)
+        one = about("drug_infusion", "Does the deformation converge", name)
         assert one.verdict == "yes"
         assert one.numbers["radius"] < 0.95
         assert "beside those of the states that move by themselves, 0.9994" in one.evidence
@@ -119,7 +119,7 @@ def test_a_slow_compartment_is_not_the_deformation_s():
 
 def test_kinetics_of_states_without_a_task_are_not_missed():
     """The rates of the outer compartments are in no response that matters: named, and no fault."""
-    one = about(reviewed("drug_infusion"), "reach the wrong parameters", "CTC+FPI")
+    one = about("drug_infusion", "reach the wrong parameters", "CTC+FPI")
     assert one.verdict == "yes"
     assert one.evidence.endswith("k21, k31, ke0 (k21, k31, ke0: only in states without a task)")
     assert one.numbers["effect_V1"] > one.numbers["effect_k10"] > one.numbers["effect_k13"] > 0
@@ -127,6 +127,6 @@ def test_kinetics_of_states_without_a_task_are_not_missed():
 
 def test_minutes_are_minutes():
     """No text about the infusion has a second in it."""
-    texts = [f"{a.evidence} {a.change}" for a in reviewed("drug_infusion").answers]
+    texts = [f"{a.evidence} {a.change}" for a in reviewed("drug_infusion")]
     assert not [t for t in texts if " 1/s" in t or " s " in t or "per second" in t]
     assert any(" 1/min" in t for t in texts)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chains import chain, errors_after_request
+from reviewed import about, answer, answers
 from test_review_laws import PERIOD, RATE, moving
 
 import fpirhc as fp
@@ -17,33 +18,21 @@ DAILY = fp.load_problem("problems/gallery/tumour_daily.py")
 PLANNED = "RHC+FPI, gentle"
 
 
-def asked(problem: fp.Problem, controller) -> dict[str, fp.Answer]:
-    """Answers about the controller by question."""
-    answers = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
-    return {a.question: a for a in answers}
-
-
-def about(answers: dict[str, fp.Answer], words: str) -> fp.Answer:
-    [question] = [q for q in answers if words in q]
-    return answers[question]
-
-
 def test_a_gentle_gain_is_worse_than_none_and_what_would_do():
     """Daily doses with gain -0.3: no, and no benefit; the named gain and the named forms converge."""
     gentle = DAILY.controllers[PLANNED]
-    answers = asked(DAILY.problem, gentle)
-    slow = about(answers, "keep up")
+    slow = answer(DAILY.problem, gentle, "keep up")
     assert slow.verdict == "no"
     assert slow.numbers["ratio"] < 1
-    assert about(answers, "lower the response error").verdict == "no"
+    assert answer(DAILY.problem, gentle, "lower the response error").verdict == "no"
     needed = float(slow.change.split("gain = ")[1].split(",")[0])
     map_ = fp.Sigmoid(gain=-0.3, shift=0.3, scale=gentle.deformation.scale)  # type: ignore[attr-defined]
     assert replace(map_) == gentle.deformation
     larger = replace(map_, gain=needed)
     assert gain_times(map_, needed / map_.gain) == f"gain = {needed:.3g}"
     for mended in (larger, fp.Increment(map_, cycles=0), fp.ModelReferenced(map_)):
-        better = asked(DAILY.problem, gentle.with_deformation(mended))
-        assert about(better, "Does the deformation converge").verdict == "yes"
+        better = predict(DAILY.problem, gentle.with_deformation(mended))
+        assert better.verdict == "yes"
     assert "(ModelReferenced, Increment), or use gain = " in slow.change
     without, adapted = (
         fp.measure(DAILY.problem, fp.simulate(DAILY.problem, gentle.with_deformation(one), seed=0, compiled=False))
@@ -56,10 +45,10 @@ def test_a_gentle_gain_is_worse_than_none_and_what_would_do():
 def test_smallest_gain_of_a_plan_is_where_its_loop_is_stable():
     """Just below it a pole is outside the unit circle, just above it none is."""
     gentle = DAILY.controllers[PLANNED]
-    least = about(asked(DAILY.problem, gentle), "keep up").numbers["least"]
+    least = answer(DAILY.problem, gentle, "keep up").numbers["least"]
     for share, stable in ((0.97, False), (1.03, True)):
         one = gentle.with_deformation(gentle.deformation.with_effective_gain(share * least))
-        assert (about(asked(DAILY.problem, one), "Does the deformation converge").numbers["radius"] < 1) == stable
+        assert (predict(DAILY.problem, one).numbers["radius"] < 1) == stable
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.95, "yes"), (0.99, "unknown")])
@@ -68,14 +57,14 @@ def test_a_secant_below_the_bound_of_the_map_may_be_beyond_that_of_the_loop(shar
     sigmoid = fp.Sigmoid(gain=-1.0, scale=5.0)
     chosen = sigmoid.with_effective_gain(share * 2 / 1.5 * sigmoid.effective_gain() / sigmoid.secant_gain())
     problem, controller = chain(2, 1.5), fp.ComputedTorque(fp.Exponential(rate=RATE), chosen)
-    answer = about(asked(problem, controller), "Does the deformation converge")
-    assert answer.verdict == predict(problem, controller).verdict
-    slowest = answer.numbers["radius"] ** problem.cycles
+    converges = about(answers(problem, controller), "Does the deformation converge")
+    assert converges.verdict == predict(problem, controller).verdict
+    slowest = converges.numbers["radius"] ** problem.cycles
     requests = np.random.default_rng(0).uniform(-10, 10, size=(12, 1))
     sizes = np.abs(errors_after_request(problem, controller, requests, 4000)[-50:, 0]).max(axis=0)
     assert (sizes.max() < 1e-6) == (verdict == "yes")
     if slowest < 1e-2:
-        assert answer.verdict == verdict
+        assert converges.verdict == verdict
 
 
 @pytest.mark.parametrize(("scale", "verdict"), [(0.5, "no"), (1.0, "no"), (2.0, "yes")])
@@ -83,9 +72,8 @@ def test_basin_of_the_plain_form(scale, verdict):
     """A start 1 m off the reference with a wrong model: steps that are too small for the first errors lose it for good."""
     problem = replace(moving(1.5), start={"y": 1.0})
     controller = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Sigmoid(gain=-0.5, scale=scale))
-    answers = asked(problem, controller)
-    assert about(answers, "come back").verdict == verdict
-    assert about(answers, "Does the deformation converge").verdict == ("yes" if verdict == "yes" else "unknown")
+    assert answer(problem, controller, "come back").verdict == verdict
+    assert predict(problem, controller).verdict == ("yes" if verdict == "yes" else "unknown")
     run = fp.simulate(replace(problem, duration=6.0), controller, seed=0, compiled=False)
     late = np.abs(run["error"][round(5.0 / PERIOD) :]).max()
     assert (late < 0.1) == (verdict == "yes")

@@ -9,9 +9,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from reviewed import answer
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
 from fpirhc.review.grid import review_grid
 from fpirhc.review.inner import inner_motion, inner_places
 from fpirhc.review.zero_dynamics import zero_dynamics
@@ -39,12 +39,6 @@ def companion(rate: float, *, weigh: bool = False, **settings: Any) -> fp.Proble
         "cost": fp.Quadratic(states={"y": 1.0} | ({"z": 1.0} if weigh else {}), deviation={"u": 1e-3}),
     }
     return fp.Problem(plant=plant, **(usual | settings))
-
-
-def answer(problem: fp.Problem, controller: Controller, words: str) -> fp.Answer:
-    every = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).answers
-    [one] = [a for a in every if words in a.question]
-    return one
 
 
 @pytest.mark.parametrize(

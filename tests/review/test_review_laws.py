@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import reviewed
 from chains import chain, errors_after_request
 from sampled import lag, poles
 
@@ -30,9 +31,7 @@ def moving(eigenvalue: float = 1.5, **settings) -> fp.Problem:
 
 def answer(problem: fp.Problem, deformation: Deformation, words: str) -> Any:
     """The answer to the question with these words, None where it is not asked."""
-    controller = fp.ComputedTorque(fp.Exponential(rate=RATE), deformation)
-    answers_by_question = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
-    return next((a for a in answers_by_question if words in a.question), None)
+    return reviewed.answer(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), deformation), words)
 
 
 @pytest.mark.parametrize(("ratio", "verdict"), [(0.9, "no"), (2.0, "unknown"), (4.0, "yes")])

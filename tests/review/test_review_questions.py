@@ -9,21 +9,14 @@ import abroad
 import casadi as ca
 import numpy as np
 import pytest
+from reviewed import answer
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import ideal_loops
 from fpirhc.review.slew import slew_enough
-
-
-def answer(problem: fp.Problem, controllers: dict[str, Controller], words: str) -> fp.Answer | None:
-    """The answer to the one question with these words; None where it is not asked."""
-    every = fp.review(problem, controllers, mismatch=0.0, seed=0).answers
-    return next((a for a in every if words in a.question), None)
-
 
 # Parameters
 
@@ -38,8 +31,7 @@ ADAPTIVE = fp.ComputedTorque(fp.Exponential(rate=2.0), fp.Sigmoid(gain=-0.5, sca
 
 def test_parameters_out_of_reach_are_named():
     """The motor's response has neither the load's inertia nor its friction: a no that names both."""
-    one = answer(servo(), {"it": ADAPTIVE}, "reach the wrong parameters")
-    assert one is not None
+    one = answer(servo(), ADAPTIVE, "reach the wrong parameters")
     assert (one.verdict, one.numbers["reached"]) == ("no", 0.0)
     assert one.evidence == "the response does not depend on J_L, b_L"
     assert "nothing to correct" in one.change
@@ -51,8 +43,7 @@ def test_parameters_in_reach_have_their_effect():
     stiffness = fp.Parameter(approximate=0.9 * 1280.2, exact=1280.2, unit="N m/rad")
     plant = replace(problem.plant, parameters={**problem.plant.parameters, "k": stiffness})
     problem = replace(problem, plant=plant, reference=fp.Trajectory(lambda t: {"load": 0.1 * t, "motor": 2 * t + 1.0}))
-    one = answer(replace(problem, judged=("motor", "load")), {"it": ADAPTIVE}, "reach the wrong parameters")
-    assert one is not None
+    one = answer(replace(problem, judged=("motor", "load")), ADAPTIVE, "reach the wrong parameters")
     assert one.verdict == "unknown"
     assert one.numbers["effect_k"] == pytest.approx(128.02 / 20 * (1.0 / 20) / 0.5)
     assert one.evidence.endswith("the response does not depend on J_L, b_L")
@@ -61,10 +52,9 @@ def test_parameters_in_reach_have_their_effect():
 def test_a_right_model_has_nothing_out_of_reach():
     """The exact model with the same deformation; without a deformation the question has no meaning."""
     words = "reach the wrong parameters"
-    exact = answer(servo(), {"it": fp.ExactModel(ADAPTIVE)}, words)
-    assert exact is not None
+    exact = answer(servo(), fp.ExactModel(ADAPTIVE), words)
     assert (exact.verdict, exact.numbers["wrong"]) == ("yes", 0.0)
-    assert answer(servo(), {"it": replace(ADAPTIVE, deformation=fp.Identity())}, words) is None
+    assert answer(servo(), replace(ADAPTIVE, deformation=fp.Identity()), words) is None
 
 
 # Limits
@@ -109,16 +99,14 @@ KEEPS = "keep the limits of states"
 )
 def test_limits_that_the_reference_leaves(limits, verdict):
     """The position reaches 0.5 m, the force changes by 1 N/s, the power by 0.25 W: -2 A^2 sin t cos t."""
-    one = answer(mass(**limits), {}, KEEPS)
-    assert one is not None
+    one = answer(mass(**limits), None, KEEPS)
     assert one.verdict == verdict
     assert bool(one.change) == (verdict != "yes")
 
 
 def test_limits_that_are_touched_are_not_covered():
     """At rest on the limit: the linear loop leaves it out, which is no yes."""
-    one = answer(mass(0.0, states={"q": (0.0, 1.0)}), {}, KEEPS)
-    assert one is not None
+    one = answer(mass(0.0, states={"q": (0.0, 1.0)}), None, KEEPS)
     assert (one.verdict, one.numbers["room_q"]) == ("unknown", 0.0)
 
 
@@ -131,15 +119,14 @@ def test_limits_inside_leave_the_linear_loop_known():
     }
     plain = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))
     for words in ("sampling fast enough", "margin", "horizon long", KEEPS):
-        one = answer(mass(**limits), {"it": plain}, words)
-        assert one is not None
+        one = answer(mass(**limits), plain, words)
         assert "known" not in one.evidence
         assert one.verdict != "unknown" or words == "horizon long"
 
 
 def test_without_such_limits_the_question_is_not_asked():
     """Inputs have a question of their own."""
-    assert answer(mass(inputs={"u": (-2.0, 2.0)}), {}, KEEPS) is None
+    assert answer(mass(inputs={"u": (-2.0, 2.0)}), None, KEEPS) is None
 
 
 # Reasons
@@ -151,9 +138,7 @@ def test_a_learning_controller_has_the_loop_of_its_first_model():
     learning = task.controllers["AID"]
     assert isinstance(learning, fp.AdaptiveInverseDynamics)
     plain = fp.ComputedTorque(learning.tracking)
-    one, other = (answer(task.problem, {"it": c}, "margin") for c in (learning, plain))
-    assert one is not None
-    assert other is not None
+    one, other = (answer(task.problem, c, "margin") for c in (learning, plain))
     assert one.numbers["radius"] == pytest.approx(other.numbers["radius"], rel=1e-4)
     assert (one.verdict, one.numbers["radius"] > 1) == ("unknown", True)
 
@@ -161,8 +146,7 @@ def test_a_learning_controller_has_the_loop_of_its_first_model():
 def test_advice_for_a_controller_without_a_map_names_no_gain():
     """A plan with small margins has no gain of a map that could be lowered."""
     task = fp.load_problem("delayed_tanks")
-    one = answer(task.problem, {"RHC": task.controllers["RHC"]}, "margin")
-    assert one is not None
+    one = answer(task.problem, task.controllers["RHC"], "margin")
     assert (one.verdict, one.change) == ("unknown", "Weigh the inputs more.")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from reviewed import about, answers, case, case_of_runs
+from reviewed import about, answers, case
 
 import fpirhc as fp
 from fpirhc.contraction.delayed import leaking_limit
@@ -179,7 +179,7 @@ def test_the_loop_is_asked_and_not_the_iteration_alone(weight, verdict):
     )
     controller = fp.Predicted(plan, inputs=60 * PERIOD)
     assert 0.75 * 1.3 < 1  # the product of gain and eigenvalue for which the leak is proved to be enough
-    answer = pays_when_late(case_of_runs(problem, controller))
+    answer = pays_when_late(case(problem, controller))
     assert answer is not None
     assert answer.verdict == verdict
     for name, cycles in (("longer", 66), ("shorter", 54)):
