@@ -18,6 +18,7 @@ from fpirhc.review import (
     commands,
     convergence,
     discretisation,
+    gain,
     horizon,
     margins,
     null_test,
@@ -31,8 +32,10 @@ from fpirhc.review import (
     well_posed,
     zero_dynamics,
 )
+from fpirhc.review.gain_advice import gain_advice
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
+from fpirhc.review.maps import largest_product
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.planned import is_planned
@@ -104,6 +107,14 @@ def _own(one: Case) -> Any:
     return spectrum_near(one.grid, one.believed, one.grid.draws[:1], near=False)
 
 
+def _admissible(one: Case) -> fp.Answer:
+    deformation, own = one.controller.deformation, _own(one)
+    boxed = spectrum_near(one.grid, one.believed, one.grid.draws, near=False)
+    limit = largest_product(one.problem, deformation, own.eigenvalues)
+    advice = gain_advice(one, boxed, null_test.leaves_right_model_alone(one))
+    return gain.gain_admissible(deformation, own, boxed, limit, advice)
+
+
 def _ideal(one: Case) -> Any:
     return one.loops.ideal if is_planned(one.controller) else None
 
@@ -132,6 +143,7 @@ OF_CONTROLLERS: dict[str, list[Callable[[Case], Any]]] = {
     null_test.QUESTION_TEXT: [_adaptive(null_test.leaves_right_model_alone, of_targets=True)],
     pays.QUESTION: [_adaptive(pays.pays)],
     two_cycles.QUESTION: [_adaptive(two_cycles.free_of_two_cycles)],
+    gain.QUESTION: [_adaptive(_admissible)],
     speed.FAST: [_adaptive(lambda one: speed.fast_enough(one, _own(one)))],
     speed.LAG: [_adaptive(lambda one: speed.bears_lag(one.grid, one.controller, _own(one)))],
     slew.QUESTION: [

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from abroad import load
-from reviewed import about as about_all
-from reviewed import answer, answers
+from reviewed import answer
 
 import fpirhc as fp
 from fpirhc.review.forms import forms_of
@@ -56,7 +55,7 @@ def test_a_map_of_one_s_own_behind_a_dead_time(name, verdict):
     assert about("Does the deformation converge").verdict == verdict
     assert (about("right model alone").verdict == "yes") == (verdict == "yes")
     if name == "unpaired":
-        gain = about_all(answers(task.problem, controller), "gain admissible")
+        gain = about("gain admissible")
         assert gain.verdict == "no"
         assert 1.5 * gain.numbers["linear_limit"] == pytest.approx(2 * np.sin(np.pi / 18), rel=0.1)
     if name == "RHC+FPI":

@@ -129,7 +129,7 @@ def test_dead_time_limit_is_where_the_loop_leaves_the_unit_circle(cycles):
         loops = loops_along(review_grid(problem, 0.0, 0), controller)
         assert (loops.radii.max() < 1) == stable
         if not stable or cycles == 1:
-            verdict = about(answers(problem, controller), "gain admissible").verdict
+            verdict = answer(problem, controller, "gain admissible").verdict
             assert (verdict == "yes") == stable
 
 
@@ -204,11 +204,7 @@ def test_a_good_problem_is_ready():
 )
 def test_what_is_wrong_is_answered_no(words, controller, settings):
     """Each question finds its own mistake, and says what to change."""
-    one = (
-        about(answers(mass(**settings), controller), words)
-        if "admissible" in words
-        else answer(mass(**settings), controller, words)
-    )
+    one = answer(mass(**settings), controller, words)
     assert one.verdict == "no"
     assert one.change
 

@@ -17,10 +17,13 @@ from foreign_plants import (
     rocket,
     underwater,
 )
+from reviewed import answer, case
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
 from fpirhc.review.answer import Verdict
+from fpirhc.review.convergence import box_converges
+from fpirhc.review.review import predict
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import written_out
 
@@ -58,8 +61,7 @@ def test_an_output_whose_gain_vanishes_on_the_way_is_refused_with_place_and_time
 def test_zero_dynamics_that_hardly_grow_over_the_run_are_no_refusal(plant, grown):
     """The rocket's mass, and rounded matrices: the run cannot show the growth, and the comparison is good."""
     one = plant()
-    answers = fp.review(one.problem, one.controllers, mismatch=0.0, seed=0).controllers["CTC"]
-    zero = next(a for a in answers if a.question == "Are the zero dynamics stable?")
+    zero = answer(one.problem, one.controllers["CTC"], "zero dynamics")
     assert zero.verdict is Verdict.UNKNOWN
     assert f"by {grown} over the run" in zero.evidence
 
@@ -117,36 +119,30 @@ def test_a_plan_is_not_refused_for_growth_that_the_run_does_not_show(plant, ques
     problem = replace(
         one.problem, horizon=fp.Horizon(stages=15, step=period), cost=fp.Quadratic(outputs={output: 100.0})
     )
-    controllers = {"RHC": fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3))}
-    review = fp.review(problem, controllers, mismatch=0.0, seed=0)
-    answer = next(a for a in (*review.problem, *review.controllers["RHC"]) if a.question == question)
-    assert answer.verdict is Verdict.UNKNOWN
-    assert said in answer.evidence
-    assert answer.change.startswith(change)
+    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3))
+    one_answer = answer(problem, plan, question)
+    assert one_answer.verdict is Verdict.UNKNOWN
+    assert said in one_answer.evidence
+    assert one_answer.change.startswith(change)
 
 
 @pytest.mark.parametrize("plant", [rocket, masses])
 def test_growth_that_no_gain_changes_is_not_blamed_on_the_gain(plant):
     """The zero dynamics are the slowest mode: neither the tracking rate nor the gain is advised to change."""
     one = plant()
-    answers = {
-        a.question: a for a in fp.review(one.problem, one.controllers, mismatch=10.0, seed=0).controllers["CTC+FPI"]
-    }
-    for question in ("Does the deformation converge?", "Does it converge all over the box of parameters?"):
-        assert answers[question].verdict is Verdict.UNKNOWN
-        assert answers[question].change.startswith(
-            "The slowest mode is that of the zero dynamics, which no gain changes"
-        )
+    adaptive = one.controllers["CTC+FPI"]
+    boxed = case(one.problem, adaptive, mismatch=10.0)
+    for said in (predict(one.problem, adaptive), box_converges(boxed.grid, boxed.loops)):
+        assert said.verdict is Verdict.UNKNOWN
+        assert said.change.startswith("The slowest mode is that of the zero dynamics, which no gain changes")
 
 
 @pytest.mark.parametrize("plant", [magnet, rocket, masses])
 def test_a_gain_is_recommended_beside_modes_that_no_gain_changes(plant):
     """Neutral modes, and zero dynamics that the run does not show, set no limit; a run speaks for the named gain."""
     one = plant()
-    answers = {
-        a.question: a for a in fp.review(one.problem, one.controllers, mismatch=10.0, seed=0).controllers["CTC+FPI"]
-    }
-    advice = answers["Is the map's gain admissible?"].numbers["recommended"]
+    admissible = answer(one.problem, one.controllers["CTC+FPI"], "gain admissible", mismatch=10.0)
+    advice = admissible.numbers["recommended"]
     assert advice < -0.5
     law = one.controllers["CTC"]
     without, recommended = (

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from reviewed import answer
 from test_verdict import case
 from test_verdict_sentences import EFFORT, entry, first, no_difference
 
@@ -29,8 +30,7 @@ def test_a_gentle_gain_is_blamed_and_not_the_limits_that_it_swings_between(daily
     pair = {name: daily.controllers[name] for name in ("RHC", GENTLE)}
     task = replace(daily, controllers=pair, headline=("RHC", GENTLE))
     comparison = fp.compare(task, seed=0, compiled=False)
-    answers = fp.review(daily.problem, {GENTLE: pair[GENTLE]}, mismatch=0.0, seed=0).controllers[GENTLE]
-    [slow] = [a for a in answers if "keep up" in a.question]
+    slow = answer(daily.problem, pair[GENTLE], "keep up")
     assert comparison.outcome is Outcome.WORSE
     assert f" Its gain is too small: {slow.evidence}. {slow.change}" in comparison.verdict[0]
     assert "stands at a limit" not in comparison.verdict[0]
@@ -69,8 +69,7 @@ def test_a_review_names_the_weight_of_the_effort_in_the_same_words():
     """two_mass has a pair with such a cost on purpose."""
     task = fp.load_problem("two_mass")
     for name, verdict in (("RHC+FPI, absolute effort", "unknown"), ("RHC+FPI", "yes")):
-        answers = fp.review(task.problem, {name: task.controllers[name]}, mismatch=0.0, seed=0).controllers[name]
-        [one] = [a for a in answers if "effort free" in a.question]
+        one = answer(task.problem, task.controllers[name], "effort free")
         assert one.verdict == verdict
         if verdict == "unknown":
             assert f" I{one.evidence[1:]}. {one.change}" == EFFORT
