@@ -4,6 +4,7 @@ The public names stand in `__init__.pyi`; each is imported when it is first used
 A member of a family that does not stand there yet is found by the name of its file (see `fpirhc.members`).
 """
 
+from importlib import import_module as _import_module
 from importlib.metadata import version as _version
 
 import lazy_loader as _lazy
@@ -26,3 +27,8 @@ def __getattr__(name: str) -> object:
     if member is None:
         raise InvalidName(f"fpirhc has no name '{name}'.{nearest(name, __all__)}")
     return member
+
+
+def __reduce_ex__(_: object) -> object:
+    """The package is pickled by its name, so that functions of notebooks that use it can go to other processes."""
+    return _import_module, (__name__,)

@@ -127,3 +127,10 @@ def test_a_longer_horizon_is_no_longer_code():
     """Stages are accumulated calls of one Function: written out one by one they would compile for seconds."""
     short, long = (rollout(horizon(fp.Limits(), stages)).n_nodes() for stages in (10, 40))
     assert long < 2 * short
+
+
+def test_the_package_is_pickled_by_its_name():
+    """lazy_loader gives it a class of module that pickles by value cannot take; functions of notebooks hold the package itself."""
+    content = pickle.dumps(fp)
+    assert len(content) < 100
+    assert pickle.loads(content) is fp
