@@ -19,15 +19,13 @@ from typing import TYPE_CHECKING, Any
 from fpirhc.errors import InvalidName
 from fpirhc.report.figures import contraction_figure, lyapunov_figure, mismatch_figure, pair_figures
 from fpirhc.report.series import chart_data
-from fpirhc.simulation.drawing import BANDS, PALETTE
-from fpirhc.simulation.pictures.base import Drawing, png
+from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import Column, Table
 from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
     from jinja2 import Environment
-    from matplotlib.figure import Figure
 
     from fpirhc.simulation.pictures.base import Picture
     from fpirhc.simulation.run import Run
@@ -62,7 +60,7 @@ class Image:
 
     source: str
     alt: str
-    caption: str
+    caption: str = ""
 
 
 def write_report(comparison: Comparison, path: Path) -> None:
@@ -89,9 +87,9 @@ def render(comparison: Comparison) -> str:
         bands=BANDS,
         pairs=_pairs(*pair) if pair else [],
         own=own_pictures(comparison),
-        contraction=[picture(contraction, _CONTRACTION)] if contraction else [],
+        contraction=[Image(contraction.address, _CONTRACTION)] if contraction else [],
         contracts=[f"{e.name}: {e.contraction.report.text}" for e in entries if e.contraction],
-        lyapunov=[picture(lyapunov, "Lyapunov function over time with its ultimate bound", _LYAPUNOV)]
+        lyapunov=[Image(lyapunov.address, "Lyapunov function over time with its ultimate bound", _LYAPUNOV)]
         if lyapunov
         else [],
         in_force=_in_force(comparison),
@@ -120,7 +118,7 @@ def _slots(comparison: Comparison) -> dict[tuple[str, ...], list[str]]:
 def _pairs(plain: Entry, adaptive: Entry) -> list[Image]:
     sides = f"{plain.name} on the left, {adaptive.name} on the right"
     return [
-        picture(figure, f"{title}: {sides}", f"{title}. {_CAPTIONS.get(title.partition(' [')[0], '')}")
+        Image(figure.address, f"{title}: {sides}", f"{title}. {_CAPTIONS.get(title.partition(' [')[0], '')}")
         for title, figure in pair_figures(plain, adaptive).items()
     ]
 
@@ -135,12 +133,12 @@ def _own(wanted: Picture, runs: Mapping[str, Run]) -> Image | None:
     shown = {name: run for name, run in runs.items() if not wanted.controllers or name in wanted.controllers}
     if not shown:
         return None
-    figure = Drawing(figsize=wanted.size(len(shown)), layout="constrained")
+    figure = new_figure(*wanted.size(len(shown)))
     try:
         wanted.draw(figure, shown)
     except InvalidName as error:
         return Image("", "", f"{wanted.title} is not drawn: {error}")
-    return picture(figure, f"{wanted.title}: {', '.join(shown)}", f"{wanted.title}. {wanted.caption}".strip())
+    return Image(figure.address, f"{wanted.title}: {', '.join(shown)}", f"{wanted.title}. {wanted.caption}".strip())
 
 
 def _in_force(comparison: Comparison) -> Table:
@@ -173,7 +171,7 @@ def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
 def render_scenarios(comparison: ScenarioComparison) -> str:
     """Return the page's text."""
     figure = mismatch_figure(comparison) if comparison.summaries else None
-    chart = picture(figure, "Error against mismatch", _MISMATCH) if figure else None
+    chart = Image(figure.address, "Error against mismatch", _MISMATCH) if figure else None
     return render_page("scenarios.html", comparison.view, chart=chart)
 
 
@@ -230,11 +228,6 @@ def _policy(scripts: Sequence[str]) -> str:
         f"default-src 'none'; script-src {code}; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
         "form-action 'none'"
     )
-
-
-def picture(figure: Figure, alt: str, caption: str = "") -> Image:
-    """Return a figure as a picture inside the page."""
-    return Image(f"data:image/png;base64,{base64.b64encode(png(figure)).decode('ascii')}", alt, caption)
 
 
 def asset(name: str) -> str:

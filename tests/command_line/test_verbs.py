@@ -183,6 +183,8 @@ HEAVY = ("casadi", "numpy", "scipy", "rich", "jinja2", "matplotlib", "control", 
         ("from fpirhc.cli.main import main; main([])", HEAVY),
         ("from fpirhc.cli.main import main; main(['list'])", HEAVY),
         ("import fpirhc as fp; fp.Problem", HEAVY[2:]),
+        ("import fpirhc as fp; fp.load_problem('two_mass')", ("matplotlib", "rich", "jinja2")),
+        ("import fpirhc.report.html", ("matplotlib",)),
     ],
 )
 def test_what_comes_first_is_light(first, absent):

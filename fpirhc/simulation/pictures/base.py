@@ -22,12 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-import io
-
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.image import imsave
-
 INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 
 
@@ -102,23 +96,3 @@ def caption_axes(axis: Axes, across: str, up: str) -> None:
     axis.set_xlabel(drawing.literal(across))
     axis.set_ylabel(drawing.literal(up))
     axis.grid(visible=True, alpha=0.25)
-
-
-_DOTS = 88  # per inch
-
-
-def png(figure: Figure) -> bytes:
-    """Return the picture of a figure; `savefig` would draw it twice, once for nothing but its layout."""
-    figure.set_dpi(_DOTS)
-    canvas, buffer = FigureCanvasAgg(figure), io.BytesIO()
-    canvas.draw()
-    imsave(buffer, canvas.buffer_rgba(), format="png", dpi=_DOTS)
-    return buffer.getvalue()
-
-
-class Drawing(Figure):
-    """A matplotlib Figure with a picture for notebooks."""
-
-    def _repr_png_(self) -> bytes:
-        """The picture as PNG; notebooks call this method."""
-        return png(self)

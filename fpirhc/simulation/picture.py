@@ -1,0 +1,29 @@
+"""A figure that notebooks show with any back end; it chooses no back end and opens no window, and nothing else imports matplotlib."""
+
+from __future__ import annotations
+
+import io
+from base64 import b64encode
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+
+_DOTS = 88  # per inch
+
+
+class Drawing(Figure):
+    """A matplotlib Figure with a picture for notebooks and pages."""
+
+    def _repr_png_(self) -> bytes:
+        """The picture as PNG; notebooks call this method. `savefig` would draw it twice, once for nothing but its layout."""
+        self.set_dpi(_DOTS)
+        canvas, buffer = FigureCanvasAgg(self), io.BytesIO()
+        canvas.draw()
+        imsave(buffer, canvas.buffer_rgba(), format="png", dpi=_DOTS)
+        return buffer.getvalue()
+
+    @property
+    def address(self) -> str:
+        """The picture as the address of an image inside a page."""
+        return f"data:image/png;base64,{b64encode(self._repr_png_()).decode('ascii')}"
