@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from fpirhc.contraction.gains import ContractionReport, assess_gain
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.recommended_gain import Recommended
+from fpirhc.review.question import Case
+from fpirhc.review.recommended_gain import FAR, Recommended, limit_of_loop
 
 QUESTION = "Is the map's gain admissible?"
 
@@ -41,6 +44,33 @@ def gain_admissible(
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
     good = 0 < value / advice.limit < 1 and _within(wide, wide.sector_limit, share)
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, "" if good else change, numbers)
+
+
+def gain_of_target(case: Case) -> Answer | None:
+    """Return the limit of a map on targets, that of its whole loop; None where the gain changes on line or is not known."""
+    deformation, loops = case.controller.deformation, case.by_gain
+    if loops is None:
+        return None
+    value, name = deformation.effective_gain(), deformation.gain_name
+    own = getattr(deformation, name, None)
+    name, scale = ("effective gain", 1.0) if own is None else (name, float(own) / value)
+    limit, sets = limit_of_loop(deformation, loops)
+    numbers = {"gain": value * scale, "limit": limit * scale, "recommended": limit * scale / 2}
+    text = f"{name} = {value * scale:.4g}; "
+    if not math.isfinite(limit):
+        return Answer(
+            QUESTION,
+            Verdict.YES,
+            f"{text}no gain up to {FAR:g} times as large is a limit of the whole loop",
+            "",
+            numbers,
+        )
+    text += f"the smallest limit is {limit * scale:.3g}, set by {sets}"
+    if value / limit < 1:
+        return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    along = case.loops.radii.max() < 1  # in the box it is another matter
+    verdict = Verdict.UNKNOWN if along else Verdict.NO
+    return Answer(QUESTION, verdict, text, f"Use {name} = {limit * scale / 2:.3g}, half of it.", numbers)
 
 
 def _within(report: ContractionReport, limit: tuple[float, float], share: float) -> bool:

@@ -31,6 +31,7 @@ _POINTS, _POINTS_OF_PLANS = 7, 3
 _DRAWN, _DRAWN_OF_PLANS = 16, 5  # draws of the parameters, of all points together
 _CYCLES = 400  # of the run to a point that laws and plans in every cycle take at most
 _PERIODS = 30  # of plans that the run to a point takes at least
+_GENTLE = 0.1  # share of a map's gain
 _SMALL = 1e-3  # feedback of a point at a limit, as a share of the others'
 
 
@@ -78,12 +79,12 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     sought = thinned(usable(grid), _POINTS if quick else _POINTS_OF_PLANS)
     every = {k: points.at(k) for k in sought}
     strongest = np.max([_fed_back(one) for one in every.values()], axis=0)
-    places = tuple(k for k, one in every.items() if (_fed_back(one) > _SMALL * strongest).all())
-    if not places:
+    places = tuple(k for k, one in every.items() if (_fed_back(one) >= _SMALL * strongest).all())
+    if not places or not (strongest.all() or all(points.asked.inside(points.quiet(k)) for k in places)):
         raise NotSupported("the command stands at a limit all along the reference")
     pairs = _pairs(grid, places, _DRAWN if quick else _DRAWN_OF_PLANS)
     drawn = {pair: points.at(*pair) for pair in pairs if np.isfinite(grid.commands[pair[::-1]]).all()}
-    drawn = {pair: one for pair, one in drawn.items() if (_fed_back(one) > _SMALL * strongest).all()}
+    drawn = {pair: one for pair, one in drawn.items() if (_fed_back(one) >= _SMALL * strongest).all()}
     late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, places[:: max(1, len(places) // 2)])]
     ideal = ideal_loops(grid, controller, 1)[0]
     loops, learns = tuple(every[k] for k in places), controller.learns and points.asked.keeps_learned
@@ -125,11 +126,29 @@ class Points:
         if (place, draw) not in self._quiets:
             grid = self.grid
             states = grid.states if draw == 0 else grid.drawn_states[draw]
-            at = self._quiet(place, states[place], grid.commands[draw, place], grid.draws[draw])
+            where = place, states[place], grid.commands[draw, place], grid.draws[draw]
+            at = self._quiet(*where)
+            if self._gentle is not None:
+                try:
+                    self._loops[place, draw] = self.asked.at(at)
+                except NotSupported:
+                    at = self.asked.with_gain(self._quiet(*where, self._gentle), self._own)
             self._quiets[place, draw] = at
         return self._quiets[place, draw]
 
-    def _quiet(self, place: int, state: np.ndarray, command: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    @property
+    def _own(self) -> float:
+        return self.asked.controller.deformation.effective_gain()
+
+    @cached_property
+    def _gentle(self) -> float | None:
+        """The gain with which a map on targets, whose fixed point is not known, is led there if it does not converge itself."""
+        linear = self.asked.controller.deforms == "target" and self.asked.gained
+        return _GENTLE * self._own if linear else None
+
+    def _quiet(
+        self, place: int, state: np.ndarray, command: np.ndarray, exact: np.ndarray, gain: float | None = None
+    ) -> np.ndarray:
         grid, asked, plant = self.grid, self.asked, self.grid.problem.plant
         reality = asked.problem.symbolic_reality
         start = asked.start(
@@ -137,6 +156,7 @@ class Points:
             state=dict(zip(plant.state.elements, map(float, state), strict=True)),
             before=dict(zip(plant.inputs, map(float, command), strict=True)),
             exact=exact if reality is None else None,
+            gain=gain,
         )
         times = grid.times[place] + grid.problem.period * np.arange(1, self._cycles + 1)
         led = grid.states_at(times) + (state - grid.states[place])

@@ -31,6 +31,7 @@ MARGIN = 2.0
 SECANT, TWO_CYCLE = "the map's steepest secant", "a two-cycle of the whole loop"
 POLES, MARGINS = "the poles of the whole loop", "the margins of the whole loop"
 _ALONG, _DRAWN = 9, 8  # loops that are looked at
+FAR = 10.0  # times a map's own gain, up to which a limit on targets is sought
 _LEAST = 1e-3  # of the smallest other limit, down to which a stable gain is sought
 _STEPS, _BISECTIONS = 24, 12
 
@@ -101,6 +102,21 @@ def secant_limit(loops: LoopsByGain) -> float | None:
         return min(two_cycle_limit(low.dynamics, own.dynamics, loops.gains) for low, own in loops.held(_ALONG))
     except (FpirhcError, np.linalg.LinAlgError):
         return None
+
+
+def limit_of_loop(deformation: Deformation, loops: LoopsByGain) -> tuple[float, str]:
+    """Return the smallest effective gain that is a limit of the whole loop, up to `FAR` times the map's own, and what sets it.
+
+    Infinite where there is none; NaN where no gain down to a hundredth of the map's own converges.
+    """
+    own = deformation.effective_gain()
+    size, sign = abs(own), math.copysign(1.0, own)
+    limits = dict(_limits_of_loop(deformation, loops, FAR * size, sign))
+    if not limits and not _stable(loops, sign * FAR * size):
+        return math.nan, ""
+    sets = min(limits, key=lambda name: limits[name], default="")
+    limit = limits[sets] if sets else math.inf
+    return (sign * limit, sets) if limit <= FAR * size else (math.inf, "")
 
 
 def _limits_of_loop(deformation: Deformation, loops: LoopsByGain, most: float, sign: float) -> Mapping[str, float]:

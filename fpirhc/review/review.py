@@ -17,7 +17,7 @@ from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges
 from fpirhc.review.discretisation import discretisation_follows
 from fpirhc.review.form import right_form
-from fpirhc.review.gain import gain_admissible
+from fpirhc.review.gain import gain_admissible, gain_of_target
 from fpirhc.review.gain_advice import gain_advice
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.horizon import horizon_long_enough
@@ -28,7 +28,6 @@ from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.null_test import leaves_right_model_alone
-from fpirhc.review.of_order_zero import controls_order_zero, review_of_order_zero
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
 from fpirhc.review.planned import is_planned
@@ -61,8 +60,6 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
     grid = review_grid(problem, mismatch, seed)
-    if controls_order_zero(grid):
-        return review_of_order_zero(grid, controllers)
     first = (well_posed, relative_orders, inverse_exists, commands_inside, discretisation_follows, horizon_long_enough)
     general = _answers((*first, *(question.ask for question in known_questions(ProblemQuestion))), grid)
     runs = NominalRuns(grid.problem)
@@ -167,16 +164,15 @@ def _concerns(question: ControllerQuestion, controller: Controller) -> bool:
 def _of_target(case: Case, general: list[Answer]) -> list[Answer]:
     """Answers about a map on targets: those of its linear loop. The gains of other questions are those of responses."""
     del general
-    covered = Answer(
-        "Is the map's gain admissible?",
-        Verdict.UNKNOWN,
-        "not covered: the map acts on targets, and its limit depends on the slopes of the settled plant; the linear loop has those "
-        "at the reference",
-    )
     doubtful = _doubtful(case)
     verdict = converges(case.grid, case.controller, case.loops, _doubts(doubtful))
     null = _asked(leaves_right_model_alone, case)
-    return [verdict, box_converges(case.grid, case.loops), covered, *doubtful, *([] if null is None else [null])]
+    gain = _asked(gain_of_target, case)
+    return [
+        answer
+        for answer in (verdict, box_converges(case.grid, case.loops), gain, *doubtful, null)
+        if answer is not None
+    ]
 
 
 def _of_map(case: Case, general: list[Answer]) -> list[Answer]:

@@ -16,7 +16,7 @@ from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.motion import controlled_places
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.state_slopes import state_slopes
+from fpirhc.review.state_slopes import below_responses, state_slopes
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
@@ -90,8 +90,7 @@ def _start_deviation(grid: ReviewGrid, shown: np.ndarray) -> np.ndarray:
     if not plant.outputs:
         return problem.start_state - grid.states[0]
     reference = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
-    places = [k for k, e in enumerate(plant.output.elements) if e.rstrip("'") in plant.controlled_names]
-    return np.asarray(np.linalg.pinv(shown) @ (problem.start_output - reference)[places])
+    return np.asarray(np.linalg.pinv(shown) @ (problem.start_output - reference)[below_responses(plant)])
 
 
 def effect(grid: ReviewGrid, name: str) -> float:

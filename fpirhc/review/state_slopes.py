@@ -26,12 +26,17 @@ def state_slopes(plant: Plant, state: np.ndarray, command: np.ndarray, parameter
     return StateSlopes(*(np.asarray(m.full()) for m in _function(plant)(state, command, parameters)))
 
 
+def below_responses(plant: Plant) -> list[int]:
+    """Return the places in `output` of controlled quantities and of their derivatives below the response; none of order 0."""
+    orders = plant.response_orders
+    return [k for k, e in enumerate(plant.output.elements) if orders.get(e.rstrip("'"), 0)]
+
+
 @lru_cache(maxsize=8)  # several questions of a review need it
 def _function(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
     rates, responses = plant.equations.rate(x, u, p), plant.equations.controlled_response(x, u, p)
     shown = plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
-    below = [k for k, e in enumerate(plant.output.elements) if e.rstrip("'") in plant.controlled_names]
-    chain = ca.vertcat(ca.SX(0, 1), *(shown[k] for k in below))
+    chain = ca.vertcat(ca.SX(0, 1), *(shown[k] for k in below_responses(plant)))
     pairs = ((rates, x), (rates, u), (responses, x), (responses, u), (chain, x))
     return ca.Function("fpirhc_state_slopes", [x, u, p], [ca.densify(ca.jacobian(one, by)) for one, by in pairs])

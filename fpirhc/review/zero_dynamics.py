@@ -33,8 +33,7 @@ def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
     Of a map it is the largest rate with which one of its modes grows; minus infinity where all end within a few cycles.
     """
     plant = grid.problem.plant
-    orders = plant.chains
-    if sum(orders[name] for name in plant.controlled_names) == plant.state.size:
+    if sum(plant.response_orders.values()) == plant.state.size:
         return None
     modes = zero_dynamics_modes(grid, [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()])
     growth = growth_of(plant)

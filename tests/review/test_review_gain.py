@@ -77,3 +77,23 @@ def test_basin_of_the_plain_form(scale, verdict):
     run = fp.simulate(replace(problem, duration=6.0), controller, seed=0, compiled=False)
     late = np.abs(run["error"][round(5.0 / PERIOD) :]).max()
     assert (late < 0.1) == (verdict == "yes")
+
+
+@pytest.mark.parametrize("name", ["Cascade", "Cascade, last target"])
+def test_the_gain_of_a_map_on_targets_is_limited_by_the_whole_loop(name):
+    """The heat exchanger: a run comes to rest with nine tenths of the limit, and never does with 1.15 times the limit."""
+    task = fp.load_problem("heat_exchanger")
+    controller, problem = task.controllers[name], replace(task.problem.of_model, duration=800.0)
+    answers = fp.review(task.problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
+    [answer] = [a for a in answers if a.question == "Is the map's gain admissible?"]
+    assert answer.verdict == "yes"
+
+    def ripple(share: float) -> float:
+        deformation = controller.deformation
+        factor = share * answer.numbers["limit"] / answer.numbers["gain"]
+        changed = deformation.with_effective_gain(factor * deformation.effective_gain())
+        run = fp.simulate(problem, controller.with_deformation(changed), seed=0, compiled=False)
+        return float(np.abs(np.diff(run["command"][-200:, 0])).max())
+
+    assert ripple(0.9) < 0.05
+    assert ripple(1.15) > 0.5

@@ -84,6 +84,11 @@ class AskedLoop:
         return self._step.scalar
 
     @property
+    def gained(self) -> bool:
+        """Whether the gain of a `LinearMap` is in the memory."""
+        return bool(self._gains)
+
+    @property
     def keeps_learned(self) -> bool:
         """Whether a model or gains that change on line stay in the linear loop what they are at its point."""
         return any(_LEARNED.search(column) for column in self.loop.memory.columns)
@@ -123,7 +128,7 @@ class AskedLoop:
         Raises:
             NotSupported: the loop has no such map.
         """
-        if not self._gains:
+        if not self.gained:
             raise NotSupported("the gain is no part of the loop's memory")
         changed = memory.copy()
         changed[self._gains] = gain
@@ -173,9 +178,7 @@ class AskedLoop:
         commands, n = passage.trace[:, self._command], self.repeats
         if len(commands) <= n + 1:
             raise NotSupported("the loop's run does not stay finite in its first cycles")
-        lower, upper = self.problem.limits.input_bounds(self.problem.plant)
-        room = _ROOM * np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-        inside = np.all((commands > lower + room) & (commands < upper - room), axis=1)
+        inside = self._inside(commands)
         sizes = np.maximum(np.abs(commands).max(axis=0), 1e-300)
         change = (np.abs(commands[n:] - commands[:-n]) / sizes).max(axis=1)
         quiet = np.logical_and(inside[n:], inside[:-n])
@@ -184,6 +187,16 @@ class AskedLoop:
         phased = (memories[:, self._phases] == passage.memories[0, self._phases]).all(axis=1)
         change = np.where(quiet & phased if (quiet & phased).any() else phased, change, np.inf)
         return np.asarray(passage.memories[n + len(change) - 1 - int(np.argmin(change[::-1]))])
+
+    def inside(self, memory: np.ndarray) -> bool:
+        """Return whether no command of the next cycle stands at a limit."""
+        return bool(self._inside(self._step(memory)[1][self._command]))
+
+    def _inside(self, commands: np.ndarray) -> np.ndarray:
+        """Which commands (..., nu) have room to all limits, shape (...)."""
+        lower, upper = self.problem.limits.input_bounds(self.problem.plant)
+        room = _ROOM * np.where(np.isfinite(upper - lower), upper - lower, 0.0)
+        return np.asarray(np.all((commands > lower + room) & (commands < upper - room), axis=-1))
 
     def at(self, memory: np.ndarray) -> LinearLoop:
         """Return the linear loop of the period that begins at a memory."""
