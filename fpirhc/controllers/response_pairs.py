@@ -9,7 +9,6 @@ pair has the same regressors as one without dead time, d + D cycles later.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,8 +16,10 @@ import casadi as ca
 
 from fpirhc.controllers.mirror_path import MEASURED, measured_output, measured_state
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import ceil, larger
 from fpirhc.symbolic.gap import straightened
 from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.live import is_live, nominal
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
@@ -59,11 +60,11 @@ class ResponsePairs:
         return measured_output(self.problem.plant) if self.waiting else self.problem.plant.output
 
     @property
-    def cycles(self) -> int:
+    def cycles(self) -> float:
         """Number of the first cycle whose pair belongs to this run: before it, samples show the start."""
         late = self.dead_time.measurement / self.problem.period
         first = self.problem.sensing.warm_up_cycles(self.problem.plant, late)
-        return max(int(first), math.ceil(late - _NONE) + 1)
+        return larger(first, ceil(late - _NONE) + 1)
 
     @property
     def late(self) -> float:
@@ -132,9 +133,12 @@ class ResponsePairs:
 
     @property
     def _commands(self) -> Queue:
-        period, late = self.problem.period, self.dead_time
+        cycles = self._cycles(self.dead_time)
+        return Queue(cycles, longest=max(self._cycles(nominal(self.dead_time).at_longest)) if is_live(cycles) else None)
+
+    def _cycles(self, late: DeadTime) -> tuple[float, ...]:
         waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)
-        return Queue(tuple(wait / period + self._delay for wait in waits))
+        return tuple(wait / self.problem.period + self._delay for wait in waits)
 
 
 def _queued(s: Signals, name: str, queue: Queue, now: Expression) -> tuple[Expression, dict[str, Expression]]:

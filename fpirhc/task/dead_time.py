@@ -10,14 +10,14 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import live_numbers, nominal
+from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import MOST, Queue, room
 
 MEASUREMENT = "measurement"  # the name beside those of the inputs
@@ -47,6 +47,12 @@ class DeadTime(Checked):
         late = {**self.inputs, MEASUREMENT: self.measurement}
         return tuple(n for n in dict.fromkeys((*late, *self.longest)) if n in self.longest or nominal(late[n]))
 
+    @property
+    def at_longest(self) -> DeadTime:
+        """The dead time with the longest numbers that a run may set."""
+        inputs = {n: self.longest.get(n, late) for n, late in self.inputs.items()}
+        return replace(self, inputs=inputs, measurement=self.longest.get(MEASUREMENT, self.measurement))
+
     def opened(self, paths: tuple[str, ...]) -> DeadTime:
         """Return it with queues of twice the dead time where one becomes live and no longest one is stated; none for zero."""
         late = {**self.inputs, MEASUREMENT: self.measurement}
@@ -68,12 +74,7 @@ class DeadTime(Checked):
 
         Raises:
             InvalidProblem: all mistakes together.
-            NotSupported: a live dead time where a controller makes another problem of this one.
         """
-        for path in live_numbers(self):
-            raise NotSupported(
-                f"setting '{path}' cannot be live here: what follows from it decides what the loop is made of"
-            )
         mistakes, unit = Mistakes("dead_time"), plant.time_unit
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("before: input", self.before, plant.inputs)
@@ -81,7 +82,7 @@ class DeadTime(Checked):
         for name, value in self.before.items():
             if not finite_number(value):
                 mistakes.add(f"before: '{name}' must be a finite number, got {value!r}")
-        for name, value in [*self.inputs.items(), (MEASUREMENT, self.measurement)]:
+        for name, value in nominal({**self.inputs, MEASUREMENT: self.measurement}).items():
             if not finite_number(value) or value < 0:
                 mistakes.add(f"'{name}' must be a number of at least 0, in {unit}, got {value!r}")
             elif value > MOST * period:

@@ -141,6 +141,44 @@ def test_a_belief_that_is_set_is_the_one_that_is_built(name, compiled):
         assert np.ptp(rebuilt["command"]) > 0
 
 
+ARM = load_problem("planar_arm")
+THROUGH = fp.Cascade(fp.ComputedTorque(LAW), fp.Affine(gain=-0.3), fp.ThroughModel(lag=0.05))
+OWNERS: dict[str, tuple[Any, Controller, dict[str, tuple[float, float]]]] = {
+    "regressor": (ARM, ARM.controllers["AID+FPI"], {"inputs.tau1": (2.0, 3.4), "measurement": (1.0, 1.7)}),
+    "error of another instant": (
+        ARM,
+        ARM.controllers["Slotine-Li"],
+        {"inputs.tau2": (2.0, 0.0), "measurement": (3.0, 5.5)},
+    ),
+    "estimator": (
+        TANKS := load_problem("leaking_tanks"),
+        TANKS.controllers["RHC offset-free"],
+        {"inputs.u": (2.0, 3.0)},
+    ),
+    "target": (HEAT := load_problem("heat_exchanger"), HEAT.controllers["Cascade"], {"inputs.valve": (4.0, 6.5)}),
+    "the slowest input": (ARM, THROUGH, {"inputs.tau1": (2.0, 1.0), "inputs.tau2": (1.5, 2.5)}),
+}
+
+
+@pytest.mark.parametrize("name", OWNERS)
+def test_what_learns_or_shifts_a_target_follows_a_dead_time_that_is_set(name):
+    """A response belongs to the command and the target that caused it, also where a run says how long they take."""
+    task, controller, cycles = OWNERS[name]
+    problem = replace(task.problem, duration=30 * task.problem.period, measure_from=0.0)
+
+    def late(which: int) -> fp.Problem:
+        times = {path: both[which] * problem.period for path, both in cycles.items()}
+        inputs = {path.removeprefix("inputs."): value for path, value in times.items() if path != "measurement"}
+        return replace(problem, dead_time=DeadTime(inputs, times.get("measurement", 0.0)))
+
+    paths = {f"dead_time.{path}": both[1] * problem.period for path, both in cycles.items()}
+    ready = simulator(late(0), controller, compiled=False, live=list(paths))
+    first, run = ready.run(seed=0), ready.run(seed=0, settings=paths)
+    assert same_signals(first, simulator(late(0), controller, compiled=False).run(seed=0))
+    assert same_signals(run, simulator(late(1), controller, compiled=False).run(seed=0))
+    assert not np.array_equal(first["command"], run["command"])
+
+
 def test_a_dead_time_is_live_up_to_its_stated_longest():
     """Without a longest one there is room for twice the dead time; beyond it a number is refused before a run begins."""
     late = LATE.problem.dead_time.inputs["Q"]

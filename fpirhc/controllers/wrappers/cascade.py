@@ -38,8 +38,11 @@ from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay
 from fpirhc.symbolic.expression import Signals, expression, is_finite, kind
+from fpirhc.symbolic.functions import largest
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import is_live, nominal
 from fpirhc.symbolic.queue import MOST, Queue, every
+from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Reference, Steps
 
@@ -179,16 +182,15 @@ class ThroughModel(Checked):
             raise InvalidValue(f"{self!r}: expected finite times of at least 0")
 
     def stated(self, problem: Problem) -> ThroughModel:
-        """Return the pairing with lag and dead time as numbers; one that cannot be known stays open, for `decays` to refuse."""
+        """Return the pairing with the lag as a number; one that cannot be known stays open, for `decays` to refuse."""
         try:
             lag = _own_lags(problem) if self.lag is None else self.lag
         except InvalidValue:
             return self
-        return ThroughModel(lag, self._late(problem))
+        return ThroughModel(lag, self.dead_time)
 
-    def _late(self, problem: Problem) -> float:
-        late = problem.dead_time
-        return max(late.inputs.values(), default=0.0) + late.measurement if self.dead_time is None else self.dead_time
+    def _late(self, late: DeadTime) -> float:
+        return largest((0.0, *late.inputs.values())) + late.measurement if self.dead_time is None else self.dead_time
 
     def decays(self, problem: Problem) -> np.ndarray:
         """Return rho of every controlled coordinate.
@@ -211,10 +213,11 @@ class ThroughModel(Checked):
         Raises:
             InvalidValue: more than 1000 cycles.
         """
-        cycles = self._late(problem) / problem.period
-        if cycles > MOST:
-            raise InvalidValue(f"{self!r}: {cycles:g} cycles of dead time, more than {MOST}")
-        return Queue(cycles)
+        late = problem.dead_time
+        cycles = self._late(late) / problem.period
+        if (now := nominal(cycles)) > MOST:
+            raise InvalidValue(f"{self!r}: {now:g} cycles of dead time, more than {MOST}")
+        return Queue(cycles, longest=self._late(nominal(late).at_longest) / problem.period if is_live(cycles) else None)
 
     def memory(self, problem: Problem) -> tuple[Signal, ...]:
         """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start."""
