@@ -1,6 +1,6 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .baselines.check import accept, bless, check_baseline
+from .baselines.check import accept, check_baseline
 from .controllers.computed_torque import ComputedTorque
 from .controllers.feedforward_only import FeedforwardOnly
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
@@ -100,6 +100,7 @@ from .studies.comparison.compare import compare
 from .studies.scenarios.scenario_study import compare_scenarios
 from .studies.tuning.tune import tune
 from .symbolic.functions import signed_power
+from .task.cases import Cases
 from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.exogenous import Believed, Known, Samples, Unknown
@@ -129,6 +130,7 @@ __all__ = [
     "ByLookAhead",
     "ByModel",
     "Cascade",
+    "Cases",
     "ColouredNoise",
     "ComputedTorque",
     "CustomCost",
@@ -247,7 +249,6 @@ __all__ = [
     "Unknown",
     "VelocityDifference",
     "accept",
-    "bless",
     "certify",
     "check_baseline",
     "compare",

@@ -196,6 +196,7 @@ FORMER = {  # names of earlier versions, and names that have left the top level
     "Tuning": "studies.tuning.tune.Tuning",
     "Watch": "RunMonitor",
     "assess_gain": "contraction.gains.assess_gain",
+    "bless": "accept",
     "check_belief": "conformance.check_observer",
     "check_controller": "conformance.check_controller",
     "check_deformation": "conformance.check_deformation",

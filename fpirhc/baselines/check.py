@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from fpirhc.baselines.bands import Expected, expected
 from fpirhc.baselines.baseline import Baseline, Settings, fingerprint, settings_of, to_text
@@ -215,13 +213,6 @@ def accept(
     )
     baseline = compose_baseline(task, expectations, reason, seed=seed, seeds=seeds, compiled=compiled)
     return baseline, write_baseline(task, baseline, baselines, project)
-
-
-@checked_call
-def bless(task: Task, reason: str, **settings: Any) -> tuple[Baseline, Path]:
-    """Call `accept`: the earlier name, which the next version removes."""
-    warnings.warn("fpirhc.bless is now fpirhc.accept", DeprecationWarning, stacklevel=2)
-    return accept(task, reason, **settings)
 
 
 def write_merged(problem: Path, parts: Sequence[str], working: Path) -> Path:

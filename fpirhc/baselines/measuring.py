@@ -20,8 +20,8 @@ from fpirhc.simulation.metrics import known_metrics, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import run_tables, simulate
 from fpirhc.studies.open_loop import solve_first
-from fpirhc.studies.scenarios.draws import with_exact
 from fpirhc.symbolic.native import find_compiler
+from fpirhc.task.cases import with_exact
 from fpirhc.task.problem import Problem
 
 FINISHED, DIVERGED, REFUSED = "finished", "diverged", "refused"

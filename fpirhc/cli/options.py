@@ -59,6 +59,12 @@ def add_scenarios(parser: Parser, default: int | None, text: str) -> None:
     parser.add_argument("--seeds", action=Former, type=int, dest="scenarios", new="--scenarios")
 
 
+def add_cases(parser: Parser, text: str) -> None:
+    """--cases PATTERN ..."""
+    what = "names or groups with wildcards, such as 'adult*', or all"
+    parser.add_argument("--cases", nargs="+", metavar="PATTERN", help=f"{text}: {what}")
+
+
 def add_baselines(parser: Parser) -> None:
     """--baselines FOLDER."""
     text = "folder of the baselines (default: baselines beside the problem)"

@@ -3,6 +3,7 @@
 A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}). The first line of its docstring is its title.
 It may also define
 - `headline`, a pair (controller without adaptation, controller with adaptation) for the verdict,
+- `cases`, a `Cases`: named cases for `fpirhc compare --cases`,
 - `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
 - `metrics`, a sequence of `Metric` for all tables, files and baselines of the problem, in addition to the shipped ones,
 - `pictures`, a sequence of pictures for the report, in addition to the usual ones.
@@ -26,7 +27,7 @@ from typing import Any, ClassVar
 from fpirhc.by_name import FoundByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import named_in_task
-from fpirhc.errors import FpirhcError, InvalidField, Mistakes, ProblemFileError
+from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, ProblemFileError
 from fpirhc.fields.checked import Checked, checked_call, mistakes_of
 from fpirhc.fields.given import call_of, described
 from fpirhc.fields.user_code import explained
@@ -35,6 +36,7 @@ from fpirhc.problem_files.shipped import find_problem
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.summary import line, table
+from fpirhc.task.cases import Cases
 from fpirhc.task.problem import Problem, problem_facts
 
 
@@ -53,6 +55,7 @@ class Task(FoundByName):
         tuning: ranges of settings by controller.
         metrics: all metrics of the problem's runs.
         pictures: further pictures for the report.
+        cases: named cases of the problem; None: there are none.
     """
 
     _LOADED: ClassVar[str] = "fp.load_problem({})"
@@ -68,6 +71,7 @@ class Task(FoundByName):
     tuning: Mapping[str, TuningSpans] = field(default_factory=dict)
     metrics: Sequence[Metric] = field(default_factory=known_metrics)
     pictures: tuple[Picture, ...] = ()
+    cases: Cases | None = None
 
     def __post_init__(self) -> None:
         if self.problem.name != self.name:
@@ -107,6 +111,10 @@ def load_problem(name_or_path: str) -> Task:
         mistakes.add(
             f"{_line_of(module, 'metrics')}metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)"
         )
+    cases = getattr(module, "cases", None)
+    if cases is not None and not isinstance(cases, Cases):
+        form = "cases = fpirhc.Cases({'heavy': {'exact.mass': 2.0}})"
+        mistakes.add(f"{_line_of(module, 'cases')}expected {form}, got {described(cases)}")
     pictures = getattr(module, "pictures", ())
     if not isinstance(pictures, Sequence):
         mistakes.add(f"{_line_of(module, 'pictures')}expected a sequence of pictures, got {described(pictures)}")
@@ -119,13 +127,26 @@ def load_problem(name_or_path: str) -> Task:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
         metrics = with_own_metrics(own)
+        assert problem is not None
+        if cases is not None:
+            cases.check(problem)
     except FpirhcError as error:
         raise ProblemFileError(str(error)) from None
-    assert problem is not None
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
-    return Task(
-        path.stem, path, title, description.strip(), problem, controllers, headline, tuning, metrics, tuple(pictures)
-    )
+    facts = (problem, controllers, headline, tuning, metrics, tuple(pictures), cases)
+    return Task(path.stem, path, title, description.strip(), *facts)
+
+
+def in_case(task: Task, name: str) -> Task:
+    """Return the task with the problem in one of its cases.
+
+    Raises:
+        InvalidName: there is no such case.
+        InvalidProblem: a change that the problem does not accept.
+    """
+    if task.cases is None:
+        raise InvalidName(f"problem '{task.name}' has no cases; add cases = fpirhc.Cases({{...}}) to its file")
+    return replace(task, problem=task.cases.problem(name, task.problem))
 
 
 def _problem(module: ModuleType, mistakes: Mistakes) -> Problem | None:

@@ -118,3 +118,4 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("CTC", "CTC+FPI")
+cases = fp.Cases.from_csv("anaesthesia_patients.csv")  # the curves of 44 patients, with this man's kinetics

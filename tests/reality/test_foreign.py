@@ -18,7 +18,7 @@ from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.simulate import Patch, run_foreign, simulator
-from fpirhc.studies.scenarios.draws import with_exact
+from fpirhc.task.cases import with_exact
 
 MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
 

@@ -17,7 +17,8 @@ from fpirhc.describe import describe
 from fpirhc.errors import InvalidProblem, NotContractive, NotSupported
 from fpirhc.sensing.base import response_names
 from fpirhc.studies.comparison.entry_facts import has_exact_model
-from fpirhc.studies.scenarios.draws import COMPARING, draw, with_exact
+from fpirhc.studies.scenarios.draws import COMPARING, draw
+from fpirhc.task.cases import with_exact
 
 TRACK = fp.Exponential(rate=6.0)
 PERIOD = 1e-3  # s

@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, NotSupported
-from fpirhc.studies.scenarios.draws import COMPARING, draw, with_exact
+from fpirhc.studies.scenarios.draws import COMPARING, draw
+from fpirhc.task.cases import with_exact
 
 PERIOD = 1 / 12  # min
 TRACK = fp.ComputedTorque(fp.Exponential(rate=1.5))

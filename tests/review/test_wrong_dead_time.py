@@ -208,13 +208,13 @@ def test_scenarios_draw_the_dead_time():
     }
     task = Task("late", Path(__file__), "", "", problem, controllers)
     bench = Bench(task, Conditions(seed=0, use=COMPARING, percent=5.0, compiled=False))
-    lateness = [bench._scenario(k)[0].lateness for k in range(8)]
+    lateness = [int(str(bench._scenario(k).build)) for k in range(8)]
     assert set(lateness) == {-1, 0, 1}
     for k in (lateness.index(-1), lateness.index(0), lateness.index(1)):
-        cycles = bench._scenario(k)[1].dead_time.inputs["u"] / PERIOD
+        cycles = bench._scenario(k).problem.dead_time.inputs["u"] / PERIOD
         assert cycles == pytest.approx(20 + lateness[k])
         sharp, leaky = (bench.record(k, name)["error"] for name in controllers)
         assert leaky < 0.1
         assert (sharp is not None and sharp < 0.1) == (lateness[k] == 0)
     tuning = Bench(task, Conditions(seed=0, use=TUNING, percent=5.0, compiled=False))
-    assert {tuning._scenario(k)[1].dead_time.inputs["u"] for k in range(8)} == {20 * PERIOD}
+    assert {tuning._scenario(k).problem.dead_time.inputs["u"] for k in range(8)} == {20 * PERIOD}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.cli.options import (
+    add_cases,
     add_controllers,
     add_json,
     add_mismatch,
@@ -37,6 +38,8 @@ _EXAMPLES = (
         "fpirhc compare my_arm.py --scenarios 50 --mismatch 30 --controllers RHC RHC+FPI --baseline RHC --out results/arm",
         "two controllers, compared with the first",
     ),
+    ("fpirhc compare my_arm.py --cases all", "every case of the problem file; the worst one is named"),
+    ("fpirhc compare anaesthesia --cases elderly 'patient 0*' --processes 2", "cases by name, or by group"),
 )
 _NOTES = """
 Scenario k of a seed is the same for every controller, whatever the number of scenarios and processes. Every exact parameter
@@ -44,6 +47,7 @@ is multiplied by a factor of its own, log-uniform between 1 - PERCENT/100 and 1 
 problem file is drawn from PERCENT/100 of it, 100 for all of it. Finished scenarios are kept in
 scenarios.jsonl in the output folder; after an interruption or a crash the same command continues from them. A folder that
 holds results of another problem, seed, mismatch or version is refused (exit code 3).
+Cases are scenarios with names: cases = fp.Cases({"heavy": {"exact.mass": 2.0}}) in the problem file, or fp.Cases.from_csv(FILE).
 """
 
 
@@ -62,7 +66,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     _check(options)
-    return _run_once(options) if options.scenarios is None else _run_scenarios(options)
+    return _run_scenarios(options) if options.scenarios is not None or options.cases else _run_once(options)
 
 
 def _run_once(options: argparse.Namespace) -> ExitCode:
@@ -130,6 +134,7 @@ def _add_scenarios(parser: argparse.ArgumentParser) -> None:
     """Add the options of scenarios to `compare`."""
     group = parser.add_argument_group("scenarios")
     add_scenarios(group, None, "run every controller in N paired scenarios")
+    add_cases(group, "run every controller in these cases of the problem file")
     add_mismatch(group, None)
     add_processes(group)
     text = "controller that the others are compared with (default: the first)"
@@ -137,22 +142,27 @@ def _add_scenarios(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Check that options of scenarios stand beside `--scenarios`, and not beside `--optimisers`.
+    """Check that options of scenarios stand beside `--scenarios` or `--cases`, and not beside `--optimisers`.
 
     Raises:
         InvalidValue: options that cannot be combined; the message names the remedy.
     """
     from fpirhc.errors import InvalidValue
 
-    if options.scenarios is None:
+    if options.scenarios is not None and options.cases:
+        raise InvalidValue("--cases and --scenarios are two comparisons; give one of them")
+    if options.cases and options.mismatch:
+        raise InvalidValue(
+            "--cases have the parameters that they state; leave --mismatch out, or compare --scenarios N"
+        )
+    if options.scenarios is None and not options.cases:
         named = [n for n in ("mismatch", "baseline") if getattr(options, n) is not None]
         named += ["processes"] if options.processes != 1 else []
         if named:
             raise InvalidValue(f"--{named[0]} needs --scenarios N, the number of scenarios")
     elif options.optimisers:
-        raise InvalidValue(
-            "--optimisers cannot be combined with --scenarios; write the controllers into the problem file"
-        )
+        way = "--cases" if options.cases else "--scenarios"
+        raise InvalidValue(f"--optimisers cannot be combined with {way}; write the controllers into the problem file")
 
 
 def _run_scenarios(options: argparse.Namespace) -> ExitCode:
@@ -165,8 +175,8 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
     from fpirhc.whole_file import write_whole
 
     task = load_problem(options.problem)
-    kind = "tuned_scenarios" if options.tuned else "scenarios"
-    name = f"{kind}_{options.mismatch or 0:g}percent_seed{options.seed}"
+    drawn = f"scenarios_{options.mismatch or 0:g}percent"
+    name = f"{'tuned_' if options.tuned else ''}{'cases' if options.cases else drawn}_seed{options.seed}"
     folder = results_folder(options.out, task.name, name)
     comparison = _compared(options, task, folder)
     report = folder / "report.html"
@@ -193,6 +203,7 @@ def _compared(options: argparse.Namespace, task: Task, folder: Path) -> Scenario
             task,
             count=options.scenarios,
             percent=options.mismatch or 0.0,
+            cases=options.cases,
             seed=options.seed,
             folder=folder,
             controllers=options.controllers,
@@ -208,8 +219,9 @@ def _compared(options: argparse.Namespace, task: Task, folder: Path) -> Scenario
 
 def _scenarios_command(options: argparse.Namespace) -> str:
     """The command that reproduces these scenarios."""
-    words = ["fpirhc", "compare", options.problem, "--scenarios", str(options.scenarios), "--seed", str(options.seed)]
-    words += ["--mismatch", f"{options.mismatch or 0:g}"]
+    words = ["fpirhc", "compare", options.problem, "--seed", str(options.seed)]
+    drawn = ["--scenarios", str(options.scenarios), "--mismatch", f"{options.mismatch or 0:g}"]
+    words += ["--cases", *options.cases] if options.cases else drawn
     for name in ("baseline", "tuned"):
         if getattr(options, name):
             words += [f"--{name}", getattr(options, name)]

@@ -26,12 +26,13 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(parser)
     add_seed(parser, "the noise")
     add_no_compile(parser)
+    parser.add_argument("--case", metavar="NAME", help="run the problem in this case of the problem file")
     text = "another number for a setting, such as deformation.gain=-1.2 or limits.inputs.Q1=-50,20; or a set-point, setpoints.q1=2"
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="PATH=NUMBER", help=text)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
-    from fpirhc.problem_files.problem_file import load_problem
+    from fpirhc.problem_files.problem_file import in_case, load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.figures import save_figure
@@ -40,6 +41,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.comparison.compare import check_gains, select
     from fpirhc.studies.comparison.harm import harm_of_adaptation
 
+    task = in_case(task, options.case) if options.case else task
     name = options.controller
     controller = select(task, [name])[name]
     if not options.settings:
@@ -55,7 +57,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
             compiled=not options.no_compile,
             progress=_named(progress, name),
         )
-    stem = "".join(c if c.isalnum() else "_" for c in name)
+    stem = "".join(c if c.isalnum() else "_" for c in f"{name} {options.case or ''}".strip())
     run.save(folder / f"{stem}.npz")
     save_figure(run.plot(), folder / f"{stem}.png")
     announce_backend([run])
@@ -167,6 +169,7 @@ VERB = Verb(
             'fpirhc run two_mass "RHC+FPI" --set deformation.gain=-1.2',
             "another gain; other numbers of it need no compiler",
         ),
+        ('fpirhc run my_arm.py "RHC+FPI" --case heavy', "the problem in a case of its file"),
         ('fpirhc run my_arm.py "RHC+FPI" --out results --seed 3', "another folder, other noise"),
     ),
 )

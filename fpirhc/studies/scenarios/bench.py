@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -13,21 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.controllers.contract import Controller, checked, resolved
+from fpirhc.controllers.contract import Controller, checked
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
-from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.review.late import is_late, live_paths, roomy, scaled
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.studies.scenarios.draws import COMPARING, Scenario, draw, with_exact
+from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios
 from fpirhc.task.problem import Problem
 
-FORMAT = 3  # of records
+FORMAT = 4  # of records
 
 
 @dataclass(frozen=True)
@@ -39,12 +38,14 @@ class Conditions:
         use: of the scenarios, see `draws`.
         percent: range of the exact parameters' draws, percent.
         compiled: whether runs use compiled C; None: only those of loops with live settings, which are compiled once.
+        named: whether they are the cases of the problem file.
     """
 
     seed: int
     use: int
     percent: float
     compiled: bool | None
+    named: bool = False
 
 
 def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
@@ -55,6 +56,7 @@ def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
         "problem": task.name,
         "problem file": _hash(task.path.read_bytes()),
         "settings": _hash(settings.encode()),
+        "cases": _hash(json.dumps(describe(task.cases)).encode()),
         "metrics": _hash(json.dumps([metric.name for metric in task.metrics]).encode()),
         **asdict(conditions),
         **{name: version(name) for name in ("fpirhc", "casadi", "numpy")},
@@ -71,6 +73,8 @@ class RecordFields(Checked):
     """The fields of a record of one controller in one scenario, as `Bench.record` makes it."""
 
     scenario: CountOrZero
+    name: str
+    group: str
     controller: str
     mismatch: float
     outcome: str
@@ -93,13 +97,13 @@ class Bench:
     """
 
     def __init__(self, task: Task, conditions: Conditions, live: Mapping[str, Sequence[str]] | None = None) -> None:
-        exact_ranges(task.problem.moved, conditions.percent)
         self._live = live or {}
         self._task, self._conditions = task, conditions
+        self._scenarios = scenarios(task, conditions)
         self._ranges = ranges(task.problem)
-        self._simulators: dict[tuple[str, int], Simulator | FpirhcError] = {}
+        self._simulators: dict[tuple[str, object], Simulator | FpirhcError] = {}
         self._shared: dict[str, Simulator | None] = {}
-        self._drawn: tuple[int, Scenario, Problem] | None = None
+        self._last: tuple[int, Scenario] | None = None
 
     def record(self, number: int, name: str, settings: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Return the result of one controller in one scenario, as plain data; a number that is not finite becomes None.
@@ -107,99 +111,82 @@ class Bench:
         A controller that cannot serve the problem, or not with these live settings, gives {"controller": its name, "skipped": the
         reason}.
         """
-        scenario, variant = self._scenario(number)
+        scenario = self._scenario(number)
         try:
-            ready = self._simulator(name, self._lateness(scenario))
-            run = ready.run(seed=scenario.seed, name=name, variant=variant, settings=settings)
+            ready = self._simulator(name, scenario)
+            run = ready.run(seed=scenario.seed, name=name, variant=scenario.problem, settings=settings)
         except FpirhcError as error:
             return {"controller": name, "skipped": str(error)}
-        metrics = measure(variant, run, self._task.metrics)
+        metrics = measure(scenario.problem, run, self._task.metrics)
         size = relative_error(metrics, self._ranges)
         return {
             "scenario": number,
+            "name": scenario.name,
+            "group": scenario.group,
             "controller": name,
             "mismatch": scenario.mismatch,
             "outcome": outcome(run, size),
             "error": _finite(size),
             "metrics": _finite(metrics.values),
-            "lasted": run.cycles / variant.cycles,
+            "lasted": run.cycles / scenario.problem.cycles,
             "stop": run.stop,
         }
 
-    def _scenario(self, number: int) -> tuple[Scenario, Problem]:
-        """The scenario and its problem; the last one is kept, because controllers take turns on it."""
-        if self._drawn is None or self._drawn[0] != number:
-            conditions, problem = self._conditions, self._task.problem
-            scenario = draw(
-                problem.moved,
-                seed=conditions.seed,
-                use=conditions.use,
-                number=number,
-                percent=conditions.percent,
-                model=problem.plant,
-            )
-            late = self._late(self._lateness(scenario))
-            self._drawn = (number, scenario, with_exact(late, scenario.exact))
-        return self._drawn[1:]
+    def _scenario(self, number: int) -> Scenario:
+        """The scenario; the last one is kept, because controllers take turns on it."""
+        if self._last is None or self._last[0] != number:
+            self._last = number, self._scenarios[number]
+        return self._last[1]
 
-    @property
-    def _draws_dead_times(self) -> bool:
-        """Whether the plant's dead times are other ones than the controllers'; they are not in studies that tune."""
-        return self._conditions.use == COMPARING and self._conditions.percent > 0 and is_late(self._task.problem)
-
-    def _lateness(self, scenario: Scenario) -> int:
-        return scenario.lateness if self._draws_dead_times else 0
-
-    def _late(self, lateness: int) -> Problem:
-        """The problem with other dead times, and with queues for the longest of them."""
-        if not self._draws_dead_times:
-            return self._task.problem
-        problem = roomy(self._task.problem, self._conditions.percent)
-        return scaled(problem, lateness * self._conditions.percent) if lateness else problem
-
-    def _simulator(self, name: str, lateness: int = 0) -> Simulator:
-        key = name, lateness
+    def _simulator(self, name: str, scenario: Scenario) -> Simulator:
+        key = name, scenario.build
         ready = self._simulators.get(key)
         if ready is None or (isinstance(ready, Simulator) and ready.remembers):
-            ready = self._simulators[key] = self._built(name, lateness)
+            ready = self._simulators[key] = self._built(name, scenario.built)
         if isinstance(ready, FpirhcError):
             raise ready
         return ready
 
-    def changes(self, name: str) -> bool:
-        """Whether the live settings of a controller can be changed: its loop can be built with them."""
-        if (name, 0) not in self._simulators:
-            self._simulators[name, 0] = self._built(name, 0)
-        return isinstance(self._simulators[name, 0], Simulator)
+    def changes(self, name: str, number: int = 0) -> bool:
+        """Whether the live settings of a controller can be changed in a scenario: its loop can be built with them."""
+        with contextlib.suppress(FpirhcError):
+            self._simulator(name, self._scenario(number))
+            return True
+        return False
 
-    def _built(self, name: str, lateness: int) -> Simulator | FpirhcError:
-        """The loop; its controller has the automatic settings for the problem's own dead times, whatever the plant's are."""
+    def _built(self, name: str, problem: Problem) -> Simulator | FpirhcError:
         live, compiled = self._live.get(name, ()), self._conditions.compiled
         compile_it = compiled if compiled is not None else bool(live)
         try:
-            controller, late = self._task.controllers[name], self._late(lateness)
-            controller = resolved(self._task.problem, controller) if self._draws_dead_times else controller
-            shared = self._for_all_dead_times(name, controller, compile_it)
+            controller = self._scenarios.automatic(self._task.controllers[name])
+            shared = self._for_all(name, controller, compile_it)
             if shared is not None:
-                checked(late, controller)
+                checked(problem, controller)
                 return shared
-            return simulator(late, controller, compiled=compile_it, live=live)
+            return simulator(problem, controller, compiled=compile_it, live=live)
         except FpirhcError as error:
             return error
 
-    def _for_all_dead_times(self, name: str, controller: Controller, compile_it: bool) -> Simulator | None:
-        """One loop for all dead times that are drawn; None where none are, and where a loop needs them while it is built."""
-        if not self._draws_dead_times:
+    def _for_all(self, name: str, controller: Controller, compile_it: bool) -> Simulator | None:
+        """One loop for all scenarios; None where there is none."""
+        if self._scenarios.for_all is None:
             return None
         if name not in self._shared:
-            problem = self._late(0)
-            live = (*self._live.get(name, ()), *live_paths(problem))
+            problem, paths = self._scenarios.for_all
             try:
-                ready = simulator(problem, controller, compiled=compile_it, live=live)
+                ready = simulator(problem, controller, compiled=compile_it, live=(*self._live.get(name, ()), *paths))
                 self._shared[name] = None if ready.remembers else ready
-            except FpirhcError:  # what is wrong for every dead time is said by the loops of their own
+            except FpirhcError:  # what is wrong in every scenario is said by the loops of their own
                 self._shared[name] = None
         return self._shared[name]
+
+
+def scenarios(task: Task, conditions: Conditions) -> Scenarios:
+    """Return the scenarios of a study."""
+    if conditions.named:
+        assert task.cases is not None
+        return NamedCases(task.cases, task.problem, conditions.seed)
+    return RandomScenarios(task.problem, conditions.seed, conditions.use, conditions.percent)
 
 
 def _finite(value: Any) -> Any:

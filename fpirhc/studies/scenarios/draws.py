@@ -1,6 +1,6 @@
-"""Scenarios: exact parameters and noise that are the same for every controller of a comparison.
+"""Scenarios, random or named: what is the same for every controller of a comparison.
 
-Scenario k of a seed is always the same: its numbers come from a stream of its own, `SeedSequence(seed, spawn_key=(use, k))`,
+Random scenario k of a seed is always the same: its numbers come from a stream of its own, `SeedSequence(seed, spawn_key=(use, k))`,
 whatever the number of scenarios, of processes and of controllers, and in whatever order they run. Every exact parameter
 is drawn from its range (see `fpirhc.plant.mismatch`): by its own spread, or without one multiplied by a factor of its own, the
 logarithm of which is uniform between log(1 - P/100) and log(1 + P/100). Dead times are those of the problem, or P percent shorter
@@ -9,20 +9,24 @@ or longer, rounded away from it to whole cycles: another length of a queue is an
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from fpirhc.plant.mismatch import Parametric, drawn
-from fpirhc.plant.motion import with_exact_parameters
+from fpirhc.controllers.contract import Controller, resolved
+from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
+from fpirhc.review.late import is_late, live_paths, roomy, scaled
+from fpirhc.task.cases import Cases, with_exact
 from fpirhc.task.problem import Problem
 
 COMPARING, TUNING = 0, 1  # uses: a controller is never compared on the scenarios on which it was tuned
 
 
 @dataclass(frozen=True, eq=False)
-class Scenario:
-    """One scenario.
+class Draw:
+    """What is drawn for one scenario.
 
     Args:
         seed: of the disturbances' noise.
@@ -39,8 +43,8 @@ class Scenario:
 
 def draw(
     plant: Parametric, *, seed: int, use: int, number: int, percent: float, model: Parametric | None = None
-) -> Scenario:
-    """Return a scenario; its exact parameters lie in `exact_ranges(plant, percent)`.
+) -> Draw:
+    """Return what is drawn; its exact parameters lie in `exact_ranges(plant, percent)`.
 
     Args:
         plant: the plant that a run moves.
@@ -54,15 +58,16 @@ def draw(
     shares = np.random.default_rng(parameters).random(len(plant.parameters))
     values = [drawn(p, percent, float(s)) for p, s in zip(plant.parameters.values(), shares, strict=True)]
     exact = np.array(values, dtype=float)
-    believed = _believed(model or plant)
-    shared = [k for k, name in enumerate(plant.parameters) if name in believed]
-    assumed = np.array([believed[name] for name in plant.parameters if name in believed])
     lateness = int(np.random.default_rng(late).integers(-1, 2))
-    return Scenario(int(noise.generate_state(1)[0]), exact, mismatch_of(assumed, exact[shared]), lateness)
+    return Draw(int(noise.generate_state(1)[0]), exact, _mismatch(model or plant, plant, exact), lateness)
 
 
-def _believed(model: Parametric) -> dict[str, float]:
-    return {name: parameter.approximate for name, parameter in model.parameters.items()}
+def _mismatch(model: Parametric, plant: Parametric, exact: np.ndarray) -> float:
+    """The mismatch in the parameters that model and plant share."""
+    known = {name: parameter.approximate for name, parameter in model.parameters.items()}
+    shared = [k for k, name in enumerate(plant.parameters) if name in known]
+    assumed = np.array([known[name] for name in plant.parameters if name in known])
+    return mismatch_of(assumed, exact[shared])
 
 
 def mismatch_of(approximate: np.ndarray, exact: np.ndarray) -> float:
@@ -72,13 +77,124 @@ def mismatch_of(approximate: np.ndarray, exact: np.ndarray) -> float:
     return float(np.sqrt(np.mean(shares**2))) if shares.size else 0.0
 
 
-def with_exact(problem: Problem, exact: np.ndarray) -> Problem:
-    """Return the problem with other exact parameters, shape (np,): those of the reality where it has one.
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """What every controller meets alike in one scenario.
+
+    Args:
+        name: of the scenario.
+        group: of the scenario; '' where there are none.
+        seed: of the noise.
+        mismatch: distance of the model from the exact parameters, see `mismatch_of`.
+        build: what decides the loop; scenarios with equal ones have one.
+        built: the problem for which the loop is built.
+        problem: the same with the scenario's exact parameters.
+    """
+
+    name: str
+    group: str
+    seed: int
+    mismatch: float
+    build: object
+    built: Problem
+    problem: Problem
+
+
+class Scenarios(ABC):
+    """The scenarios of a study, by number; random ones and named cases differ in nothing else."""
+
+    @abstractmethod
+    def __getitem__(self, number: int) -> Scenario:
+        """Return a scenario, always the same one."""
+
+    def automatic(self, controller: Controller) -> Controller:
+        """Return the controller with those settings that it has whatever the scenario is."""
+        return controller
+
+    @property
+    def for_all(self) -> tuple[Problem, tuple[str, ...]] | None:
+        """A problem whose loop with these live settings serves every scenario; None where there is none."""
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class RandomScenarios(Scenarios):
+    """Scenarios with drawn parameters and dead times.
+
+    Args:
+        of: the problem.
+        seed: of the study.
+        use: `COMPARING` or `TUNING`.
+        percent: range of the exact parameters, percent.
 
     Raises:
-        InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
-        NotSupported: an external plant without parameters.
+        InvalidProblem, InvalidValue: draws that could leave the parameters' physical bounds.
     """
-    if problem.reality is not None:
-        return replace(problem, reality=problem.reality.with_exact(exact))
-    return replace(problem, plant=with_exact_parameters(problem.plant, exact))
+
+    of: Problem
+    seed: int
+    use: int
+    percent: float
+
+    def __post_init__(self) -> None:
+        exact_ranges(self.of.moved, self.percent)
+
+    def __getitem__(self, number: int) -> Scenario:
+        """Return scenario `number` of the seed."""
+        plant, facts = self.of.moved, {"seed": self.seed, "use": self.use, "percent": self.percent}
+        one = draw(plant, number=number, model=self.of.plant, **facts)  # type: ignore[arg-type]  # of several types
+        lateness = one.lateness if self._draws_dead_times else 0
+        built = self._late[lateness]
+        return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, with_exact(built, one.exact))
+
+    def automatic(self, controller: Controller) -> Controller:
+        """Return the controller with the automatic settings for the problem's own dead times, whatever the plant's are."""
+        return resolved(self.of, controller) if self._draws_dead_times else controller
+
+    @cached_property
+    def for_all(self) -> tuple[Problem, tuple[str, ...]] | None:
+        """The problem with live dead times, where they are drawn."""
+        return (self._late[0], live_paths(self._late[0])) if self._draws_dead_times else None
+
+    @cached_property
+    def _draws_dead_times(self) -> bool:
+        """Whether the plant's dead times are other ones than the controllers'; they are not in studies that tune."""
+        return self.use == COMPARING and self.percent > 0 and is_late(self.of)
+
+    @cached_property
+    def _late(self) -> dict[int, Problem]:
+        """The problem with its dead times and with others, by lateness, all with queues for the longest of them."""
+        if not self._draws_dead_times:
+            return {0: self.of}
+        room = roomy(self.of, self.percent)
+        return {0: room, **{k: scaled(room, k * self.percent) for k in (-1, 1)}}
+
+
+@dataclass(frozen=True, eq=False)
+class NamedCases(Scenarios):
+    """Scenarios that are the cases of a problem file.
+
+    Args:
+        cases: the cases.
+        of: the problem.
+        seed: of the study; a case without a seed of its own has noise of this one and of its place among the cases.
+    """
+
+    cases: Cases
+    of: Problem
+    seed: int
+    _built: dict[object, Problem] = field(default_factory=dict, init=False)
+
+    def __getitem__(self, number: int) -> Scenario:
+        """Return the case at a place."""
+        name = self.cases.names[number]
+        key, own = self.cases.key(name), self.cases.seed(name)
+        if key not in self._built:
+            self._built[key] = self.cases.build(name, self.of)
+        built = self._built[key]
+        problem = self.cases.exactly(name, built)
+        seed = int(np.random.SeedSequence(self.seed, spawn_key=(COMPARING, number)).generate_state(1)[0])
+        moved = problem.moved
+        exact = np.array([one.exact for one in moved.parameters.values()])
+        mismatch = _mismatch(problem.plant, moved, exact)
+        return Scenario(name, self.cases.group(name), seed if own is None else own, mismatch, key, built, problem)

@@ -28,6 +28,7 @@ class Summary(FoundByName):
         median: median of the errors.
         worst: largest error.
         worst_scenario: number of the scenario with the largest error.
+        worst_name: its name; the number as text where scenarios are random.
         metrics: median over the scenarios, by metric and element; a run without the number counts as worse than any
             other.
         outcomes: number of scenarios by outcome.
@@ -43,6 +44,7 @@ class Summary(FoundByName):
     median: float
     worst: float
     worst_scenario: int
+    worst_name: str
     metrics: Mapping[str, Mapping[str, float]]
     outcomes: Mapping[str, int]
     statuses: Mapping[str, int]
@@ -95,6 +97,7 @@ def summarise(
         median=float(middle(errors)),
         worst=float(errors[worst]),
         worst_scenario=int(records[worst]["scenario"]),
+        worst_name=str(records[worst].get("name", records[worst]["scenario"])),
         metrics=_medians(records, known_metrics() if metrics is None else metrics),
         outcomes=dict(Counter(str(r["outcome"]) for r in records)),
         statuses=dict(sum((Counter(r["metrics"]["status"]) for r in records), Counter())),
@@ -138,9 +141,20 @@ def _ratios(after: np.ndarray, before: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(ratios), 1.0, ratios)
 
 
-def verdict(summaries: Sequence[Summary], skipped: Mapping[str, str]) -> tuple[str, ...]:
-    """Return sentences: every controller against the baseline, failures, and controllers that were not run."""
-    sentences = [_sentence(summaries[0], s) for s in summaries[1:]]
+def noun(named: bool) -> str:
+    """Return what scenarios are called where they are named, and where they are not."""
+    return "cases" if named else "scenarios"
+
+
+def verdict(summaries: Sequence[Summary], skipped: Mapping[str, str], what: str = "scenarios") -> tuple[str, ...]:
+    """Return sentences: every controller against the baseline, failures, and controllers that were not run.
+
+    Args:
+        summaries: the baseline first.
+        skipped: reasons why controllers were not run, by name.
+        what: what the scenarios are called.
+    """
+    sentences = [_sentence(summaries[0], s, what) for s in summaries[1:]]
     if len(summaries) == 1:
         only = summaries[0]
         sentences.append(
@@ -148,19 +162,19 @@ def verdict(summaries: Sequence[Summary], skipped: Mapping[str, str]) -> tuple[s
         )
     elif not summaries:
         sentences.append("No controller could serve the problem, so nothing can be compared.")
-    sentences += [_failed(s) for s in summaries if s.failures]
+    sentences += [_failed(s, what) for s in summaries if s.failures]
     if skipped:
         sentences.append("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + ".")
     return tuple(sentences)
 
 
-def _sentence(baseline: Summary, one: Summary) -> str:
+def _sentence(baseline: Summary, one: Summary, what: str) -> str:
     difference = one.difference
     assert difference is not None
     count = one.errors.size
     numbers = (
         f"median difference of the error {signed(difference.median)}, "
-        f"95 % interval {signed(difference.low)} to {signed(difference.high)}; smaller in {one.better} of {count} scenarios"
+        f"95 % interval {signed(difference.low)} to {signed(difference.high)}; smaller in {one.better} of {count} {what}"
     )
     if one.outcome is Outcome.BETTER:
         return f"{one.name} has a smaller error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
@@ -169,9 +183,9 @@ def _sentence(baseline: Summary, one: Summary) -> str:
     return f"{one.name} and {baseline.name} show no clear difference ({numbers})."
 
 
-def _failed(one: Summary) -> str:
+def _failed(one: Summary, what: str) -> str:
     parts = [f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished"]
-    return f"{one.name} fails in {one.failures} of {one.errors.size} scenarios ({', '.join(parts)})."
+    return f"{one.name} fails in {one.failures} of {one.errors.size} {what} ({', '.join(parts)})."
 
 
 def percent(share: float) -> str:

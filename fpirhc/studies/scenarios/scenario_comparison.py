@@ -11,7 +11,7 @@ from typing import Any
 from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.simulation.metrics.columns import Column as Number
-from fpirhc.studies.scenarios.paired import Record, Summary, percent, signed
+from fpirhc.studies.scenarios.paired import Record, Summary, noun, percent, signed
 from fpirhc.studies.view import View, status_shares
 from fpirhc.summary import Column, Table, line, written_out
 
@@ -33,6 +33,7 @@ class ScenarioComparison(FoundByName):
         title: its title.
         description: its description.
         count: number of scenarios.
+        named: whether they are cases of the problem file.
         percent: range of the exact parameters' draws, percent.
         seed: of all draws.
         measure_from: time from which errors count.
@@ -67,9 +68,10 @@ class ScenarioComparison(FoundByName):
     command: str
     elapsed: float
     time_unit: str = "s"
+    named: bool = False
 
     def __repr__(self) -> str:
-        counts = f"{self.count} scenarios", f"{len(self.summaries)} controllers", f"seed {self.seed}"
+        counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"
         return line(self, self.problem, *counts, self.verdict[0])
 
     def _repr_html_(self) -> str:
@@ -90,9 +92,10 @@ class ScenarioComparison(FoundByName):
 
 def _view(comparison: ScenarioComparison) -> View:
     """Return what is said of paired scenarios."""
+    drawn = f", exact parameters within {comparison.percent:g} % of the problem's"
     conditions = (
-        f"{comparison.count} scenarios of seed {comparison.seed}, exact parameters within {comparison.percent:g} % of the "
-        f"problem's, errors from t = {comparison.measure_from:g} {comparison.time_unit} on."
+        f"{comparison.count} {noun(comparison.named)} of seed {comparison.seed}{'' if comparison.named else drawn}, errors from "
+        f"t = {comparison.measure_from:g} {comparison.time_unit} on."
     )
     outcomes = [
         one.outcome for one in comparison.summaries[1:]
@@ -122,11 +125,11 @@ def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
         Column("smaller in", None),
         *(Column(f"median {c.short}", None) for c in comparison.columns),
         Column("worst"),
-        Column("in scenario", None),
+        Column(f"in {noun(comparison.named).removesuffix('s')}", None),
         Column("failures", "failed"),
         Column("status", None, left=True),
     )
-    table = Table(f"{comparison.problem}: {comparison.count} scenarios", heads, conditions)
+    table = Table(f"{comparison.problem}: {comparison.count} {noun(comparison.named)}", heads, conditions)
     for one in comparison.summaries:
         beside = ["baseline", "", ""]
         if one.difference is not None:
@@ -135,7 +138,7 @@ def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
             beside = [apart, written_out(one.ratio), str(one.better)]
         failed = ", ".join(f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished")
         medians = [_median(c, one) for c in comparison.columns]
-        worst = [percent(one.worst), str(one.worst_scenario), failed or "0"]
+        worst = [percent(one.worst), one.worst_name, failed or "0"]
         table.add([one.name, percent(one.median), *beside, *medians, *worst, status_shares(one.statuses)])
     return table
 
@@ -168,6 +171,7 @@ def _summary(one: Summary) -> dict[str, Any]:
         "better": one.better,
         "worst_error": one.worst,
         "worst_scenario": one.worst_scenario,
+        "worst_name": one.worst_name,
         "rms_error": one.rms_error,
         "metrics": one.metrics,
         "outcomes": one.outcomes,

@@ -21,7 +21,7 @@ from fpirhc.studies.comparison.compare import check_gains, select, versions
 from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
-from fpirhc.studies.scenarios.paired import Record, Summary, summarise, verdict
+from fpirhc.studies.scenarios.paired import Record, Summary, noun, summarise, verdict
 from fpirhc.studies.scenarios.processes import Workers
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 from fpirhc.studies.tuning.tuned_file import with_tuned
@@ -34,8 +34,9 @@ Progress = Callable[[str, int, int], None]
 def compare_scenarios(
     task: Task,
     *,
-    count: int,
-    percent: float,
+    count: int | None = None,
+    percent: float = 0.0,
+    cases: Sequence[str] | None = None,
     seed: Seed,
     folder: Path,
     controllers: Sequence[str] | None = None,
@@ -47,12 +48,13 @@ def compare_scenarios(
     command: str = "",
     progress: Progress | None = None,
 ) -> ScenarioComparison:
-    """Run every controller in `count` scenarios and return paired statistics; scenarios that `folder` holds are not run again.
+    """Run every controller in the same scenarios and return paired statistics; scenarios that `folder` holds are not run again.
 
     Args:
         task: the loaded problem file.
-        count: number of scenarios.
+        count: number of random scenarios.
         percent: range of the exact parameters' draws around the problem's, percent.
+        cases: in place of random scenarios, those cases of the task that these patterns name; see `Cases.matching`.
         seed: of all draws.
         folder: folder to which finished scenarios are written, one by one.
         controllers: names of controllers; None: all.
@@ -71,22 +73,25 @@ def compare_scenarios(
         WorkerDied: processes die again and again.
     """
     begin = time.perf_counter()
-    _check_request(task, count, percent, processes)
+    numbers = _numbers(task, count, percent, cases)
+    if processes < 1:
+        raise InvalidValue(f"processes {processes}: expected at least 1")
     task = with_tuned(task, tuned or {})
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
-    conditions = Conditions(seed, COMPARING, float(percent), compiled)
+    conditions = Conditions(seed, COMPARING, float(percent), compiled, named=cases is not None)
     bench, header = Bench(task, conditions), fingerprint(task, conditions)
     opening = {"path": str(task.path.resolve()), "tuned": tuned or {}, "conditions": asdict(conditions)}
     workers = Workers(__package__ + ".worker", opening, header, processes)
     with Ledger(folder / LEDGER, header, RecordFields) as ledger:
-        records, skipped = _completed(ledger, bench, workers if processes > 1 else None, count, names, progress)
+        records, skipped = _completed(ledger, bench, workers if processes > 1 else None, numbers, names, progress)
     summaries = _summaries(records, seed, task.metrics)
     return ScenarioComparison(
         problem=task.name,
         title=task.title,
         description=task.description,
-        count=count,
+        count=len(numbers),
+        named=conditions.named,
         percent=float(percent),
         seed=seed,
         measure_from=task.problem.measure_from,
@@ -95,7 +100,7 @@ def compare_scenarios(
         summaries=summaries,
         records=records,
         skipped=skipped,
-        verdict=verdict(summaries, skipped),
+        verdict=verdict(summaries, skipped, noun(conditions.named)),
         tuning={n: note for n, note in (tuning or {}).items() if n in names},
         settings={"problem": describe(task.problem), **{n: describe(task.controllers[n]) for n in names}},
         versions=versions(),
@@ -104,24 +109,41 @@ def compare_scenarios(
     )
 
 
-def _check_request(task: Task, count: int, percent: float, processes: int) -> None:
-    """Raise where there is nothing to run, or where all scenarios would be the same."""
-    for name, value in (("scenarios", count), ("processes", processes)):
-        if value < 1:
-            raise InvalidValue(f"{name} {value}: expected at least 1")
+def _numbers(task: Task, count: int | None, percent: float, cases: Sequence[str] | None) -> Sequence[int]:
+    """Numbers of the scenarios; an error where there is nothing to run, or where all scenarios would be the same."""
+    if cases is not None:
+        if count is not None or percent:
+            raise InvalidValue("cases are what they are: give either cases, or a number of scenarios and a mismatch")
+        if task.cases is None:
+            raise InvalidValue(
+                f"problem '{task.name}' has no cases; add to its file cases = fpirhc.Cases({{'heavy': {{'exact.mass': 2.0}}}}), or "
+                "fpirhc.Cases.from_csv('cases.csv')"
+            )
+        wanted = task.cases.matching(cases)
+        for name in wanted:  # what is wrong with a case is said before the first run
+            task.cases.problem(name, task.problem)
+        return [task.cases.names.index(name) for name in wanted]
+    if count is None or count < 1:
+        raise InvalidValue(f"scenarios {count}: expected at least 1")
     if percent == 0 and not task.problem.disturbances:
         raise InvalidValue(
             "every scenario would be the same: the problem has no disturbances and no parameter is drawn; give --mismatch P"
         )
+    return range(count)
 
 
 def _completed(
-    ledger: Ledger, bench: Bench, workers: Workers | None, count: int, names: Sequence[str], progress: Progress | None
+    ledger: Ledger,
+    bench: Bench,
+    workers: Workers | None,
+    numbers: Sequence[int],
+    names: Sequence[str],
+    progress: Progress | None,
 ) -> tuple[dict[str, Sequence[Record]], dict[str, str]]:
     """Run the jobs that the ledger lacks; return all records by controller in order, and the skipped with reasons."""
     records = {(r["scenario"], r["controller"]): r for r in ledger.records}
-    jobs = [(k, name) for k in range(count) for name in names if (k, name) not in records]
-    done = {name: sum((k, name) in records for k in range(count)) for name in names}
+    jobs = [(k, name) for k in numbers for name in names if (k, name) not in records]
+    done = {name: sum((k, name) in records for k in numbers) for name in names}
     skipped: dict[str, str] = {}
     # Closed whatever happens: the workers end with it.
     with closing(_answers(bench, workers, jobs)) as answers:
@@ -134,8 +156,8 @@ def _completed(
                 records[record["scenario"], name] = record
             done[name] += 1
             if progress:
-                progress(name, done[name], count)
-    return {n: [records[k, n] for k in range(count)] for n in names if n not in skipped}, skipped
+                progress(name, done[name], len(numbers))
+    return {n: [records[k, n] for k in numbers] for n in names if n not in skipped}, skipped
 
 
 def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, str]]) -> Generator[dict[str, Any]]:

@@ -1,0 +1,390 @@
+"""Named cases of a problem: under each name, what is different from the problem there.
+
+A path says what a case changes: 'exact.NAME', 'approximate.NAME' and 'known.NAME' a parameter, 'start.NAME' the first value of a
+state, and any other one a field of the problem or a number inside it, 'limits.inputs.Q1.1', 'dead_time.measurement', 'reality'.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, InvalidValue, Mistakes, nearest
+from fpirhc.fields.checked import Checked, checked_call, expects_whole_number
+from fpirhc.fields.given import described
+from fpirhc.fields.kinds import finite_number
+from fpirhc.fields.user_code import users_folder
+from fpirhc.plant.mismatch import Parametric
+from fpirhc.plant.motion import with_exact_parameters
+from fpirhc.summary import line
+from fpirhc.symbolic.paths import changed_at, content_at
+from fpirhc.task.problem import Problem
+
+EVERY = "all"  # the pattern of every case
+_GROUP, _SEED, _CASE = "group", "seed", "case"  # what a case has beside its changes; the column of the names
+_EXACT, _APPROXIMATE, _KNOWN, _START = "exact", "approximate", "known", "start"
+_PARAMETERS = {
+    _EXACT: "what moves",
+    _APPROXIMATE: "what the controllers know",
+    _KNOWN: "both: what moves has it, and the controllers know it",
+}
+_OWN = (
+    "plant",
+    "start",
+    "name",
+)  # fields of a problem that no path begins with: parameters and the start have words of their own
+
+
+@dataclass(frozen=True, eq=False)
+class Cases(Checked):
+    """Named cases of one problem; every controller of a comparison runs in every case.
+
+        cases = fp.Cases({"heavy": {"exact.mass": 2.0, "start.angle": 0.3}, "late": {"dead_time.measurement": 0.01}})
+        cases = fp.Cases.from_csv("patients.csv")
+
+    A run in a case is that of `problem(name, ...)`. What a case changes is known to the controllers as everything in a problem is,
+    except exact parameters and the reality.
+
+    Args:
+        changes: by name of the case and path. The path is 'exact.NAME' (the parameter of what moves), 'approximate.NAME' (of the
+            controllers' model), 'known.NAME' (of both), 'start.NAME', or begins with another field of the problem: 'reference',
+            'reality', 'signals', 'dead_time.inputs.Q1', 'limits.inputs.Q1' (a pair) or 'limits.inputs.Q1.1' (its upper end).
+            'group' is a text by which cases are summed up, 'seed' the seed of the case's noise.
+        places: where cases stand in a file, by name, for messages.
+
+    Raises:
+        InvalidProblem: all mistakes together: no case, a name that is no text, changes that are no mapping, a wrong group or seed.
+    """
+
+    changes: Mapping[str, Mapping[str, object]]
+    places: Mapping[str, str] = field(default_factory=dict, kw_only=True, metadata={"setting": False})
+
+    def __post_init__(self) -> None:
+        mistakes = Mistakes("cases")
+        if not self.changes:
+            mistakes.add('there is none; expected {"heavy": {"exact.mass": 2.0}}')
+        for name, changes in self.changes.items():
+            for why in _form(name, changes):
+                mistakes.add(f"{self._place(name)}: {why}")
+        mistakes.raise_if_any()
+
+    def __repr__(self) -> str:
+        groups = tuple(dict.fromkeys(filter(None, map(self.group, self.names))))
+        return line(self, f"{len(self.names)} cases", *([f"groups {', '.join(groups)}"] if groups else []))
+
+    @classmethod
+    def from_csv(cls, path: str | Path) -> Cases:
+        """Return the cases of a table: a row each, named in the column 'case', with a path as the head of every other column.
+
+        Cells hold numbers; where one is empty, the case leaves the problem as it is. There may be columns 'group' and 'seed'. A
+        line that begins with '#' is a remark.
+
+        Args:
+            path: of the file; a relative one begins at the folder of the file that calls this.
+
+        Raises:
+            InvalidProblem: the file cannot be read, or all mistakes in its form together, each with row and column.
+        """
+        place = Path(path)
+        return _read(cls, place if place.is_absolute() else users_folder() / place)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the cases."""
+        return tuple(self.changes)
+
+    def group(self, name: str) -> str:
+        """Return the group of a case; '' where it has none."""
+        return str(self.changes[name].get(_GROUP, ""))
+
+    def seed(self, name: str) -> int | None:
+        """Return the seed of a case's noise; None where the study chooses it."""
+        return cast(int | None, self.changes[name].get(_SEED))
+
+    @checked_call
+    def matching(self, patterns: Sequence[str]) -> tuple[str, ...]:
+        """Return the names of the cases that a pattern names, in their order: 'all', 'adult*', or the pattern of a group.
+
+        Raises:
+            InvalidName: a pattern without a case.
+        """
+        known = {name: (name, self.group(name)) for name in self.names}
+        wanted: set[str] = set()
+        for pattern in patterns:
+            found = {
+                n for n, texts in known.items() if pattern == EVERY or any(fnmatchcase(t, pattern) for t in texts if t)
+            }
+            if not found:
+                valid = dict.fromkeys((EVERY, *filter(None, map(self.group, self.names)), *self.names))
+                raise InvalidName(f"no case matches '{pattern}'.{nearest(pattern, valid)}")
+            wanted |= found
+        return tuple(name for name in self.names if name in wanted)
+
+    def problem(self, name: str, problem: Problem) -> Problem:
+        """Return the problem in a case.
+
+        Raises:
+            InvalidName: an unknown case.
+            InvalidProblem: a change that the problem does not accept.
+        """
+        return self.exactly(name, self.build(name, problem))
+
+    def build(self, name: str, problem: Problem) -> Problem:
+        """Return the problem with all changes of a case but those of exact parameters, which are data of a loop."""
+        if name not in self.changes:
+            raise InvalidName(f"case '{name}' is unknown.{nearest(name, self.names)}")
+        self.check(problem, [name])
+        try:
+            return _changed(problem, self.changes[name])
+        except FpirhcError as error:
+            raise InvalidProblem(f"{self._place(name)}: {error}") from None
+
+    def exactly(self, name: str, built: Problem) -> Problem:
+        """Return what `build` returned, with the exact parameters of a case."""
+        given = {name: one.exact for name, one in built.moved.parameters.items()}
+        exact = {**given, **_exact_of(self.changes[name], given)}
+        if exact == given:
+            return built
+        try:
+            return with_exact(built, np.array(list(exact.values())))
+        except FpirhcError as error:
+            raise InvalidProblem(f"{self._place(name)}: {error}") from None
+
+    def key(self, name: str) -> tuple[object, ...]:
+        """Return what decides the build of a case; cases with equal keys have one build."""
+        return tuple(
+            (path, value if isinstance(value, int | float | str) else id(value))
+            for path, value in sorted(self.changes[name].items())
+            if path not in (_GROUP, _SEED) and not path.startswith(f"{_EXACT}.")
+        )
+
+    def check(self, problem: Problem, names: Sequence[str] | None = None) -> None:
+        """Raise where a path or a number does not fit the problem.
+
+        Args:
+            problem: the problem.
+            names: of the cases; None: all.
+
+        Raises:
+            InvalidProblem: all mistakes together, each with its case and path, or its row and column.
+        """
+        mistakes, unknown = Mistakes("cases"), set[str]()
+        for name in self.names if names is None else names:
+            changes = self.changes[name]
+            for path in (p for p in changes if p not in (*unknown, _GROUP, _SEED)):
+                try:
+                    _check_change(problem, changes, path)
+                except InvalidName as error:  # a wrong path is one mistake, in however many cases it stands
+                    unknown.add(path)
+                    mistakes.add(f"{self._place(name, path, head=True)}: {error}")
+                except FpirhcError as error:
+                    mistakes.add(f"{self._place(name, path)}: {error}")
+        mistakes.raise_if_any()
+
+    def _place(self, name: str, path: str = "", *, head: bool = False) -> str:
+        """Where a case stands, or one of its numbers: by name and path, or by row and column of a file."""
+        row = self.places.get(name, "")
+        if not row:
+            return f"case {name!r}" + (f", {path!r}" if path else "")
+        return (row.partition(",")[0] if head else f"{row} ({name})") + (f", column '{path}'" if path else "")
+
+
+def with_exact(problem: Problem, exact: np.ndarray) -> Problem:
+    """Return the problem with other exact parameters, shape (np,): those of the reality where it has one.
+
+    Raises:
+        InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
+        NotSupported: an external plant without parameters.
+    """
+    if problem.reality is not None:
+        return replace(problem, reality=problem.reality.with_exact(exact))
+    return replace(problem, plant=with_exact_parameters(problem.plant, exact))
+
+
+def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
+    """The problem with all changes but those of exact parameters; whole fields come first."""
+    of_fields = {path: value for path, value in changes.items() if _word(path) not in (*_WORDS, _GROUP, _SEED)}
+    for path, value in sorted(_joined(problem, of_fields).items(), key=lambda one: one[0].count(".")):
+        problem = changed_at(problem, path, _number_of(problem, path, value))
+    model = {name: value for word in (_APPROXIMATE, _KNOWN) for name, value in _named(changes, word).items()}
+    start = _named(changes, _START)
+    if model:
+        parameters = {
+            name: replace(one, approximate=float(model[name])) if name in model else one
+            for name, one in problem.plant.parameters.items()
+        }
+        problem = replace(problem, plant=replace(problem.plant, parameters=parameters))
+    return replace(problem, start={**problem.start, **start}) if start else problem
+
+
+def _joined(problem: Problem, changes: Mapping[str, object]) -> dict[str, object]:
+    """The changes with both ends of an interval as one, because one of them may be valid with the other alone."""
+    joined: dict[str, object] = {}
+    for path, value in changes.items():
+        parent, _, place = path.rpartition(".")
+        both = f"{parent}.0" in changes and f"{parent}.1" in changes and place in ("0", "1")
+        if both and isinstance(content_at(problem, parent, "the problem"), tuple):
+            joined[parent] = (changes[f"{parent}.0"], changes[f"{parent}.1"])
+        else:
+            joined[path] = value
+    return joined
+
+
+def _number_of(problem: Problem, path: str, value: object) -> object:
+    """A number of a file as the field declares it."""
+    parent, _, name = path.rpartition(".")
+    owner = content_at(problem, parent, "the problem") if parent else problem
+    whole = is_dataclass(owner) and expects_whole_number(type(owner), name)
+    return int(value) if whole and isinstance(value, float) and value.is_integer() else value
+
+
+def _word(path: str) -> str:
+    return path.partition(".")[0]
+
+
+def _named(changes: Mapping[str, object], word: str) -> dict[str, float]:
+    """The numbers below a word, by the name behind it."""
+    return {
+        path.partition(".")[2]: cast(float, value) for path, value in changes.items() if path.startswith(f"{word}.")
+    }
+
+
+def _exact_of(changes: Mapping[str, object], moved: Container[str]) -> dict[str, float]:
+    """The exact parameters that a case changes; what is known has its exact value where the plant that moves has it too."""
+    known = {name: value for name, value in _named(changes, _KNOWN).items() if name in moved}
+    return {name: float(value) for name, value in {**known, **_named(changes, _EXACT)}.items()}
+
+
+def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
+    """What is wrong with a case whatever its problem is."""
+    if not name.strip():
+        yield "the name of a case is a text that is not empty"
+    if name == EVERY:
+        yield f"'{EVERY}' means every case; choose another name"
+    group, seed = changes.get(_GROUP, ""), changes.get(_SEED)
+    if not isinstance(group, str):
+        yield f"'{_GROUP}' is a text, got {described(group)}"
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
+        yield f"'{_SEED}' is a whole number of at least 0, got {described(seed)}"
+
+
+def _check_change(problem: Problem, changes: Mapping[str, object], path: str) -> None:
+    """Raise where one change does not fit.
+
+    Raises:
+        InvalidName: nothing stands at the path; the message says what does.
+        InvalidValue: no number, or one outside the range of a parameter or a state.
+    """
+    word, _, name = path.partition(".")
+    if word == _START:
+        _check_name(f"'{_START}.NAME' has a state", name, problem.plant.state.elements)
+        _check_number(changes[path], problem.plant.ranges.get(name))
+        return
+    if word in _PARAMETERS:
+        settable = {n: one for n, one in _parametric(problem, changes, word).parameters.items() if not one.outside}
+        _check_name(f"'{word}.NAME' has a parameter of {_PARAMETERS[word]}", name, settable)
+        _check_number(changes[path], settable[name].bounds, settable[name].unit)
+        return
+    paths = [f.name for f in fields(problem) if f.name not in _OWN]
+    if word not in paths:
+        raise InvalidName(f"a case has no '{path}'.{_meant(problem, path) or nearest(word, [*_WORDS, *paths])}")
+    if isinstance(content_at(problem, path, "the problem"), int | float):
+        _check_number(changes[path])
+
+
+def _parametric(problem: Problem, changes: Mapping[str, object], word: str) -> Parametric:
+    """Whose parameter a case changes; a case with a reality of its own means that one."""
+    if word != _EXACT:
+        return problem.plant
+    return changed_at(problem, "reality", changes["reality"]).moved if "reality" in changes else problem.moved
+
+
+def _meant(problem: Problem, path: str) -> str:
+    """What to write for the name of a parameter, a state or an input alone."""
+    if path in problem.plant.parameters or path in problem.moved.parameters:
+        return (
+            " It is a parameter: " + ", ".join(f"'{word}.{path}' is {what}" for word, what in _PARAMETERS.items()) + "."
+        )
+    if path in problem.plant.state.elements:
+        return f" It is a state: '{_START}.{path}' is its first value."
+    return f" It is an input: 'limits.inputs.{path}' are its limits." if path in problem.plant.inputs else ""
+
+
+def _check_name(what: str, name: str, valid: Iterable[str]) -> None:
+    names = list(valid)
+    if name not in names:
+        raise InvalidName(f"{what}, and there is no '{name}'.{nearest(name, names)}")
+
+
+def _check_number(value: object, bounds: tuple[float, float] | None = None, unit: str = "") -> None:
+    if not finite_number(value):
+        raise InvalidValue(f"expected a finite number, got {described(value)}")
+    low, high = bounds or (-math.inf, math.inf)
+    if not low <= float(value) <= high:  # type: ignore[arg-type]  # it is a number
+        raise InvalidValue(f"expected {low:g} to {high:g}{f' {unit}' if unit not in ('', '1') else ''}, got {value:g}")
+
+
+def _read(make: Callable[..., Cases], path: Path) -> Cases:
+    """The cases of a file; places of mistakes are its rows and columns, counted from 1."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            lines = [(k, row) for k, row in enumerate(csv.reader(file), 1) if any(row) and not row[0].startswith("#")]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InvalidProblem(f"cases: cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
+    mistakes = Mistakes(path.name)
+    head = [cell.strip() for cell in lines[0][1]] if lines else []
+    _check_head(head, mistakes)
+    changes: dict[str, dict[str, object]] = {}
+    places: dict[str, str] = {}
+    for number, row in lines[1:]:
+        cells = dict(zip(head, map(str.strip, row), strict=False))
+        name = cells.pop(_CASE, "")
+        if len(row) != len(head):
+            mistakes.add(f"row {number}: it has {len(row)} cells, expected {len(head)}, one for every column")
+        elif not name:
+            mistakes.add(f"row {number}, column '{_CASE}': it is empty; expected the name of the case")
+        elif name in changes:
+            mistakes.add(f"row {number}, column '{_CASE}': '{name}' stands in {places[name].partition(', ')[2]} too")
+        else:
+            changes[name], places[name] = {}, f"{path.name}, row {number}"
+            for column, cell in cells.items():
+                try:
+                    changes[name] |= {column: _cell(column, cell)} if cell else {}
+                except ValueError as error:
+                    mistakes.add(f"row {number} ({name}), column '{column}': {error}")
+    mistakes.raise_if_any()
+    return make(changes, places=places)
+
+
+def _check_head(head: Sequence[str], mistakes: Mistakes) -> None:
+    if _CASE not in head:
+        apart = "; columns are separated by commas" if head and ";" in head[0] else ""
+        mistakes.add(f"row 1: there is no column '{_CASE}' with the names of the cases{apart}.{nearest(_CASE, head)}")
+    for column in dict.fromkeys(head):
+        if not column or head.count(column) > 1:
+            mistakes.add(
+                f"row 1: column '{column}' stands {head.count(column)} times"
+                if column
+                else "row 1: a column has no name"
+            )
+    mistakes.raise_if_any()
+
+
+def _cell(column: str, cell: str) -> object:
+    if column == _GROUP:
+        return cell
+    try:
+        return int(cell) if column == _SEED else float(cell)
+    except ValueError:
+        what = "a whole number of at least 0" if column == _SEED else "a number, such as 3.5, or nothing"
+        raise ValueError(f"expected {what}, got '{cell}'") from None
+
+
+_WORDS = (*_PARAMETERS, _START)

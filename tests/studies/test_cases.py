@@ -1,0 +1,301 @@
+"""Named cases: a case is a problem, a comparison of cases is one of scenarios, and every wrong use says what to write.
+
+The laws: the run of a case is the run of its problem, bit by bit; cases and random scenarios are served by one machine; a wrong
+number is named by case and path, or by row and column.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from line import line_text
+
+import fpirhc as fp
+from fpirhc.cli.main import main
+from fpirhc.cli.verb import ExitCode
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.draws import COMPARING
+
+CASES = """
+cases = fp.Cases({
+    "usual": {},
+    "weak": {"exact.b": 0.9, "group": "light"},
+    "stiff": {"exact.k": 8.0, "exact.b": 1.2, "group": "heavy"},
+    "known": {"known.b": 2.0, "group": "heavy"},
+    "far": {"start.y": 1.0, "start.y'": -0.5, "seed": 7},
+    "late": {"dead_time.measurement": 0.01},
+    "narrow": {"limits.inputs.u.1": 4.0, "limits.inputs.u.0": -4.0},
+    "other way": {"reference": fp.Trajectory(lambda t: {"y": 0.3 * ca.cos(t)}), "start.y": 0.3},
+})
+"""
+TASK = (
+    "period=5e-3, duration=1.0, measure_from=0.2, disturbances={'u': fp.Noise(0.1)}, "
+    "dead_time=fp.DeadTime(measurement=0.0), limits=fp.Limits(inputs={'u': (-40.0, 40.0)})"
+)
+LINE = line_text(TASK, bounds="(0.5, 2.4)", more=CASES)
+
+
+@pytest.fixture
+def task(tmp_path, monkeypatch) -> Task:
+    """The task in a file of its own, in an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("line.py").write_text(LINE)
+    return fp.load_problem("line.py")
+
+
+def compared(task: Task, *patterns: str, folder: str = "out", **settings: Any) -> Any:
+    return fp.compare_scenarios(task, cases=patterns, seed=3, folder=Path(folder), compiled=False, **settings)
+
+
+# --- What a case is ---------------------------------------------------------------------------------------------------
+
+
+def test_a_case_changes_what_it_states_and_nothing_else(task):
+    """Parameters of either set, the start and inner numbers; the problem stays as it is."""
+    plain, cases = task.problem, task.cases
+    of = {name: cases.problem(name, plain) for name in cases.names}
+    assert [of["stiff"].plant.exact.tolist(), of["stiff"].plant.approximate.tolist()] == [[1.2, 8.0], [1.0, 2.0]]
+    assert [of["known"].plant.exact.tolist(), of["known"].plant.approximate.tolist()] == [[2.0, 5.0], [2.0, 2.0]]
+    assert of["far"].start_state.tolist() == [1.0, -0.5]
+    assert of["late"].dead_time.measurement == 0.01
+    assert of["narrow"].limits.inputs["u"] == (-4.0, 4.0)
+    assert of["other way"].reference is not plain.reference
+    assert np.array_equal(of["usual"].plant.exact, plain.plant.exact)
+    assert plain.start_state.tolist() == [0.5, 0.0]
+
+
+def test_the_run_of_a_case_is_that_of_its_problem(task):
+    """Bit by bit, in every case and with every controller, whichever loop it shares with other cases."""
+    bench = Bench(task, Conditions(3, COMPARING, 0.0, compiled=False, named=True))
+    for number, name in enumerate(task.cases.names):
+        problem, seed = task.cases.problem(name, task.problem), bench._scenario(number).seed
+        for controller in task.controllers:
+            record = bench.record(number, controller)
+            run = fp.simulate(problem, task.controllers[controller], seed=seed, compiled=False)
+            assert record["metrics"]["rms_error"] == fp.measure(problem, run).values["rms_error"]
+    loops = {id(one) for (owner, _), one in bench._simulators.items() if owner == "CTC"}
+    assert (
+        len(loops) == len(task.cases.names) - 2
+    )  # 'weak' and 'stiff' have the loop of 'usual': exact parameters are data
+
+
+def test_the_seed_of_a_case_is_its_own_or_the_studys(task):
+    scenarios = Bench(task, Conditions(3, COMPARING, 0.0, compiled=False, named=True))._scenarios
+    seeds = [scenarios[k].seed for k in range(8)]
+    assert seeds[4] == 7
+    assert len(set(seeds)) == len(seeds)
+    other = Bench(task, Conditions(4, COMPARING, 0.0, compiled=False, named=True))._scenarios
+    assert [other[k].seed == seeds[k] for k in range(8)] == [k == 4 for k in range(8)]
+
+
+def test_exact_parameters_are_those_of_the_reality(task):
+    """Where another plant moves, 'exact' means its parameters, also those that the model does not have."""
+    plant = task.problem.plant
+    real = replace(plant, parameters={**plant.parameters, "drag": fp.Parameter(0.0, 0.0, "1/s")})
+    problem = replace(task.problem, reality=fp.Reality(real))
+    cases = fp.Cases(
+        {"drag": {"exact.drag": 0.4, "known.b": 1.1}, "none": {"reality": fp.Reality(plant), "exact.k": 6.0}}
+    )
+    moved = cases.problem("drag", problem)
+    assert moved.real_plant.exact.tolist() == [1.1, 5.0, 0.4]
+    assert moved.plant.approximate.tolist() == [1.1, 2.0]
+    assert cases.problem("none", problem).real_plant.exact.tolist() == [1.6, 6.0]
+
+
+# --- From a table -----------------------------------------------------------------------------------------------------
+
+TABLE = """# a remark
+case, group, exact.b, exact.k, start.y, seed
+weak, light, 0.9, , ,
+stiff, heavy, 1.2, 8, 0.4, 11
+"""
+
+
+def written(text: str) -> Path:
+    path = Path("cases.csv")
+    path.write_text(text)
+    return path
+
+
+def test_a_table_is_a_mapping(task):
+    """An empty cell leaves the problem as it is."""
+    cases = fp.Cases.from_csv(written(TABLE).resolve())
+    assert cases.changes == {
+        "weak": {"group": "light", "exact.b": 0.9},
+        "stiff": {"group": "heavy", "exact.b": 1.2, "exact.k": 8.0, "start.y": 0.4, "seed": 11},
+    }
+    assert cases.problem("stiff", task.problem).plant.exact.tolist() == [1.2, 8.0]
+    assert repr(cases) == "Cases(2 cases, groups light, heavy)"
+
+
+def test_a_table_lies_beside_the_problem_file(task, tmp_path, monkeypatch):
+    """A relative path begins at the file that names it, wherever the command is given."""
+    written(TABLE)
+    Path("line.py").write_text(line_text(TASK, bounds="(0.5, 2.4)", more='cases = fp.Cases.from_csv("cases.csv")\n'))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    cases = fp.load_problem("../line.py").cases
+    assert cases is not None
+    assert cases.names == ("weak", "stiff")
+
+
+# --- Comparisons ------------------------------------------------------------------------------------------------------
+
+
+def test_patterns_name_cases_and_groups(task):
+    matching = task.cases.matching
+    assert matching(["all"]) == task.cases.names
+    assert matching(["heavy"]) == ("stiff", "known")
+    assert matching(["*r*", "late"]) == ("far", "late", "narrow", "other way")
+
+
+def test_finished_cases_are_kept_whichever_are_asked_for_next(task):
+    """A ledger of some cases goes on to all of them; what was run stays and is not run again."""
+    compared(task, "heavy")
+    before = Path("out/scenarios.jsonl").read_text().splitlines()
+    everything = compared(task, "all")
+    after = Path("out/scenarios.jsonl").read_text().splitlines()
+    assert after[: len(before)] == before
+    assert len(after) - len(before) == 6 * len(task.controllers)
+    assert everything.count == 8
+    assert [r["name"] for r in everything.records["CTC"]] == list(task.cases.names)
+
+
+def test_processes_change_nothing(task):
+    alone, two = compared(task, "all", folder="one"), compared(task, "all", folder="two", processes=2)
+    assert alone.records == two.records
+
+
+def test_the_worst_case_has_its_name_everywhere(task):
+    """The case with the largest error is named in the verdict's table, in the facts and in the summary."""
+    comparison = compared(task, "all")
+    summary = comparison["CTC"]
+    errors = {r["name"]: r["error"] for r in comparison.records["CTC"]}
+    assert summary.worst_name == max(errors, key=lambda name: errors[name])
+    assert summary.worst == max(errors.values())
+    assert comparison.view.facts["controllers"]["CTC"]["worst_name"] == summary.worst_name
+    assert "of 8 cases" in comparison.verdict[0]
+    assert comparison.view.tables[0].title == "line: 8 cases"
+
+
+def test_the_command(task, capsys):
+    """`compare --cases` writes a report; `run --case` is one of its runs, to look into."""
+    assert main(["compare", "line.py", "--cases", "heavy", "far", "--no-compile", "--json"]) == ExitCode.FINISHED
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["scenarios"] == 3
+    assert Path("results/line/cases_seed0/report.html").is_file()
+    assert main(["run", "line.py", "CTC", "--case", "far", "--no-compile", "--seed", "7"]) == ExitCode.FINISHED
+    run = fp.load_run("results/line/CTC_far.npz")
+    error = fp.measure(task.cases.problem("far", task.problem), run).rms_error["y"]
+    record = next(r for r in compared(task, "far").records["CTC"])
+    assert record["metrics"]["rms_error"]["y"] == error
+
+
+# --- Wrong uses -------------------------------------------------------------------------------------------------------
+
+WRONG_CASES: dict[str, tuple[Any, str]] = {
+    "no case": ({}, r"there is none; expected \{.heavy.: "),
+    "a name that is empty": ({" ": {}}, "the name of a case is a text that is not empty"),
+    "the name of all": ({"all": {}}, "'all' means every case; choose another name"),
+    "no mapping": ({"weak": 0.9}, r"Cases\.changes\['weak'\]: expected .*got 0\.9"),
+    "a path that is no text": ({"weak": {1: 0.9}}, r"Cases\.changes\['weak'\]: name 1: expected a text, got 1"),
+    "a group that is no text": ({"weak": {"group": 1}}, "case 'weak': 'group' is a text, got 1"),
+    "a seed below zero": ({"weak": {"seed": -1}}, "case 'weak': 'seed' is a whole number of at least 0, got -1"),
+}
+WRONG_PATHS: dict[str, tuple[Any, str]] = {
+    "a parameter that is not there": ({"exact.c": 1.0}, r"'exact\.c': .* there is no 'c'\. .*Valid: b, k"),
+    "a parameter alone": (
+        {"b": 1.0},
+        r"a case has no 'b'\. It is a parameter: 'exact\.b' is what moves, 'approximate\.b'",
+    ),
+    "a state alone": ({"y'": 1.0}, r"It is a state: 'start\.y'' is its first value"),
+    "an input alone": ({"u": 1.0}, r"It is an input: 'limits\.inputs\.u' are its limits"),
+    "a field that is misspelt": ({"dead_tme.measurement": 0.1}, r"a case has no 'dead_tme.*Did you mean 'dead_time'\?"),
+    "a field inside": ({"dead_time.measurment": 0.1}, r"Did you mean 'measurement'\?"),
+    "a parameter outside its bounds": ({"exact.b": -70.0}, r"'exact\.b': expected 0\.5 to 2\.4 1/kg, got -70"),
+    "no number": ({"exact.b": "1.2"}, r"'exact\.b': expected a finite number, got the text '1\.2'"),
+    "an infinite start": ({"start.y": float("inf")}, r"'start\.y': expected a finite number, got inf"),
+    "a limit that is none": ({"limits.inputs.u.1": -50.0}, r"case 'weak': .*u"),
+}
+WRONG_TABLES = {
+    "no column of names": ("name,exact.b\nweak,1\n", r"cases\.csv: row 1: there is no column 'case'"),
+    "semicolons": ("case;exact.b\nweak;1\n", "columns are separated by commas"),
+    "a name twice": ("case,exact.b\nweak,1\nweak,2\n", "row 3, column 'case': 'weak' stands in row 2 too"),
+    "a column twice": ("case,exact.b,exact.b\nweak,1,2\n", "row 1: column 'exact.b' stands 2 times"),
+    "too few cells": ("case,exact.b\nweak\n", "row 2: it has 1 cells, expected 2"),
+    "no number": (
+        "case,exact.b\nweak,1\nstiff,heavy\n",
+        r"row 3 \(stiff\), column 'exact\.b': expected a number, .* got 'heavy'",
+    ),
+    "no name": ("case,exact.b\n,1\n", "row 2, column 'case': it is empty"),
+    "a wrong column": ("case,exact.c\nweak,1\nstiff,1\n", r"cases\.csv, column 'exact\.c': .* there is no 'c'"),
+    "a negative weight": (
+        "case,exact.b\nweak,1\nodd,-70\n",
+        r"cases\.csv, row 3 \(odd\), column 'exact\.b': expected 0\.5 to 2\.4 1/kg, got -70",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_CASES)
+def test_wrong_cases(wrong):
+    changes, message = WRONG_CASES[wrong]
+    with pytest.raises(InvalidProblem, match=message):
+        fp.Cases(changes)
+
+
+@pytest.mark.parametrize("wrong", WRONG_PATHS)
+def test_wrong_paths(wrong, task):
+    """The case and the path are named, and what could stand there."""
+    changes, message = WRONG_PATHS[wrong]
+    with pytest.raises(InvalidProblem, match=message):
+        fp.Cases({"weak": changes}).problem("weak", task.problem)
+
+
+@pytest.mark.parametrize("wrong", WRONG_TABLES)
+def test_wrong_tables(wrong, task):
+    """Row and column are named, as a spreadsheet counts them."""
+    text, message = WRONG_TABLES[wrong]
+    with pytest.raises(InvalidProblem, match=message):
+        fp.Cases.from_csv(written(text).resolve()).check(task.problem)
+
+
+def test_all_mistakes_of_a_table_are_told_together(task):
+    """A wrong column once, however many rows it has, and every wrong number."""
+    text = "case,exact.c,exact.b\nweak,1,9\nstiff,1,-1\nfar,2,1\n"
+    with pytest.raises(InvalidProblem) as error:
+        fp.Cases.from_csv(written(text).resolve()).check(task.problem)
+    assert str(error.value).count("exact.c") == 1
+    assert [f"row {k}" in str(error.value) for k in (2, 3, 4)] == [True, True, False]
+
+
+def test_wrong_requests(task):
+    with pytest.raises(InvalidName, match=r"no case matches 'hevy'\. Did you mean 'heavy'\?"):
+        compared(task, "hevy")
+    with pytest.raises(InvalidValue, match="give either cases, or a number of scenarios"):
+        compared(task, "all", count=3)
+    with pytest.raises(InvalidValue, match=r"problem 'line' has no cases; add to its file cases = fpirhc\.Cases"):
+        compared(replace(task, cases=None), "all")
+    Path("line.py").write_text(line_text(TASK, more='cases = {"weak": {}}\n'))
+    with pytest.raises(ProblemFileError, match=r"line \d+: expected cases = fpirhc\.Cases\("):
+        fp.load_problem("line.py")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--cases", "all", "--scenarios", "3"], "--cases and --scenarios are two comparisons"),
+        (["--cases", "all", "--mismatch", "3"], "--cases have the parameters that they state"),
+        (["--cases", "all", "--optimisers", "all"], "--optimisers cannot be combined with --cases"),
+        (["--cases", "nobody"], "no case matches 'nobody'"),
+    ],
+)
+def test_wrong_commands(options, message, task, capsys):
+    assert main(["compare", "line.py", *options]) == ExitCode.BAD_INPUT
+    assert message in capsys.readouterr().err
