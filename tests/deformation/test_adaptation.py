@@ -44,7 +44,7 @@ SMOOTH = np.sin(0.01 * np.arange(CYCLES))
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_tuner_follows_a_plant_whose_gain_jumps(noise):
-    """1.2 -> 15 -> 0.3: the rms response error stays below 0.1 in each regime; a fixed gain cycles in the second."""
+    """1.2 -> 15 -> 0.3: the rms response error stays below 0.14 in each regime; a fixed gain cycles in the second."""
     gains = np.repeat([1.2, 15.0, 0.3], CYCLES // 3)
     white = noise * np.random.default_rng(0).standard_normal(CYCLES)
     sigmoid = fp.Sigmoid(gain=-0.5, scale=10.0)
@@ -53,7 +53,7 @@ def test_tuner_follows_a_plant_whose_gain_jumps(noise):
     for deformation in (sigmoid, tuned):
         _, errors, _, _ = run(deformation, lambda k, r: gains[k] * r, SMOOTH, white)
         results[deformation] = [np.sqrt(np.mean(part[500:] ** 2)) for part in np.split(errors[: CYCLES - 3], 3)]
-    assert max(results[tuned]) < 0.1
+    assert max(results[tuned]) < 0.14
     assert results[sigmoid][1] > 10
 
 

@@ -118,6 +118,50 @@ def rms_errors(plant: str, tuned: bool, gain: float = -0.5) -> tuple[float, ...]
     return tuple(float(np.mean(list(rms.values()))) for rms in runs)
 
 
+@pytest.mark.parametrize("components", [1, 2, 3])
+@pytest.mark.parametrize("product", [0.5, 0.9, 1.5])
+def test_false_alarms_are_as_rare_as_stated(product, components):
+    """White noise, 200 000 cycles the cap is the floor: at most one alarm up to a product of 0.9, one in 7000 cycles at 1.5."""
+    tuned = fp.Tuned(fp.Affine(gain=-2 * product), largest_gain=product)
+    layout = tuned.memory(tuple(f"q{k}" for k in range(components)))
+    r, n, m = (ca.SX.sym(name, size) for name, size in (("r", components), ("n", components), ("m", layout.size)))
+    request, next_memory = tuned.step(r, r + n, ca.SX.zeros(components), layout.split(m))
+    step = ca.Function("s", [ca.vertcat(r, m), n], [ca.vertcat(request, layout.join(next_memory))])
+    noise = np.random.default_rng(0).standard_normal((components, 200_000))
+    log = step.mapaccum("run", noise.shape[1])(np.append(np.zeros(components), layout.start()), noise).full()
+    factor = log[components + layout.slice("tuner_factor").start]
+    assert np.sum(np.diff(factor) < -0.3) <= (1 if product < 1 else 28)
+    assert factor.max() == 1.0
+    # Below the floor the target is a product of 1: there, or at the floor, the factor ends.
+    assert factor.mean() > (0.99 if product < 1 else 0.8)
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("law", ["computed torque", "receding horizon"])
+@pytest.mark.parametrize("gain", [-0.5, -2.0])
+def test_tuner_costs_at_most_three_percent_in_noise(law, gain, noise):
+    """Twelve settings of two masses with noisy accelerometers, three seeds each: beside the gain that the tuner begins with."""
+    sensors = {name: fp.Sensor(noise=fp.Noise(noise)) for name in ("q1''", "q2''")}
+    file = fp.load_problem("two_mass")
+    problem, map_ = replace(file.problem, sensing=fp.Sensing(sensors)), fp.Sigmoid(gain=gain, shift=0.3, scale=20.0)
+    base: Any = {
+        "computed torque": file.controllers["CTC+FPI (eq 3)"],
+        "receding horizon": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=5e-2)),
+    }[law]
+    for seed in SEEDS:
+        fixed, tuned = (
+            np.mean(
+                list(
+                    fp.measure(
+                        problem, fp.simulate(problem, replace(base, deformation=d), seed=seed)
+                    ).rms_error.values()
+                )
+            )
+            for d in (map_, fp.Tuned(map_, largest_gain=1.2))
+        )
+        assert tuned <= 1.03 * fixed
+
+
 @pytest.mark.parametrize(("plant", "gain"), [("two_mass", -0.5), ("drive", -0.4), ("drive", -0.08)])
 def test_tuner_is_never_worse_than_its_start(plant, gain):
     """Three seeds on both noisy plants: tracking at least as good as with the gain that the tuner begins with."""

@@ -78,10 +78,16 @@ def forget(before: Expression, sign: Expression) -> Expression:
     return ca.if_else(ca.fabs(mean) <= 1, mean, 0)
 
 
-def growing_in_a_row(count: Expression, error: Expression, before: Expression) -> Expression:
-    """Return how many errors in a row alternated in sign and grew; zero when the newest did not."""
-    grows = ca.logic_and(ca.dot(error, before) < 0, ca.sumsqr(error) > ca.sumsqr(before))
-    return ca.if_else(grows, count + 1, 0)
+def growing_in_a_row(
+    count: Expression, error: Expression, before: Expression, slow: float = 1.0, fast: float | Expression = 1.0
+) -> Expression:
+    """Return how many errors in a row alternated in sign and grew; zero when the newest did not.
+
+    An error that grew by less than the factor `fast` counts `slow`.
+    """
+    size, earlier = ca.sumsqr(error), ca.sumsqr(before)
+    weight = ca.if_else(size > fast**2 * earlier, 1, slow)
+    return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, size > earlier), count + weight, 0)
 
 
 def returning_in_a_row(count: Expression, error: Expression, before: Expression, earlier: Expression) -> Expression:
