@@ -430,8 +430,8 @@ def test_review_asks_the_plant_as_estimated(folder, capsys):
     del folder
     Path("outside.py").write_text(OUTSIDE)
     answers = []
-    for words in (["review", "outside.py", "--json"], ["review", "outside.py", "--probe", "--json"]):
-        main(words)
+    for words in ([], ["--probe"]):
+        main(["review", "outside.py", "--json", "--controllers", "CTC+FPI", *words])
         facts = json.loads(capsys.readouterr().out)
         every = [*facts["answers"], *facts["controllers"]["CTC+FPI"]]
         answers.append(sum(one["verdict"] != "unknown" for one in every))

@@ -41,7 +41,7 @@ def carriage(mass: float = 1.0, believed: float = 1.3) -> fp.Problem:
 
 
 def adaptive(gain: float = -1.0) -> fp.RecedingHorizon:
-    return fp.RecedingHorizon(fp.FixedPoint(iterations=200, tolerance=1e-7), fp.Affine(gain))
+    return fp.RecedingHorizon(fp.FixedPoint(iterations=20, tolerance=1e-6), fp.Affine(gain))
 
 
 def plain() -> fp.RecedingHorizon:

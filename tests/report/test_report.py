@@ -52,20 +52,25 @@ def comparison():
 
 
 @pytest.fixture(scope="module")
-def whole(comparison):
-    """Its page."""
-    return render(comparison)
-
-
-def test_report_is_self_contained_and_small(comparison, tmp_path):
-    """It opens offline: nothing is fetched, and everything is inside."""
-    path = tmp_path / "report.html"
+def written(comparison, tmp_path_factory) -> Path:
+    """The file of its page."""
+    path: Path = tmp_path_factory.mktemp("report") / "report.html"
     write_report(comparison, path)
-    page = path.read_text(encoding="utf-8")
-    assert len(page) < 3_000_000
-    assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)""", page)
-    assert "@import" not in page
-    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(written):
+    """Its page."""
+    return written.read_text(encoding="utf-8")
+
+
+def test_report_is_self_contained_and_small(written, whole):
+    """It opens offline: nothing is fetched, and everything is inside."""
+    assert len(whole) < 3_000_000
+    assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)""", whole)
+    assert "@import" not in whole
+    assert [p.name for p in written.parent.iterdir()] == ["report.html"]
 
 
 def test_verdict_comes_first_then_table_charts_and_pictures(whole):
@@ -201,8 +206,9 @@ def test_comparison_without_a_pair_has_no_pair_pictures(comparison):
     assert "No controller finished" in render(empty)
 
 
-def test_folder_that_cannot_be_written(comparison, tmp_path):
+def test_folder_that_cannot_be_written(comparison, tmp_path, monkeypatch):
     """One error, nothing half-written."""
+    monkeypatch.setattr("fpirhc.report.html.render", lambda _: "a page")
     with pytest.raises(OutputError, match="cannot write the report"):
         write_report(comparison, tmp_path / "missing" / "report.html")
 
