@@ -21,7 +21,6 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import run_tables, simulate
 from fpirhc.studies.open_loop import solve_first
 from fpirhc.symbolic.native import find_compiler
-from fpirhc.task.cases import with_exact
 from fpirhc.task.problem import Problem
 
 FINISHED, DIVERGED, REFUSED = "finished", "diverged", "refused"
@@ -217,7 +216,7 @@ class Variant:
             start = {name: value * (1 + self.nudge) for name, value in problem.start.items()}
             elsewhere = replace(problem, start=start)
             exact = np.array([one.exact for one in problem.moved.parameters.values()])
-            return with_exact(elsewhere, exact * (1 + self.nudge)) if exact.size else elsewhere
+            return elsewhere.with_exact(exact * (1 + self.nudge)) if exact.size else elsewhere
         if self.finer > 1:
             finer = problem.real_integrator.finer(self.finer) or problem.real_integrator
             if problem.symbolic_reality is not None:

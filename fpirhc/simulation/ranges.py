@@ -90,7 +90,7 @@ def _of_errors(problem: Problem, trace: Layout) -> _Entries:
     signal = trace[next(name for name in _ERRORS if name in trace)]
     plant, first = problem.plant, trace.slice(signal.name).start
     times = np.linspace(0.0, problem.duration, _INSTANTS)
-    motion = np.asarray(problem.reference.function(plant).map(_INSTANTS)(times[None, :])[0].full())
+    motion = np.asarray(problem.reference_function.map(_INSTANTS)(times[None, :])[0].full())
     places, sizes, words = [], [], []
     for k, name in enumerate(signal.elements):
         row = plant.output.elements.index(name)

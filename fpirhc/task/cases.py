@@ -22,7 +22,6 @@ from fpirhc.fields.given import described
 from fpirhc.fields.kinds import finite_number
 from fpirhc.fields.user_code import users_folder
 from fpirhc.plant.mismatch import Parametric
-from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.summary import line
 from fpirhc.symbolic.paths import changed_at, content_at
 from fpirhc.task.problem import Problem
@@ -153,7 +152,7 @@ class Cases(Checked):
         if exact == given:
             return built
         try:
-            return with_exact(built, np.array(list(exact.values())))
+            return built.with_exact(np.array(list(exact.values())))
         except FpirhcError as error:
             raise InvalidProblem(f"{self._place(name)}: {error}") from None
 
@@ -194,18 +193,6 @@ class Cases(Checked):
         if not row:
             return f"case {name!r}" + (f", {path!r}" if path else "")
         return (row.partition(",")[0] if head else f"{row} ({name})") + (f", column '{path}'" if path else "")
-
-
-def with_exact(problem: Problem, exact: np.ndarray) -> Problem:
-    """Return the problem with other exact parameters, shape (np,): those of the reality where it has one.
-
-    Raises:
-        InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
-        NotSupported: an external plant without parameters.
-    """
-    if problem.reality is not None:
-        return replace(problem, reality=problem.reality.with_exact(exact))
-    return replace(problem, plant=with_exact_parameters(problem.plant, exact))
 
 
 def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -20,11 +21,12 @@ from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of
-from fpirhc.plant.motion import followed, followed_units, words
+from fpirhc.plant.motion import followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.units import derivative_unit
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line, number, table
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.checks import check_maps, check_stage, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
@@ -38,6 +40,7 @@ from fpirhc.task.steps import check_steps
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _TRIED = 8  # states near the start, at which an input may have an effect that it lacks there
+_OF_EXACT = ("truth", "real_start", "start_output")  # cached properties that depend on the exact parameters
 _INSTANTS = 101  # at which signals from outside are tried before a run
 
 
@@ -118,7 +121,7 @@ class Problem(Checked):
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
-            lambda: self.reference.function(plant),
+            lambda: self.reference_function,
             lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
@@ -214,6 +217,30 @@ class Problem(Checked):
         plant, moved = self.plant, self.real_plant.coordinates
         orders = plant.equations.output_orders
         return {n: orders[n] for n in self.disturbances if n in orders and n not in moved}
+
+    def with_exact(self, exact: np.ndarray) -> Problem:
+        """Return the problem with other exact parameters of what moves, shape (np,).
+
+        What does not depend on them is shared and not checked again.
+
+        Raises:
+            InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
+            NotSupported: an external plant without parameters.
+        """
+        if self.reality is not None:
+            return replace(self, reality=self.reality.with_exact(exact))
+        other, mistakes = copy(self), Mistakes("problem")
+        object.__setattr__(other, "plant", with_exact_parameters(self.plant, exact))
+        for name in _OF_EXACT:
+            other.__dict__.pop(name, None)
+        _check_inverse(other, mistakes)
+        mistakes.raise_if_any()
+        return other
+
+    @cached_property
+    def reference_function(self) -> ca.Function:
+        """The reference's Function for this plant."""
+        return self.reference.function(self.plant)
 
     @property
     def of_model(self) -> Problem:
@@ -430,6 +457,9 @@ def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Boun
     return problem.integrator, tuple(map(float, problem.start_state)), bounds, (problem.period, problem.cycles)
 
 
+_GAINS: Latest[ca.Function] = Latest(4)
+
+
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
     plant = problem.plant
@@ -442,7 +472,11 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
         return
     x, u, p = plant.symbols()
     response = plant.equations.controlled_response(x, u, p)
-    gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
+    gain_of = _GAINS.of(
+        (plant.equations,),
+        (),
+        lambda: ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response]),
+    )
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
     for which, values in (("approximate", plant.approximate), *exact):
         gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))

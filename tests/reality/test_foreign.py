@@ -18,7 +18,6 @@ from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.simulate import Patch, run_foreign, simulator
-from fpirhc.task.cases import with_exact
 
 MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
 
@@ -385,7 +384,7 @@ def test_nothing_is_drawn_and_no_model_is_exact():
     """Parameters of an object outside are nobody's to set."""
     problem = outside(task())
     with pytest.raises(NotSupported, match="no exact parameters"):
-        with_exact(problem, np.array([1.0]))
+        problem.with_exact(np.array([1.0]))
     with pytest.raises(NotSupported, match="no equations"):
         run(problem, fp.ExactModel(CONTROLLERS["computed torque"]))
 
@@ -443,7 +442,7 @@ def test_a_made_body_is_new_in_every_run_and_has_its_seed():
     seeds: list[int] = []
     problem = made(task(), seeds)
     first = run(problem)
-    weaker = run(with_exact(problem, np.array([1.0])))
+    weaker = run(problem.with_exact(np.array([1.0])))
     assert seeds == [0, 0]
     assert np.array_equal(first["plant_state"], run(outside(task()))["plant_state"])
     assert not np.array_equal(first["plant_state"], weaker["plant_state"])
@@ -465,7 +464,7 @@ def test_wrong_ways_to_make_a_body_are_named():
     with pytest.raises(InvalidProblem, match="its body object has no method reset"):
         run(task(reality=fp.ExternalPlant(make=nobody, measures=MEASURES)), law)
     with pytest.raises(InvalidProblem, match="outside its bounds"):
-        with_exact(made(task()), np.array([20.0]))
+        made(task()).with_exact(np.array([20.0]))
 
 
 def test_contraction_is_identified_where_the_response_is_measured():

@@ -18,7 +18,6 @@ from fpirhc.errors import InvalidProblem, NotContractive, NotSupported
 from fpirhc.sensing.base import response_names
 from fpirhc.studies.comparison.entry_facts import has_exact_model
 from fpirhc.studies.scenarios.draws import COMPARING, draw
-from fpirhc.task.cases import with_exact
 
 TRACK = fp.Exponential(rate=6.0)
 PERIOD = 1e-3  # s
@@ -183,7 +182,7 @@ def test_draws_are_those_of_the_reality():
     """Scenarios vary the reality's parameters; the mismatch counts those that the model has too."""
     problem = task(reality=fp.Reality(lagged()))
     scenario = draw(problem.real_plant, seed=1, use=COMPARING, number=0, percent=20.0, model=problem.plant)
-    variant = with_exact(problem, scenario.exact)
+    variant = problem.with_exact(scenario.exact)
     assert np.array_equal(variant.real_plant.exact, scenario.exact)
     assert scenario.exact.size == 2
     assert scenario.mismatch == pytest.approx(abs(1 - scenario.exact[0]) / max(1.0, scenario.exact[0]))

@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.studies.scenarios.draws import COMPARING, draw
-from fpirhc.task.cases import with_exact
 
 PERIOD = 1 / 12  # min
 TRACK = fp.ComputedTorque(fp.Exponential(rate=1.5))
@@ -186,7 +185,7 @@ def test_scenarios_comparison_and_report(tmp_path):
     """Draws are of the patient; the table, the verdict and the page are as of every problem."""
     problem = task(duration=1.0)
     scenario = draw(problem.real_plant, seed=1, use=COMPARING, number=0, percent=20.0, model=problem.plant)
-    assert np.array_equal(with_exact(problem, scenario.exact).real_plant.exact, scenario.exact)
+    assert np.array_equal(problem.with_exact(scenario.exact).real_plant.exact, scenario.exact)
     pair = {"CTC": TRACK, "CTC+FPI": replace(TRACK, deformation=FPI)}
     file = replace(fp.load_problem("two_mass"), problem=problem, controllers=pair, headline=("CTC", "CTC+FPI"))
     comparison = fp.compare(file, seed=0, compiled=False)

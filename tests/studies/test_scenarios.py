@@ -31,7 +31,6 @@ from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import median_interval, middle, summarise, verdict
 from fpirhc.studies.scenarios.processes import DEATHS, Workers
-from fpirhc.task.cases import with_exact
 
 LINE = line_text(
     "period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}", bounds="(0.5, 2.4)", more=EXACT
@@ -132,7 +131,7 @@ def test_a_prepared_loop_runs_what_a_fresh_one_runs(dead_time, task):
         result = bench.record(number, name)
         scenario = draw(problem.plant, seed=5, use=COMPARING, number=number, percent=20.0)
         late = scaled(problem, 20.0 * scenario.lateness) if is_late(problem) else problem
-        variant = with_exact(late, scenario.exact)
+        variant = late.with_exact(scenario.exact)
         run = fp.simulate(variant, resolved(problem, task.controllers[name]), seed=scenario.seed, compiled=False)
         fresh = fp.measure(variant, run).values
         for metric, numbers in result["metrics"].items():

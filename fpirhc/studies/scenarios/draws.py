@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
 from fpirhc.review.late import is_late, live_paths, roomy, scaled
-from fpirhc.task.cases import Cases, with_exact
+from fpirhc.task.cases import Cases
 from fpirhc.task.problem import Problem
 
 COMPARING, TUNING = 0, 1  # uses: a controller is never compared on the scenarios on which it was tuned
@@ -145,7 +145,7 @@ class RandomScenarios(Scenarios):
         one = draw(plant, number=number, model=self.of.plant, **facts)  # type: ignore[arg-type]  # of several types
         lateness = one.lateness if self._draws_dead_times else 0
         built = self._late[lateness]
-        return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, with_exact(built, one.exact))
+        return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, built.with_exact(one.exact))
 
     def automatic(self, controller: Controller) -> Controller:
         """Return the controller with the automatic settings for the problem's own dead times, whatever the plant's are."""
