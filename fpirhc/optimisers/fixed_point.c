@@ -152,7 +152,7 @@ INLINE void substitute(const int* free, In lower, In pivots, Out column) {
 /* The stage's box QP; returns in v the best move, and in free, lower, pivots the factors of the feedback. */
 INLINE void box_policy(In slope, In matrix, In low, In high, Out v, int* free, Out lower, Out pivots) {
   int i, j, round, same, held[NU];
-  casadi_real move[NU], grown[NU], lowest = 0;
+  casadi_real move[NU], lowest = 0;
   for (i = 0; i < NU; ++i) move[i] = v[i] = 0;
   for (round = 0; round <= ROUNDS; ++round) {
     In at = round < ROUNDS ? move : v; /* the last round only finds what is free at the best move */
@@ -160,9 +160,8 @@ INLINE void box_policy(In slope, In matrix, In low, In high, Out v, int* free, O
       casadi_real rate = slope[i];
       for (j = 0; j < NU; ++j) rate += matrix[j * NU + i] * at[j];
       held[i] = (at[i] <= low[i] && rate > 0) || (at[i] >= high[i] && rate < 0);
-      grown[i] = rate;
     }
-    for (same = round > 0, i = 0; i < NU; ++i) same &= free[i] == !held[i];
+    for (same = round > 0, i = 0; same && i < NU; ++i) same = free[i] == !held[i];
     for (i = 0; i < NU; ++i) free[i] = !held[i];
     if (!same) factorise(matrix, free, lower, pivots);
     if (round == ROUNDS) return;

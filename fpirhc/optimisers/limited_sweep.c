@@ -91,14 +91,15 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
   int i, j, l, m;
   In arg[8];
   Out res[8];
-  casadi_real values[(N + 1) * NS * NS], slopes[(N + 1) * NS];
+  casadi_real values[(N + 1) * NS * NS], slopes[(N + 1) * NS], factor[NU * NU];
   for (j = 0; j < NS * NS; ++j) values[N * NS * NS + j] = p->final[j];
   for (j = 0; j < NS; ++j) slopes[N * NS + j] = p->tail[j];
+  for (j = 0; j < NU * NU; ++j) factor[j] = 0; /* no compiler shall take it for unwritten */
   for (i = N; i-- > 0;) {
     In a = p->a + i * NS * NS, b = p->b + i * NS * NU;
     Out value = values + (i + 1) * NS * NS, slope = slopes + (i + 1) * NS, k = d->k + i * NU * NS, v = d->v + i * NU;
     casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], turned[NS * NS], flat[NU * NS];
-    casadi_real bends[NH], pushed[NS], factor[NU * NU], pivots[NU];
+    casadi_real bends[NH], pushed[NS], pivots[NU];
     for (m = 0; m < NB; ++m) {
       value[place[m] * NS + place[m]] += weight[i * ROWS + NU + m];
       slope[place[m]] += lean[i * ROWS + NU + m];
@@ -163,6 +164,9 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
 /* One library runs on every machine of its architecture: wider registers are used where there are some. Without fused
    multiply-add both round alike. */
 #define SWEEP Direction *d, const Point *p, In weight, In lean, In costates, casadi_real delta, int use_exact, In data, Scratch *s
+#ifdef PORTABLE
+static int swept(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
+#else /* PORTABLE */
 #if defined(__GNUC__) && defined(__x86_64__)
 __attribute__((target("avx2"), noinline)) static int sweep_wide(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
 __attribute__((noinline)) static int sweep_plain(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
@@ -172,3 +176,4 @@ static int swept(SWEEP) {
 #else
 static int swept(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
 #endif
+#endif /* PORTABLE */

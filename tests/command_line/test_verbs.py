@@ -299,6 +299,12 @@ JOURNEYS: dict[str, Any] = {
         (tunable, "line.py --trials 2 --out tuned", 0),
         (stale, "line.py --trials 2 --out tuned", 3),
     ],
+    "export": [
+        (None, "line.py CTC --out device --cycles 50", 0),
+        (None, "line.py CTC --out device", 3),
+        (None, "line.py CTC --out other --to d", 2),
+        (None, "line.py CTC --out other --name 2nd", 2),
+    ],
     "new": [(None, "class", 2), (None, "arm", 0), (None, "arm", 3)],
     "check": [
         (None, "", 6),

@@ -1,0 +1,67 @@
+"""`fpirhc export PROBLEM CONTROLLER --to TARGET --out FOLDER`: a controller out of Python."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fpirhc.cli.options import add_problem
+from fpirhc.cli.verb import ExitCode, Verb
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    add_problem(parser)
+    parser.add_argument("controller", metavar="CONTROLLER", help="name of a controller in the problem file")
+    parser.add_argument("--to", metavar="TARGET", default="c", help="c: C99 for every compiler (default: c)")
+    parser.add_argument("--out", metavar="FOLDER", required=True, help="folder for the files, new or empty")
+    text = "prefix of everything in C (default: made of the names of problem and controller)"
+    parser.add_argument("--name", metavar="NAME", help=text)
+    text = "settings that stay open, such as deformation.gain or limits.inputs.Q1; all others are constants"
+    parser.add_argument("--live", nargs="+", default=[], metavar="PATH", help=text)
+    text = "cycles that are recorded for the replay, faults among them (default: 2000)"
+    parser.add_argument("--cycles", type=int, default=2000, metavar="N", help=text)
+
+
+def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.export.target import device_of, target_called, write
+    from fpirhc.problem_files.problem_file import load_problem
+    from fpirhc.studies.comparison.compare import select
+
+    target = target_called(options.to)
+    task = load_problem(options.problem)
+    controller = select(task, [options.controller])[options.controller]
+    device = device_of(
+        task.problem, controller, options.controller, name=options.name, live=options.live, cycles=options.cycles
+    )
+    for file in write(device, target, Path(options.out)):
+        print(f"wrote {file}")
+    sizes = {"memory": device.stepper.memory.size, "trace": device.stepper.signals.size, "work": device.sizes["w"]}
+    print(f"numbers of one controller: {', '.join(f'{size} of {what}' for what, size in sizes.items())}")
+    for path, (low, high) in device.bounds.items():
+        print(f"setting {path}: from {low:.6g} to {high:.6g}, now {device.stepper.numbers[path]:.6g}")
+    return ExitCode.FINISHED
+
+
+VERB = Verb(
+    name="export",
+    summary="write a controller for a device: C without Python, bit by bit the same",
+    add=_add,
+    run=_run,
+    codes={ExitCode.NOT_WRITABLE: "the folder is not empty, or cannot be written"},
+    examples=(
+        ('fpirhc export two_mass "RHC+FPI" --out device', "C99 in the folder device"),
+        ('fpirhc export two_mass "RHC+FPI" --out device --name arm', "arm_init, arm_step, arm_reset"),
+        (
+            'fpirhc export two_mass "CTC+FPI (eq 6)" --out device --live deformation.gain limits.inputs.Q1',
+            "and arm_set, which refuses numbers outside their bounds",
+        ),
+    ),
+    notes="""
+Where there is a compiler, recorded cycles with faults are compared bit by bit:
+
+  cmake -S device -B build && cmake --build build && build/replay device/samples.bin
+
+A compiler is not needed to write C. Nothing is allocated: the caller owns one struct per controller. What needs a solver's own
+library (IPOPT, fatrop, OSQP) is refused. With fused multiply-add (-ffp-contract=fast) numbers differ in their last digits.
+""",
+)

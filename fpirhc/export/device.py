@@ -1,0 +1,162 @@
+"""What every target knows of a controller that leaves Python: its C, the C names of its numbers, and how large all of it is.
+
+The C is that of `Stepper.function`; no target computes anything of the controller anew.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.gap import BRIDGED
+from fpirhc.errors import InvalidName, NotSupported
+from fpirhc.export.c_text import portable
+from fpirhc.simulation.clock import most_missed
+from fpirhc.simulation.stepper import Stepper
+from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.native import generate
+from fpirhc.task.problem import Problem
+
+_RAW = "fpirhc_native"  # name of the generated function, before it has its own
+_DRIVER = re.compile(r"\bfpirhc_(\w+_driver)\b")
+_SAMPLE = ("time", "state", "output", "realised", "measured", "taken")
+_C_WORDS = frozenset(
+    re.findall(
+        r"\w+",
+        """auto break case char const continue default do double else enum extern float for goto if inline int long register
+        restrict return short signed sizeof static struct switch typedef union unsigned void volatile while _Bool _Complex
+        _Imaginary main asm typeof class new delete this template namespace private public protected virtual operator bool
+        true false""",
+    )
+)
+_LONGEST = 40  # characters of a name
+
+
+@dataclass(frozen=True, eq=False)
+class Device:
+    """A controller for a device.
+
+    Args:
+        name: prefix of everything in C.
+        title: of problem and controller.
+        problem: of the controller.
+        controller: as the problem file has it.
+        stepper: of the controller; compiled where there is a compiler, so that its numbers are those of C to the last bit.
+        cycles: number of cycles that are recorded for a replay.
+    """
+
+    name: str
+    title: str
+    problem: Problem
+    controller: Controller
+    stepper: Stepper
+    cycles: int
+
+    @cached_property
+    def inputs(self) -> Layout:
+        """What a step is given: the time and the sample."""
+        return self._read(lambda name: name in _SAMPLE)
+
+    @cached_property
+    def settings(self) -> Layout:
+        """Live settings and what follows from them."""
+        return self._read(lambda name: name.startswith(PREFIX))
+
+    @cached_property
+    def data(self) -> Layout:
+        """What stays until somebody changes it: parameters and set-points."""
+        return self._read(lambda name: name not in _SAMPLE and not name.startswith(PREFIX))
+
+    @cached_property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Intervals of the live settings, by path.
+
+        Raises:
+            NotSupported: a number follows from a setting that must not stay as it was, and a device cannot compute it.
+        """
+        outdated = [name for name, effect in self.stepper.outdated().items() if not effect]
+        if outdated:
+            raise NotSupported(
+                f"these live settings cannot leave Python: '{outdated[0].removeprefix(PREFIX)}' follows from them and must not "
+                "stay as it was; export without live settings, or with gains, limits and rates alone"
+            )
+        return dict(self.stepper.bounds())
+
+    @cached_property
+    def most_missed(self) -> int:
+        """Number of missed cycles that a step makes up for."""
+        return most_missed(self.problem, BRIDGED)
+
+    @cached_property
+    def sources(self) -> tuple[str, ...]:
+        """The C files of the Function, for every compiler: its own, and the loops that it calls."""
+        texts, files = self._generated, []
+        for text in texts:
+            entry = re.match(r"#define ENTRY (\w+)\n", text)
+            visible = entry[1] if entry else _RAW
+            text = re.sub(r"\bENTRY\b", visible, text[entry.end() :]) if entry else text
+            own = portable(text, visible)
+            files.append(_DRIVER.sub(rf"{self.name}_\1", re.sub(rf"\b{_RAW}\b", f"{self.name}_raw", own)))
+        return tuple(files)
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        """Numbers of pointers, whole numbers and numbers that the Function needs to work: arg, res, iw, w."""
+        return {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", self._generated[0])}
+
+    @cached_property
+    def _generated(self) -> tuple[str, ...]:
+        return generate(self.stepper.function)
+
+    def _read(self, wanted: Callable[[str], bool]) -> Layout:
+        return Layout(tuple(s for s in self.stepper.reads.signals if wanted(s.name)))
+
+
+def identifiers(names: Sequence[str]) -> list[str]:
+    """Return C names for names of signals, each once: q1'' is q1_dd."""
+    found: dict[str, int] = {}
+    chosen = []
+    for name in names:
+        one = _identifier(name)
+        found[one] = found.get(one, 0) + 1
+        chosen.append(one if found[one] == 1 else f"{one}_{found[one]}")
+    return chosen
+
+
+def check_name(name: str) -> None:
+    """Raise for a name that C does not take as a prefix.
+
+    Raises:
+        InvalidName: it is none; one is offered.
+    """
+    if re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) and name not in _C_WORDS and len(name) <= _LONGEST:
+        return
+    offer = default_name(name)
+    raise InvalidName(
+        f"'{name}' cannot be the name of a controller in C: expected at most {_LONGEST} letters, digits and underscores, a letter "
+        f"first, and no word of C. Did you mean '{offer}'?"
+    )
+
+
+def default_name(text: str) -> str:
+    """Return a C name made of a text."""
+    name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_").lower()[:_LONGEST].rstrip("_")
+    return name if re.match(r"[a-z]", name) and name not in _C_WORDS else f"c_{name}"[:_LONGEST].rstrip("_")
+
+
+def literal(value: float) -> str:
+    """Return a number with all its digits, in the form that `driver.of_type` recognises."""
+    return f"{float(np.clip(value, -1.7e308, 1.7e308)):.16e}"
+
+
+def _identifier(name: str) -> str:
+    base = name.rstrip("'")
+    primes = len(name) - len(base)
+    text = re.sub(r"\W", "_", base, flags=re.ASCII) + ("_" + "d" * primes if primes else "")
+    return f"_{text}" if not re.match(r"[A-Za-z_]", text) or text in _C_WORDS else text

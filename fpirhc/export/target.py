@@ -1,0 +1,121 @@
+"""The contract of a target, how targets are found, and how one is written.
+
+A target is a module of `fpirhc.export.targets` with a value `TARGET`. It turns a `Device` into files; an addition is one file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+
+from fpirhc.controllers.contract import Controller
+from fpirhc.errors import InvalidName, NotSupported, OutputError, nearest
+from fpirhc.export import targets as package
+from fpirhc.export.device import Device, check_name, default_name
+from fpirhc.simulation.stepper import Stepper
+from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of place where a controller runs.
+
+    Args:
+        name: word after --to.
+        summary: what comes out, in one line.
+        files: function of a device that returns the contents of all files by name.
+    """
+
+    name: str
+    summary: str
+    files: Callable[[Device], Mapping[str, str | bytes]]
+
+
+@cache
+def targets() -> dict[str, Target]:
+    """Return all targets by name."""
+    found = [import_module(f"{package.__name__}.{m.name}").TARGET for m in iter_modules(package.__path__)]
+    return {target.name: target for target in sorted(found, key=lambda one: one.name)}
+
+
+def target_called(name: str) -> Target:
+    """Return a target.
+
+    Raises:
+        InvalidName: there is none of this name.
+    """
+    if name not in targets():
+        raise InvalidName(f"the target '{name}' is unknown.{nearest(name, list(targets()))}")
+    return targets()[name]
+
+
+def device_of(
+    problem: Problem,
+    controller: Controller,
+    title: str,
+    *,
+    name: str | None = None,
+    live: Sequence[str] = (),
+    cycles: int = 2000,
+) -> Device:
+    """Return a controller for a device.
+
+    Args:
+        problem: of the controller.
+        controller: to be exported.
+        title: its name in the problem file.
+        name: prefix of everything in C; None: made of the title.
+        live: paths of live settings.
+        cycles: to be recorded for a replay.
+
+    Raises:
+        InvalidName: no C name, or no setting.
+        NotSupported: a controller that needs a solver's own library, or settings that Python must follow up.
+    """
+    whole = f"{problem.name} {title}"
+    chosen = default_name(whole) if name is None else name
+    check_name(chosen)
+    try:
+        # A solver without a bound of its time is refused below, for what it is.
+        stepper = Stepper(problem, controller, live=live, bounded=False)
+        device = Device(chosen, whole, problem, controller, stepper, cycles)
+        _ = device.sources, device.bounds
+    except NotSupported as error:
+        raise NotSupported(f"'{title}' cannot be exported: {error}{_instead(controller)}") from None
+    return device
+
+
+def write(device: Device, target: Target, folder: Path) -> list[Path]:
+    """Write the files of a target into a new or empty folder, and return their paths.
+
+    Raises:
+        OutputError: the folder is not empty, or cannot be written.
+    """
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise OutputError(
+                f"'{folder}' is not an empty folder, and nothing in it is replaced; choose another one with --out"
+            )
+        contents = target.files(device)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    except OSError as error:
+        if isinstance(error, OutputError):
+            raise
+        raise OutputError(
+            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
+        ) from None
+    return [folder / name for name in contents]
+
+
+def _instead(controller: Controller) -> str:
+    """What to use in place of an optimiser that needs a library; empty for a controller without one."""
+    optimiser = None if controller.planner is None else type(controller.planner.optimiser).__name__
+    if optimiser in (None, "FixedPoint"):
+        return ""
+    return f". In place of {optimiser} use FixedPoint(iterations=1, tolerance=...), which is C of its own"

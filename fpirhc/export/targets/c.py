@@ -1,0 +1,279 @@
+"""C99: a header with named structs, the controller, its layout, a replay of recorded cycles, and a CMake file.
+
+No heap, no files, no globals: the caller owns one struct, and several of them run side by side.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from importlib import resources
+
+import numpy as np
+
+from fpirhc.controllers.gate import HELD
+from fpirhc.export.device import Device, identifiers, literal
+from fpirhc.export.samples import recorded
+from fpirhc.export.target import Target
+from fpirhc.simulation.clock import LONGEST, MEMORY
+from fpirhc.simulation.machine import SKIPPED
+from fpirhc.status import Status
+from fpirhc.symbolic.driver import OF_TYPE, SIGNATURE, of_type
+from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.live import PREFIX
+
+_FEW = 12  # entries of a signal that are named in C; longer ones are arrays
+_WIDTH = 120
+_TYPES = """#ifndef casadi_real
+#define casadi_real double
+#endif
+#ifndef casadi_int
+#define casadi_int long long int
+#endif
+"""
+
+
+def _files(device: Device) -> Mapping[str, str | bytes]:
+    name, bodies = device.name, device.sources
+    names = [f"{name}_step{k or ''}.c" for k in range(len(bodies))]
+    before = f"/* {device.title}. Made by fpirhc from its symbolic step. */\n"
+    return {
+        f"{name}.h": _header(device),
+        f"{name}.c": _controller(device),
+        **{own: before + body for own, body in zip(names, bodies, strict=True)},
+        "layout.json": json.dumps(_layout(device), indent=1),
+        "samples.bin": recorded(device),
+        "main.c": _filled(device, "main.c"),
+        "CMakeLists.txt": _filled(device, "CMakeLists.txt", sources=" ".join([f"{name}.c", *names])),
+    }
+
+
+TARGET = Target("c", "C99 without heap, files and globals: header, controller, layout, replay, CMake file", _files)
+
+
+def _filled(device: Device, template: str, **more: str) -> str:
+    """A template with its words between @ filled in."""
+    text = resources.files("fpirhc.export.targets").joinpath(template).read_text(encoding="utf-8")
+    words = {"name": device.name, "NAME": device.name.upper(), "title": device.title, **more}
+    return re.sub(r"@(\w+)@", lambda m: words[m[1]], text)
+
+
+def _header(device: Device) -> str:
+    name, upper, stepper = device.name, device.name.upper(), device.stepper
+    memory, trace, sizes = stepper.memory, stepper.signals, device.sizes
+    command = Layout((trace["command"],))
+    structs = {"inputs": device.inputs, **_data(device), "memory": memory, "command": command, "trace": trace}
+    counts = {
+        "INPUTS": device.inputs.size,
+        "COMMANDS": command.size,
+        "MEMORY": memory.size,
+        "TRACE": trace.size,
+        "STATUSES": len(Status),
+    }
+    own = [f"  {name}_{part} {part};" for part in ("memory", *_data(device), "trace")]
+    lines = [
+        f"/* {device.title}. Made by fpirhc; names and units are those of layout.json.",
+        "",
+        f"   {name}_init(&c) begins; {name}_step(&c, &in, &out) is one control cycle and returns its status; {name}_reset(&c)",
+        "   forgets the past and keeps parameters and settings. A struct serves one thread. */",
+        "",
+        f"#ifndef {upper}_H",
+        f"#define {upper}_H",
+        "",
+        _TYPES,
+        "#ifdef __cplusplus",
+        'extern "C" {',
+        "#endif",
+        "",
+        f"#define {upper}_PERIOD {float(device.problem.period)!r} /* {device.problem.plant.time_unit} */",
+        *[f"#define {upper}_{key} {value} /* numbers */" for key, value in counts.items()],
+        "",
+        f"typedef enum {{\n{_list(f'{upper}_{s.name} = {int(s)}' for s in Status)}\n}} {name}_status;",
+        "",
+        *[_struct(f"{name}_{part}", layout) for part, layout in structs.items()],
+        "/* Members before `next` may be read, and data written, between two steps; those from `next` on are the step's own. */",
+        "typedef struct {",
+        *own,
+        f"  {name}_memory next;",
+        f"  const casadi_real* arg[{sizes['arg']}];",
+        f"  casadi_real* res[{sizes['res']}];",
+        f"  casadi_int iw[{sizes['iw']}];",
+        f"  casadi_real w[{sizes['w']}];",
+        f"}} {name}_controller;",
+        "",
+        f"void {name}_init({name}_controller* c);",
+        f"void {name}_reset({name}_controller* c);",
+        f"{name}_status {name}_step({name}_controller* c, const {name}_inputs* in, {name}_command* out);",
+        *_set_declaration(device),
+        "",
+        "#ifdef __cplusplus",
+        "}",
+        "#endif",
+        "#endif",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _set_declaration(device: Device) -> list[str]:
+    if not device.bounds:
+        return []
+    name, upper = device.name, device.name.upper()
+    items = [f"{upper}_SET_{one.upper()}" for one in identifiers(list(device.bounds))]
+    return [
+        "",
+        f"typedef enum {{\n{_list(items)}\n}} {name}_setting;",
+        "",
+        "/* Put a number in force from the next step on, and return 1. Return 0 where it is not finite, outside its bounds, or",
+        "   on the wrong side of the other end of its interval: then the old number stays. */",
+        f"int {name}_set({name}_controller* c, {name}_setting setting, casadi_real value);",
+    ]
+
+
+def _data(device: Device) -> dict[str, Layout]:
+    """The structs of what stays until somebody changes it, by name; none is empty."""
+    parts = {s.name: Layout((s,)) for s in device.data.signals if s.size and (s.elements or s.units)}
+    return parts if not device.settings.size else {**parts, "settings": device.settings}
+
+
+def _struct(name: str, layout: Layout) -> str:
+    """A struct of numbers without gaps, in the order of the layout."""
+    signals, lines = layout.signals, []
+    names = identifiers([s.name.removeprefix(PREFIX) for s in signals])
+    alone = len(signals) == 1 and bool(signals[0].elements)
+    for own, signal in zip(names, signals, strict=True):
+        units = ", ".join(dict.fromkeys(signal.entry_units))
+        entries = identifiers(signal.elements)
+        if not entries:
+            lines.append(f"  casadi_real {own}; /* {units} */")
+        elif alone:
+            lines += [f"  casadi_real {e}; /* {u} */" for e, u in zip(entries, signal.entry_units, strict=True)]
+        elif len(entries) <= _FEW:
+            lines += [
+                "  struct {",
+                *[f"    casadi_real {e}; /* {u} */" for e, u in zip(entries, signal.entry_units, strict=True)],
+                f"  }} {own};",
+            ]
+        else:
+            lines.append(f"  casadi_real {own}[{len(entries)}]; /* {units} */")
+    return "typedef struct {\n" + "\n".join(lines) + f"\n}} {name};\n"
+
+
+def _list(items: object) -> str:
+    return ",\n".join(f"  {one}" for one in items)  # type: ignore[attr-defined]
+
+
+def _controller(device: Device) -> str:
+    name, stepper = device.name, device.stepper
+    memory, trace = stepper.memory, stepper.signals
+    lower, upper = device.problem.limits.input_bounds(device.problem.plant)
+    tables = {"START": stepper.start(), "LEAST": lower, "MOST": upper}
+    for part, layout in _data(device).items():
+        tables[part.upper()] = layout.start()
+    texts = [_table(key, values) for key, values in tables.items()]
+    texts += [
+        f"#define PERIOD ((casadi_real){literal(device.problem.period)})",
+        f"#define LONGEST ((casadi_real){LONGEST})",
+        f"#define MISSED {device.most_missed}L",
+    ]
+    missing = next(k for k, s in enumerate(device.inputs.signals) if s.name != "time")
+    return _filled(
+        device,
+        "controller.c",
+        tables=of_type("\n".join(texts)),
+        declaration=f"int {name}_raw{SIGNATURE};",
+        before=str(memory.slice(MEMORY.name).start),
+        held=str(memory.slice(HELD).start),
+        skipped=str(memory.slice(f"{SKIPPED}_before").start),
+        status=str(trace.slice("status").start),
+        skipped_now=str(trace.slice(SKIPPED).start),
+        command=str(trace.slice("command").start),
+        first=str(device.inputs.slice(device.inputs.names[missing]).start),
+        bind="\n".join(_bound(device)),
+        init="\n".join(f"  memcpy(&c->{part}, {part.upper()}, sizeof {part.upper()});" for part in _data(device)),
+        set=_setter(device),
+    )
+
+
+def _bound(device: Device) -> list[str]:
+    """Lines that tell the Function where its arguments are, in its order."""
+    lines, data = ["  c->arg[0] = (const casadi_real*)&c->memory;"], _data(device)
+    for k, signal in enumerate(device.stepper.reads.signals, start=1):
+        if signal.name in device.inputs:
+            place = f"(const casadi_real*)in + {device.inputs.slice(signal.name).start}"
+        elif signal.name in device.settings:
+            place = f"(const casadi_real*)&c->settings + {device.settings.slice(signal.name).start}"
+        else:
+            place = f"(const casadi_real*)&c->{signal.name}" if signal.name in data else "0"
+        lines.append(f"  c->arg[{k}] = {place};")
+    return lines
+
+
+def _setter(device: Device) -> str:
+    """The function that checks a setting before it is in force; empty where nothing is live."""
+    if not device.bounds:
+        return ""
+    paths = list(device.bounds)
+    other = [_other_end(path, paths) for path in paths]
+    places = [device.settings.slice(PREFIX + path).start for path in paths]
+    low, high = (np.array([ends[k] for ends in device.bounds.values()]) for k in (0, 1))
+    tables = of_type("\n".join([_table("LOWEST", low), _table("HIGHEST", high)])).replace(OF_TYPE, "")
+    # Of an interval the sign of the other end's number + 1 says on which side it stands.
+    return f"""
+{tables}
+static const int PLACES[] = {{{", ".join(map(str, places))}}}; /* among the settings */
+static const int OTHERS[] = {{{", ".join(map(str, other))}}};  /* k + 1: setting k must be above; -k - 1: below; 0: no interval */
+
+int {device.name}_set({device.name}_controller* c, {device.name}_setting setting, casadi_real value) {{
+  casadi_real* settings = (casadi_real*)&c->settings;
+  int which = (int)setting, other;
+  if (which < 0 || which >= {len(paths)} || !(fabs(value) <= FINITE)) return 0;
+  if (!(value >= LOWEST[which] && value <= HIGHEST[which])) return 0;
+  other = OTHERS[which];
+  if (other > 0 && !(value < settings[PLACES[other - 1]])) return 0;
+  if (other < 0 && !(value > settings[PLACES[-other - 1]])) return 0;
+  settings[PLACES[which]] = value;
+  return 1;
+}}
+"""
+
+
+def _other_end(path: str, paths: list[str]) -> int:
+    """K + 1 for the lower end of an interval whose upper end is setting k, -k - 1 for its upper end, else 0."""
+    owner, _, end = path.rpartition(".")
+    if end == "0" and f"{owner}.1" in paths:
+        return paths.index(f"{owner}.1") + 1
+    return -paths.index(f"{owner}.0") - 1 if end == "1" and f"{owner}.0" in paths else 0
+
+
+def _table(name: str, values: np.ndarray) -> str:
+    """A table of numbers; infinite ones are beyond every finite one."""
+    texts = [literal(v) if np.isfinite(v) else "-10 * FINITE" if v < 0 else "10 * FINITE" for v in values]
+    lines: list[str] = []
+    line = " "
+    for text in texts:
+        if len(line) + len(text) + 2 > _WIDTH:
+            lines, line = [*lines, line], " "
+        line += f" {text},"
+    return "\n".join([f"static const casadi_real {name}[] = {{", *lines, line.rstrip(","), "};"])
+
+
+def _layout(device: Device) -> dict[str, object]:
+    stepper = device.stepper
+    layouts = {"inputs": device.inputs, **_data(device), "memory": stepper.memory, "trace": stepper.signals}
+    return {
+        "name": device.name,
+        "of": device.title,
+        "period": float(device.problem.period),
+        "time_unit": device.problem.plant.time_unit,
+        "status": {s.name: int(s) for s in Status},
+        "work": device.sizes,
+        **{part: _columns(layout) for part, layout in layouts.items()},
+        "bounds": {path: [e if np.isfinite(e) else None for e in ends] for path, ends in device.bounds.items()},
+        "outdated": dict(stepper.outdated()),
+    }
+
+
+def _columns(layout: Layout) -> list[dict[str, object]]:
+    rows = zip(layout.columns, layout.units, layout.start().tolist(), strict=True)
+    return [{"name": column, "unit": unit, "start": start} for column, unit, start in rows]

@@ -1,0 +1,79 @@
+"""Write docs/targets.md: what exported controllers need and how they answer, measured here with the compiler that is found."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import tempfile
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import fpirhc as fp
+from fpirhc.export.target import device_of, target_called, write
+from fpirhc.symbolic.native import find_compiler
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "targets.md"
+CASES = (
+    ("two_mass", "CTC+FPI (eq 6)", {}),
+    ("two_mass", "RHC+FPI", {}),
+    ("two_mass", "RHC+FPI", {"q1": (1.85, 2.35)}),
+    ("anaesthesia", "RHC+FPI", {}),
+    ("fishery", "RHC+FPI", {}),
+)
+CYCLES = 2000
+
+
+def row(problem: str, title: str, states: dict[str, tuple[float, float]]) -> list[str]:
+    """One line of the table."""
+    task, compiler = fp.load_problem(problem), str(find_compiler())
+    changed = replace(task.problem, limits=replace(task.problem.limits, states=states)) if states else task.problem
+    device = device_of(changed, task.controllers[title], title, name="c", cycles=CYCLES)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write(device, target_called("c"), folder)
+        sources = sorted(folder.glob("c*.c"))
+        objects = [str(path.with_suffix(".o")) for path in sources]
+        for source, made in zip(sources, objects, strict=True):
+            strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Os", "-fstack-usage"]
+            subprocess.run([compiler, *strict, "-c", str(source), "-o", made], check=True)
+        flash = sum(int(line.split()[0]) for line in _said("size", *objects).splitlines()[1:])
+        stack = sum(
+            max(int(line.split("\t")[1]) for line in path.read_text().splitlines()) for path in folder.glob("*.su")
+        )
+        program = folder / "replay"
+        files = [*map(str, sources), str(folder / "main.c")]
+        subprocess.run([compiler, "-std=c99", "-O2", *files, "-o", str(program), "-lm"], check=True)
+        said = _said(str(program), str(folder / "samples.bin"))
+        differ = re.search(r"command (\d+), memory (\d+), trace (\d+)", said)
+        size = re.search(r"(\d+) bytes of a controller", said)
+        assert differ is not None
+        assert size is not None
+        samples = (folder / "samples.bin").read_bytes()
+    limits = f", {', '.join(states)} limited" if states else ""
+    digest = hashlib.sha256(samples).hexdigest()[:12]
+    sums = " / ".join(differ.groups())
+    memory, work = device.stepper.memory.size, device.sizes["w"]
+    return [f"{problem}, {title}{limits}", f"{flash / 1000:.1f}", f"{int(size[1]) / 1000:.1f}", f"{stack / 1000:.1f}",
+            f"{memory}", f"{work}", sums, digest]  # fmt: skip
+
+
+def _said(*command: str) -> str:
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def main() -> None:
+    """Measure and write."""
+    warnings.simplefilter("ignore", fp.HarmfulAdaptation)
+    text = PAGE.read_text(encoding="utf-8")
+    head = ["controller", "code, kB", "struct, kB", "stack, kB", "memory", "work", "cycles that differ", "answers"]
+    rows = [head, ["---"] * len(head), *(row(*case) for case in CASES)]
+    table = "\n".join("| " + " | ".join(one) + " |" for one in rows)
+    PAGE.write_text(
+        re.sub(r"(<!-- table -->\n).*(\n<!-- end -->)", rf"\1{table}\2", text, flags=re.DOTALL), encoding="utf-8"
+    )
+
+
+if __name__ == "__main__":
+    main()
