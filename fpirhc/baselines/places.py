@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 from fpirhc.errors import BaselineError, OutputError
+from fpirhc.problem_files.shipped import missing
 
 FOLDER, UNCHECKED = "baselines", "unchecked.toml"
 
@@ -37,12 +38,13 @@ def problems_here(folder: Path, baselines: Path | None = None) -> tuple[list[Pat
         named.setdefault(path.stem, path)
     for path in (f for h in folders for f in sorted(h.glob("*.json"))):
         named.setdefault(path.stem, (place if baselines else path.parents[1]) / f"{path.stem}.py")
-    unchecked = {name: reason for h in folders for name, reason in _unchecked(h / UNCHECKED).items()}
-    for name in unchecked:
+    listed = {name: reason for h in folders for name, reason in _unchecked(h / UNCHECKED).items()}
+    for name in listed:
         if name not in named:
             raise BaselineError(f"{UNCHECKED} names '{name}', which is no problem in '{place}'; take it out")
         if baseline_path(named[name], baselines).exists():
             raise BaselineError(f"{UNCHECKED} names '{name}', which has a baseline; take it out")
+    unchecked = {name: why for name, path in named.items() if (why := missing(path))} | listed
     to_check = [path for name, path in sorted(named.items()) if name not in unchecked]
     if not to_check:
         raise BaselineError(f"no problem to check in '{place}'; name one, or go to the folder that has 'problems'")

@@ -4,28 +4,53 @@ from __future__ import annotations
 
 import ast
 from difflib import get_close_matches
+from importlib.util import find_spec
 from pathlib import Path
 
 from fpirhc.errors import ProblemFileError
 
+GROUPS = {"first examples": "", "gallery": "gallery", "plants of other packages": "outside"}  # title -> subfolder
 _OFFERED = 4  # files of a folder that a message names
 
 
 def shipped_folders() -> list[Path]:
-    """Folders of shipped problems, inside the installed package or beside it in a checkout, each with its gallery."""
+    """Folders of shipped problems, inside the installed package or beside it in a checkout."""
     package = Path(__file__).resolve().parents[1]
-    places = (package / "_problems", package.parent / "problems")
-    return [f for place in places for f in (place, place / "gallery") if f.is_dir()]
+    return [folder for folder in (package / "_problems", package.parent / "problems") if folder.is_dir()]
+
+
+def shipped_groups() -> dict[str, dict[str, Path]]:
+    """Return the shipped problems by group, name -> path: first examples, the gallery, and those of other packages' plants."""
+    return {title: _problems_in(subfolder) for title, subfolder in GROUPS.items()}
 
 
 def shipped_problems() -> dict[str, Path]:
-    """Return the shipped problems: name -> path."""
+    """Return the shipped problems that need no other package: name -> path."""
+    return {name: path for group in shipped_groups().values() for name, path in group.items() if not needed(path)}
+
+
+def _problems_in(subfolder: str) -> dict[str, Path]:
     paths: dict[str, Path] = {}
-    for folder in shipped_folders():
-        for path in sorted(folder.glob("*.py")):
-            if not path.name.startswith("_"):
-                paths.setdefault(path.stem, path)
+    for path in (path for folder in shipped_folders() for path in sorted((folder / subfolder).glob("*.py"))):
+        if not path.name.startswith("_"):
+            paths.setdefault(path.stem, path)
     return paths
+
+
+def needed(path: Path) -> tuple[str, ...]:
+    """Packages that a problem file needs, its line `needs = ("mujoco",)`, without running the file."""
+    try:
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+        values = [s.value for s in body if isinstance(s, ast.Assign) and ast.unparse(s.targets[0]) == "needs"]
+        return tuple(map(str, ast.literal_eval(values[0]))) if values else ()
+    except (OSError, SyntaxError, ValueError, TypeError):
+        return ()
+
+
+def missing(path: Path) -> str:
+    """Say which packages of a problem file are not installed, and how they are; empty where none is missing."""
+    names = [name for name in needed(path) if find_spec(name) is None]
+    return f"it needs {', '.join(names)}: pip install 'fpirhc[outside]'" if names else ""
 
 
 def title_of(path: Path) -> str:
@@ -43,7 +68,8 @@ def find_problem(name_or_path: str) -> Path:
     Raises:
         ProblemFileError: there is no such file or problem; the nearest shipped name is offered.
     """
-    path, shipped = Path(name_or_path), shipped_problems()
+    path = Path(name_or_path)
+    shipped = {name: path for group in shipped_groups().values() for name, path in group.items()}
     if path.suffix == ".py" and path.is_file():
         return path
     if name_or_path in shipped:

@@ -16,7 +16,13 @@ from fpirhc.members import FAMILIES, member_classes
 from fpirhc.simulation.loop import close_loop
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-NEEDED = {"simulators": ("tclab", "gymnasium")}  # page -> packages of an extra
+NEEDED = {  # page -> packages of an extra
+    "simulators": ("tclab", "gymnasium"),
+    "outside-car": ("vehiclemodels",),
+    "outside-lab": ("tclab",),
+    "outside-arm": ("mujoco",),
+    "outside-quadrotor": ("rotorpy",),
+}
 PAGES = sorted(p for p in DOCS.rglob("*.md") if "_build" not in p.parts)
 
 

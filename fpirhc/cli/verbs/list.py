@@ -12,11 +12,14 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> ExitCode:  # noqa: ARG001
-    from fpirhc.problem_files.shipped import shipped_problems, title_of
+    from fpirhc.problem_files.shipped import missing, shipped_groups, title_of
     from fpirhc.summary import printable
 
-    for name, path in shipped_problems().items():
-        print(printable(f"{name:20s} {title_of(path)}"))
+    for group, paths in shipped_groups().items():
+        print(f"{group}:")
+        for name, path in paths.items():
+            lack = missing(path)
+            print(printable(f"  {name:22s} {title_of(path)}{f' ({lack})' if lack else ''}"))
     return ExitCode.FINISHED
 
 

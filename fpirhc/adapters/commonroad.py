@@ -1,0 +1,109 @@
+"""A car of CommonRoad's vehicle models as the reality of a problem: single track ("st") or single track with drift ("std").
+
+    problem = fp.Problem(plant=model, reality=commonroad_body("std", model, period=1e-2, speed=20.0, names={"side": "y"}), ...)
+
+Measured are x, y and heading with their derivatives, the second ones as differences over a cycle. The input `steer` (rad) is the
+angle that the wheels turn to at the car's own rate; `acceleration` (m/s^2) is the other, or the car holds its speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fpirhc.adapters.names import base_and_order, counterparts, package, steps_per_cycle
+from fpirhc.errors import Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.task.external_plant import ExternalPlant, quantities
+
+_STEP, _PULL, _COORDINATES = 1e-3, 2.0, ("x", "y", "heading")  # s; 1/s of the speed's error; in the order of `_moved`
+
+
+def commonroad_body(
+    kind: str, model: Plant, *, period: float, speed: float, vehicle: int = 2, names: Mapping[str, str] | None = None
+) -> ExternalPlant:
+    """Return a car as a reality; it starts at the origin, along x.
+
+    Args:
+        kind: of the package's model, "st" or "std".
+        model: the controller's model.
+        period: of the problem, s; a whole number of ms.
+        speed: at the start, m/s, which the car holds where the model has no input `acceleration`.
+        vehicle: number of the package's set of parameters; 2 is a BMW 320i.
+        names: coordinate -> "x", "y" or "heading", input -> "steer" or "acceleration", where the names differ.
+
+    Raises:
+        NotSupported: commonroad-vehicle-models is not installed.
+        InvalidProblem: a name that the car or the model does not have, or a period that is no whole number of ms.
+    """
+    units, mistakes, given = quantities(model), Mistakes("commonroad_body"), names or {}
+    mistakes.unknown("kind", [kind], ("st", "std"))
+    own = dict.fromkeys(base_and_order(q)[0] for q in units)
+    mistakes.unknown("names: name of the model", given, [*own, *model.inputs])
+    seen = counterparts(mistakes, "coordinate", own, {n: v for n, v in given.items() if n in own}, _COORDINATES)
+    sent = {n: v for n, v in given.items() if n in model.inputs}
+    inputs = counterparts(mistakes, "input", model.inputs, sent, ("steer", "acceleration"))
+    mistakes.raise_if_any()
+    count = steps_per_cycle("commonroad_body", period, _STEP)
+    body = _Car(kind, speed, vehicle, count, tuple(inputs.values()))
+    body.read = [(order, _COORDINATES.index(seen[name])) for name, order in map(base_and_order, units)]
+    return ExternalPlant(body, measures=units)
+
+
+class _Car:
+    """The package's derivative, integrated by Runge-Kutta steps of 1 ms.
+
+    Args:
+        kind: "st" or "std".
+        speed: that is held, m/s.
+        vehicle: number of the parameters.
+        steps: in a cycle.
+        inputs: what the commands are.
+    """
+
+    def __init__(self, kind: str, speed: float, vehicle: int, steps: int, inputs: tuple[str, ...]) -> None:
+        of = {name: package(f"vehiclemodels.{name}") for name in (f"vehicle_dynamics_{kind}", f"init_{kind}")}
+        number = f"parameters_vehicle{vehicle}"
+        self._rate, self._start = (getattr(module, name) for name, module in of.items())
+        self._car: Any = getattr(package(f"vehiclemodels.{number}"), number)()
+        self._kind, self._speed, self._steps, self._inputs = kind, speed, steps, inputs
+        self.read: list[tuple[int, int]] = []
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Straight on at the speed; there is nothing random."""
+        del seed
+        first = [0.0, 0.0, 0.0, self._speed, 0.0, 0.0, 0.0]
+        self._x = np.array(self._start(first, self._car) if self._kind == "std" else self._start(first))
+        return self._measured(self._moved(), np.zeros(3))
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Turn the wheels to their angle, at the car's rate, for a cycle."""
+        del time
+        sent, span, before = dict(zip(self._inputs, command, strict=True)), self._steps * _STEP, self._moved()
+        limits = self._car.steering
+        turn = np.clip((sent.get("steer", self._x[2]) - self._x[2]) / span, limits.v_min, limits.v_max)
+        for _ in range(self._steps):
+            pull = sent.get("acceleration", np.clip(_PULL * (self._speed - self._x[3]), -5.0, 5.0))
+            self._x = self._x + _STEP * self._mean_rate([turn, pull])
+        now = self._moved()
+        return self._measured(now, (now - before) / span)
+
+    def _mean_rate(self, u: list[float]) -> np.ndarray:
+        def rate(x: np.ndarray) -> np.ndarray:
+            return np.array(self._rate(list(x), u, self._car))
+
+        k1 = rate(self._x)
+        k2 = rate(self._x + _STEP / 2 * k1)
+        k3 = rate(self._x + _STEP / 2 * k2)
+        return np.asarray(k1 + 2 * k2 + 2 * k3 + rate(self._x + _STEP * k3)) / 6
+
+    def _moved(self) -> np.ndarray:
+        """Rates of x, y and heading."""
+        _, _, _, v, heading, turn, slip, *_ = self._x
+        return np.array([v * np.cos(heading + slip), v * np.sin(heading + slip), turn])
+
+    def _measured(self, rates: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
+        values = self._x[[0, 1, 4]], rates, accelerations
+        return np.array([values[order][place] for order, place in self.read])

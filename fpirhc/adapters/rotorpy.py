@@ -1,0 +1,113 @@
+"""A quadrotor of RotorPy - motors, aerodynamics, attitude loop - as the reality of a problem.
+
+    problem = fp.Problem(plant=model, reality=rotorpy_body(model, period=1e-2, wind=(3.0, 0.0, 0.0)), ...)
+
+Measured are the position x, y, z, its velocity, and the acceleration that an accelerometer shows. The inputs thrust_x, thrust_y,
+thrust_z are the thrust per nominal mass in the world's axes, m/s^2; the vehicle's own attitude loop turns it there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+
+from fpirhc.adapters.names import package
+from fpirhc.errors import Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.task.external_plant import ExternalPlant, quantities
+
+_SEEN = [name + dash for dash in ("", "'", "''") for name in ("x", "y", "z")]
+_SENT = ("thrust_x", "thrust_y", "thrust_z")
+
+
+def rotorpy_body(
+    model: Plant,
+    *,
+    period: float,
+    start: Mapping[str, float] | None = None,
+    wind: Sequence[float] = (0.0, 0.0, 0.0),
+    payload: float = 0.0,
+    vehicle: Mapping[str, Any] | None = None,
+) -> ExternalPlant:
+    """Return a quadrotor as a reality.
+
+    Args:
+        model: the controller's model, with all of x, y, z in m and of thrust_x, thrust_y, thrust_z in m/s^2.
+        period: of the problem, s.
+        start: position and velocity at the start by name, zero where not named; it hovers upright.
+        wind: constant velocity of the air, m/s.
+        payload: mass that is carried at the centre, kg; the thrust stays that per nominal mass.
+        vehicle: parameters as of the package; None: its Hummingbird.
+
+    Raises:
+        NotSupported: RotorPy is not installed.
+        InvalidProblem: the model has other names.
+    """
+    mistakes = Mistakes("rotorpy_body")
+    mistakes.unknown("measured", quantities(model), _SEEN)
+    mistakes.unknown("input", model.inputs, _SENT)
+    mistakes.unknown("start: quantity", start or {}, _SEEN[:6])
+    for name in (name for name in (*_SEEN[:3], *_SENT) if name not in (*model.coordinates, *model.inputs)):
+        mistakes.add(f"the model has no {name}; it needs x, y, z and thrust_x, thrust_y, thrust_z")
+    mistakes.raise_if_any()
+    parameters = vehicle or package("rotorpy.vehicles.hummingbird_params").quad_params
+    first = [(start or {}).get(name, 0.0) for name in _SEEN[:6]]
+    order = [list(model.inputs).index(name) for name in _SENT]
+    units = {name: quantities(model)[name] for name in _SEEN}
+    return ExternalPlant(_Quadrotor(parameters, payload, np.array(wind), first, period, order), measures=units)
+
+
+class _Quadrotor:
+    """The vehicle under the thrust that is asked for.
+
+    Args:
+        parameters: of the package, of the vehicle alone.
+        payload: kg.
+        wind: m/s.
+        first: position and velocity.
+        period: s.
+        order: places of the thrusts among the commands.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Any],
+        payload: float,
+        wind: np.ndarray,
+        first: Sequence[float],
+        period: float,
+        order: list[int],
+    ) -> None:
+        own = dict(deepcopy(parameters))
+        self._share, own["mass"] = own["mass"] / (own["mass"] + payload), own["mass"] + payload
+        hover = np.sqrt(parameters["mass"] * 9.81 / 4 / own["k_eta"])
+        self._first = {
+            "x": np.array(first[:3]),
+            "v": np.array(first[3:]),
+            "q": np.array([0.0, 0.0, 0.0, 1.0]),
+            "w": np.zeros(3),
+            "wind": wind,
+            "rotor_speeds": np.full(4, hover),
+        }
+        multirotor = package("rotorpy.vehicles.multirotor").Multirotor
+        self._vehicle = multirotor(own, initial_state=self._first, control_abstraction="cmd_acc", aero=True)
+        self._period, self._order = period, order
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Go to the start; there is nothing random."""
+        del seed
+        self._state = deepcopy(self._first)
+        return np.concatenate([self._state["x"], self._state["v"], np.zeros(3)])
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Fly for a cycle."""
+        del time
+        thrust = {"cmd_acc": np.asarray(command)[self._order] * self._share}
+        self._state["wind"] = self._first["wind"]
+        self._state = self._vehicle.step(self._state, thrust, self._period)
+        self._state["wind"] = self._first["wind"]
+        shown = self._vehicle.statedot(self._state, thrust, self._period)["vdot"]
+        return np.concatenate([self._state["x"], self._state["v"], shown])
