@@ -52,6 +52,17 @@ def test_robust_fixed_point_transformation(offset, sign):
     assert one.iteration.reach == Reach("offset", 50.0)
 
 
+@pytest.mark.parametrize(("offset", "sign"), [(50.0, -1), (-50.0, 1)])
+def test_robust_fixed_point_transformation_of_a_vector(offset, sign):
+    """r+ = (1 + B) r + B K_c h / |h| with B = B_c tanh(A_c |h|); nothing moves where f = d."""
+    one = fp.RFPTVector(offset=offset, sign=sign, gain=0.01)
+    r, f, d = np.array([1.0, 2.0]), np.array([3.0, 50.0]), np.array([2.0, 10.0])
+    size = np.linalg.norm(f - d)
+    share = sign * np.tanh(0.01 * size)
+    assert after(one, r, f, d) == pytest.approx((1 + share) * r + share * offset * (f - d) / size, rel=1e-6)
+    assert after(one, r, d, d) == pytest.approx(r, abs=0)
+
+
 def test_settings_of_the_robust_transformation():
     """A sign is -1 or 1; offset and gain are not zero."""
     for wrong in ({"sign": 0}, {"sign": 2}, {"sign": -2}, {"offset": 0.0}, {"gain": 0.0}, {"gain": math.nan}):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -17,11 +18,11 @@ from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges
-from fpirhc.review.gain import gain_admissible
+from fpirhc.review.gain import gain_admissible, gain_of_target
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
 from fpirhc.review.margins import margins_enough
-from fpirhc.review.recommended_gain import recommended_gain
+from fpirhc.review.recommended_gain import FAR, recommended_gain
 from fpirhc.review.slew import slew_enough
 from fpirhc.review.wording import duration, per_cycle
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
@@ -233,6 +234,35 @@ def test_both_signs_have_no_gain():
     assert box.evidence == "gain = -0.5; no gain is recommended, because no gain converges all over the box"
     own = admissible(-0.5, [-1.0, 1.0], [-1.0, 1.0])
     assert (own.verdict, own.change) == ("no", "See the question about the eigenvalues' sign.")
+
+
+def test_both_signs_of_an_inverse_are_inside():
+    """J of the other sign: the gains that converge are positive, and the far end of their interval is the limit."""
+    one = admissible(0.5, [-1.0], [-1.0, -1.5])
+    assert one.numbers["linear_limit"] == pytest.approx(8 / 3)
+
+
+@pytest.mark.parametrize(
+    ("limit", "radius", "verdict", "said", "change"),
+    [
+        (1.0, 1.5, "yes", "the smallest limit is -2, set by a pole", ""),
+        (0.25, 0.9, "unknown", "the smallest limit is -0.5, set by a pole", "Use gain = -0.25, half of it."),
+        (0.2, 0.9, "unknown", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
+        (0.2, 1.0, "no", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
+        (math.inf, 0.9, "yes", f"no gain up to {FAR:g} times as large is a limit of the whole loop", ""),
+    ],
+)
+def test_gain_of_a_map_on_targets(monkeypatch, limit, radius, verdict, said, change):
+    """A_c = -0.5 is the effective gain 0.25: numbers are those of A_c, and a loop that converges at the plant refuses nothing."""
+    monkeypatch.setattr("fpirhc.review.gain.limit_of_loop", lambda deformation, loops: (limit, "a pole"))
+    controller, loops = SimpleNamespace(deformation=fp.Affine(-0.5)), SimpleNamespace(radii=np.array([0.5, radius]))
+    case: Any = SimpleNamespace(controller=controller, by_gain=object(), loops=loops)
+    one = gain_of_target(case)
+    assert one is not None
+    assert (one.verdict, one.evidence, one.change) == (verdict, f"gain = -0.5; {said}", change)
+    assert one.numbers == pytest.approx({"gain": -0.5, "limit": -2 * limit, "recommended": -limit})
+    case.by_gain = None
+    assert gain_of_target(case) is None
 
 
 # The slew

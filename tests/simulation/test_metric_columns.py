@@ -130,6 +130,7 @@ def test_a_run_that_ended_at_once_has_no_numbers():
     assert metrics.solve == {}
     assert metrics.statuses == {"NON_FINITE": 1}
     assert metrics["cycles"] == {"": 0}
+    assert metrics.broken == fp.measure(problem(), run(1.0)).broken == ()
 
 
 def test_one_cycle_is_enough_for_a_solve():
@@ -182,6 +183,20 @@ def test_plans_that_return_are_counted_once():
     assert of_solves(np.arange(CYCLES) // 10 % 2).solve["plans"] == 2
     assert of_solves(np.zeros(CYCLES)).solve["plans"] == 1
     assert of_solves(np.arange(CYCLES)).solve["plans"] == CYCLES
+
+
+def test_plans_that_differ_by_one_everywhere_are_two():
+    """Cost, residuals, iterations and status of the second are each larger by one."""
+    solve = np.repeat(step(0.0, 1.0, 50)[:, None], 5, axis=1)
+    assert fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve))).solve["plans"] == 2
+
+
+def test_a_plan_that_is_not_finite_has_iterations_and_no_residual():
+    """It took its time, and its residual is no number of a plan."""
+    solve = np.tile([0.0, 0.1, 0.2, 3.0, Status.OK], (CYCLES, 1))
+    solve[7] = [0.0, 9.0, 9.0, 50.0, Status.NON_FINITE]
+    of = fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve))).solve
+    assert (of["worst_iterations"], of["worst_stationarity"], of["worst_feasibility"]) == (50, 0.1, 0.2)
 
 
 def test_a_run_that_ended_early_has_no_cost():

@@ -78,6 +78,19 @@ def test_who_finishes():
     assert outcomes == [Outcome.WORSE, Outcome.BETTER, Outcome.NOT_COMPARABLE]
 
 
+def test_the_headline_comes_first():
+    """Of two pairs the headline is the first, in whatever order they ran; without one the order is that of the rows."""
+    rows = [entry("a"), entry("a+", "a"), entry("b"), entry("b+", "b")]
+    assert said(*rows, headline=("b", "b+"))[0].startswith("b+")
+    assert said(*rows)[0].startswith("a+")
+
+
+def test_where_nobody_finishes_every_end_is_told():
+    assert said(entry("a", stop="x is not finite"), entry("b", stop="the plan is not finite"))[0] == (
+        "No controller finished its run: a: x is not finite; b: the plan is not finite."
+    )
+
+
 def test_several_coordinates():
     """Each has its numbers, unit and factor, the worst first; better and worse together are mixed."""
     plain, adaptive = entry("RHC", errors={"y": 1.0, "z": 2.0}), entry("FPI", "RHC", errors={"y": 0.2, "z": 1.0})
