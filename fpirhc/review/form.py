@@ -36,7 +36,7 @@ def form_of(deformation: Deformation) -> str:
 
 
 def right_form(problem: Problem, deformation: Deformation, harm: Callable[[Deformation], str]) -> Answer:
-    """Whether the form in use is the recommended one; advice, so never no.
+    """Whether the form in use is the recommended one, or runs speak against that one alone; advice, so never no.
 
     Args:
         problem: the problem.
@@ -51,6 +51,8 @@ def right_form(problem: Problem, deformation: Deformation, harm: Callable[[Defor
         return Answer(question, Verdict.YES, f"it is {used}: {why}")
     proposed = forms_of(problem, deformation).get(form)
     against = "" if proposed is None else harm(proposed)
+    if against and not harm(deformation):
+        return Answer(question, Verdict.YES, f"{text}; but here {against}, and the form in use does no harm")
     if against:
         change = "Keep the form that a comparison shows to be better."
         return Answer(question, Verdict.UNKNOWN, f"{text}; but here {against}", change)

@@ -1,4 +1,4 @@
-"""Does adaptation lower the response error? It is predicted along the model's own run, with and without it."""
+"""Does adaptation lower the response error? It is predicted along the own run of the model, else run on the plant."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, response_errors
-from fpirhc.review.question import Case
+from fpirhc.review.question import TRIED, Case
 
 QUESTION = "Does adaptation lower the response error?"
 _HARM = 0.5  # share of the error without adaptation that adaptation may make of a model that is right
@@ -18,7 +18,7 @@ def pays(case: Case) -> Answer:
     """Return the rms response errors without adaptation, with it, and with it on a right model, where every change does harm."""
     nominal = case.nominal
     if isinstance(nominal, str):
-        return Answer(QUESTION, Verdict.UNKNOWN, nominal)
+        return _by_runs(case, nominal)
     without = rms(nominal, errors_without_adaptation(nominal))
     adapted = rms(nominal, response_errors(nominal))
     null = rms(nominal, response_errors(nominal, exact=nominal.believed))
@@ -35,6 +35,24 @@ def pays(case: Case) -> Answer:
         change = "Adaptation would do harm with a slightly better model: raise the gain or shorten the period."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     return Answer(QUESTION, Verdict.YES, text, "", numbers)
+
+
+def _by_runs(case: Case, reason: str) -> Answer:
+    """The answer where nothing predicts it: the tracking errors of two runs on the plant decide."""
+    trial = case.trial(case.controller.deformation)
+    pair = None if isinstance(trial, str) else trial[0]
+    if pair is None:
+        why = trial if isinstance(trial, str) else "the plant is outside"
+        return Answer(QUESTION, Verdict.UNKNOWN, f"{reason}; and no run, because {why}")
+    numbers = {"without": pair.without[pair.worst], "with": pair.adapted[pair.worst]}
+    text = f"in a run of at most {TRIED} cycles {pair.sentence} ({reason})"
+    if pair.lower:
+        return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    if pair.fails and not case.controller.learns:
+        return Answer(
+            QUESTION, Verdict.NO, text, "Lower the gain, use another form, or leave the deformation out.", numbers
+        )
+    return Answer(QUESTION, Verdict.UNKNOWN, text, "Run it for longer and compare.", numbers)
 
 
 def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer:

@@ -73,6 +73,12 @@ class ErrorPair:
         return not self._beyond(WORSE, _ROUNDING)
 
     @property
+    def lower(self) -> bool:
+        """Whether the errors are smaller with adaptation, as a sum of squares of their shares of the ranges, and `passes`."""
+        sums = [sum((e[n] / max(self.ranges[n], 1e-300)) ** 2 for n in e) for e in (self.without, self.adapted)]
+        return self.passes and sums[1] < sums[0]
+
+    @property
     def fails(self) -> bool:
         """Whether it makes one worse by a factor of two and a hundredth of its range, or by ten times and a thousandth."""
         return self._beyond(MUCH_WORSE, CLEAR) or self._beyond(FAR_WORSE, SLIGHT)

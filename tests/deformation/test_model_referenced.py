@@ -359,6 +359,9 @@ def test_review_says_which_form():
     assert advice.verdict == "unknown"
     assert "it is plain; measurements speak for model-referenced" in advice.evidence
     assert advice.change == f"Try ModelReferenced(map={affine(0.5)!r})."
+    decided = right_form(TWO_MASS.problem, affine(0.5), lambda form: "it loses" if form != affine(0.5) else "")
+    assert decided.verdict == "yes"
+    assert decided.evidence.endswith("; but here it loses, and the form in use does no harm")
     lost = right_form(TWO_MASS.problem, affine(0.5), lambda _: "with the wrong model it loses")
     assert lost.evidence.endswith("; but here with the wrong model it loses")
     assert "Try" not in lost.change

@@ -15,6 +15,7 @@ from sampled import lag, poles
 import fpirhc as fp
 from fpirhc.contraction.large_errors import least_product
 from fpirhc.deformation import Deformation
+from fpirhc.simulation.model_as_plant import shortened
 
 RATE, PERIOD = 20.0, 1e-3  # 1/s, s
 
@@ -117,12 +118,22 @@ def test_benefit_is_told_from_harm():
         assert one_answer.numbers["with"] == pytest.approx(one_answer.numbers["null"], rel=1.0)
 
 
-def test_benefit_is_not_known_under_dead_time():
-    """The recursion pairs a response with the last request."""
-    late = moving(dead_time=fp.DeadTime(inputs={"u": PERIOD}))
-    one_answer = answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "lower the response error")
-    assert one_answer.verdict == "unknown"
-    assert "dead time" in one_answer.evidence
+@pytest.mark.parametrize(("eigenvalue", "verdict"), [(1.5, "yes"), (1.0, "unknown")])
+def test_runs_decide_on_the_benefit_under_dead_time(eigenvalue, verdict):
+    """The recursion pairs a response with the last request, so nothing predicts it; the errors are those of two runs."""
+    late = moving(eigenvalue, dead_time=fp.DeadTime(inputs={"u": PERIOD}))
+    paired = fp.Paired(fp.Affine(gain=-0.5), cycles=1)
+    one_answer = answer(late, paired, "lower the response error")
+    assert one_answer.verdict == verdict
+    assert "no prediction with dead time" in one_answer.evidence
+    short = shortened(late, 1000)
+    runs = [
+        fp.simulate(short, fp.ComputedTorque(fp.Exponential(rate=RATE), map_), seed=0, compiled=False)
+        for map_ in (fp.Identity(), paired)
+    ]
+    without, adapted = (fp.measure(short, run).rms_error["y"] for run in runs)
+    assert (adapted < without) == (verdict == "yes")
+    assert one_answer.numbers == pytest.approx({"without": without, "with": adapted}, rel=1e-9)
     assert answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "two-cycles") is None
     assert answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "small lag") is None
 
