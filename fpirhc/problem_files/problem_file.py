@@ -4,6 +4,7 @@ A problem file defines `problem` (a Problem) and `controllers` ({name: Controlle
 It may also define
 - `headline`, a pair (controller without adaptation, controller with adaptation) for the verdict,
 - `cases`, a `Cases`: named cases for `fpirhc compare --cases`,
+- `headline_metric`, the name of the number by which controllers are compared and tuned, 'in_band' or 'rms_error.q1',
 - `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
 - `metrics`, a sequence of `Metric` for all tables, files and baselines of the problem, in addition to the shipped ones,
 - `pictures`, a sequence of pictures for the report, in addition to the usual ones.
@@ -56,6 +57,7 @@ class Task(FoundByName):
         metrics: all metrics of the problem's runs.
         pictures: further pictures for the report.
         cases: named cases of the problem; None: there are none.
+        headline_metric: number by which controllers are compared and tuned; None: the relative error.
     """
 
     _LOADED: ClassVar[str] = "fp.load_problem({})"
@@ -72,6 +74,7 @@ class Task(FoundByName):
     metrics: Sequence[Metric] = field(default_factory=known_metrics)
     pictures: tuple[Picture, ...] = ()
     cases: Cases | None = None
+    headline_metric: str | None = None
 
     def __post_init__(self) -> None:
         if self.problem.name != self.name:
@@ -111,6 +114,9 @@ def load_problem(name_or_path: str) -> Task:
         mistakes.add(
             f"{_line_of(module, 'metrics')}metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)"
         )
+    main = getattr(module, "headline_metric", None)
+    if main is not None and not isinstance(main, str):
+        mistakes.add(f"{_line_of(module, 'headline_metric')}expected the name of a metric, got {described(main)}")
     cases = getattr(module, "cases", None)
     if cases is not None and not isinstance(cases, Cases):
         form = "cases = fpirhc.Cases({'heavy': {'exact.mass': 2.0}})"
@@ -133,7 +139,7 @@ def load_problem(name_or_path: str) -> Task:
     except FpirhcError as error:
         raise ProblemFileError(str(error)) from None
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
-    facts = (problem, controllers, headline, tuning, metrics, tuple(pictures), cases)
+    facts = (problem, controllers, headline, tuning, metrics, tuple(pictures), cases, main)
     return Task(path.stem, path, title, description.strip(), *facts)
 
 

@@ -21,8 +21,8 @@ from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.studies.comparison.comparison import Comparison
-from fpirhc.studies.scenarios.paired import percent
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
+from fpirhc.studies.tuning.objective import Objective
 from fpirhc.summary import printable, table
 
 HOSTILE = "<img src=x onerror=alert(1)>[bold red]$\\frac$ \x1b[31m:bomb: `id` $(id) \"'&"
@@ -154,7 +154,7 @@ def test_inputs_show_what_they_hold(inputs):
     for text in ("not ready", "change it", "1 yes, 2 no, 0 unknown"):
         assert text in texts["review"]
     study = inputs["scenarios"]
-    for text in ("baseline", percent(study.summaries[1].median), printable(study.verdict[0])):
+    for text in ("baseline", Objective().text(study.summaries[1].median), printable(study.verdict[0])):
         assert text in texts["scenarios"]
 
 

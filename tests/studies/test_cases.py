@@ -198,6 +198,105 @@ def test_the_command(task, capsys):
     assert record["metrics"]["rms_error"]["y"] == error
 
 
+# --- The figure -------------------------------------------------------------------------------------------------------
+
+
+def judged_by(task: Task, name: str) -> Task:
+    """The task with a figure that is better when larger, and one that is better when smaller."""
+    figures = (
+        fp.figures.Nadir("output.y" if task.problem.plant.outputs else "state.y"),
+        fp.figures.Total("true_error.y"),
+    )
+    return replace(task, metrics=[*task.metrics, *figures], headline_metric=name)
+
+
+def test_a_comparison_speaks_of_the_headline_metric(task):
+    """By hand from the records: medians, the worst, and who is better; larger is better by the metric, not by the reader."""
+    task = judged_by(task, "nadir")
+    comparison = compared(task, "all")
+    nadirs = {c: np.array([r["metrics"]["nadir"][""] for r in rs]) for c, rs in comparison.records.items()}
+    plain, adaptive = comparison["CTC"], comparison["CTC+FPI"]
+    assert plain.median == -np.median(nadirs["CTC"])
+    assert plain.worst == -nadirs["CTC"].min()
+    assert plain.worst_name == comparison.records["CTC"][int(nadirs["CTC"].argmin())]["name"]
+    assert adaptive.better == np.sum(nadirs["CTC+FPI"] > nadirs["CTC"])
+    assert adaptive.difference is not None
+    assert adaptive.difference.median == pytest.approx(-np.median(nadirs["CTC+FPI"] - nadirs["CTC"]))
+    assert plain.worst_metrics["nadir"][""] == nadirs["CTC"].min()
+    table = comparison.view.tables[0]
+    shown = dict(zip((column.head for column in table.columns), table.rows[0].cells, strict=True))
+    assert shown["worst nadir"] == f"{nadirs['CTC'].min():.3g} m"
+    assert shown["median nadir"] == f"{np.median(nadirs['CTC']):.3g} m"
+    assert comparison.view.facts["headline"] == "nadir"
+
+
+def test_the_headline_needs_no_new_runs(task):
+    """Records hold every metric, so that another figure is another reading of them."""
+    task = judged_by(task, "nadir")
+    compared(task, "all")
+    before = Path("out/scenarios.jsonl").read_bytes()
+    again = compared(task, "all", headline="rms_error.y")
+    assert Path("out/scenarios.jsonl").read_bytes() == before
+    assert again["CTC"].median == np.median([r["metrics"]["rms_error"]["y"] for r in again.records["CTC"]])
+
+
+def test_the_verdict_of_one_run_speaks_of_it_first(task):
+    """The sentence has both numbers, and its outcome is that of the metric's direction."""
+    task = judged_by(task, "nadir")
+    comparison = fp.compare(task, seed=0, compiled=False)
+    first = comparison.findings[0]
+    before, after = (e.metrics["nadir"][""] for e in comparison.entries)
+    assert first.pair == ("CTC", "CTC+FPI")
+    assert first.text.startswith("CTC+FPI ")
+    assert "nadir" in first.text
+    assert "larger is better" in first.text
+    better = (
+        {True: "better", False: "worse"}[after > before] if not 0.9 <= abs(after / before) <= 1.1 else "no difference"
+    )
+    assert first.outcome is not None
+    assert first.outcome.value == better
+    assert comparison.findings[1].text.startswith("CTC+FPI")
+
+
+def test_groups_are_comparisons_of_their_own(task):
+    """The summary of a group is that of its cases alone."""
+    everything, heavy = compared(task, "all"), compared(task, "heavy", folder="heavy")
+    assert list(everything.groups) == ["heavy", "light"]
+    for alone, one in zip(heavy.summaries, everything.groups["heavy"], strict=True):
+        assert (alone.median, alone.worst, alone.worst_name, alone.ratio) == (
+            one.median,
+            one.worst,
+            one.worst_name,
+            one.ratio,
+        )
+    assert len(everything.view.tables[1].rows) == 4
+
+
+def test_what_is_worst_stands_first(task):
+    """Whoever reads one column after the name reads the worst case, its name, and failures."""
+    heads = [column.head for column in compared(task, "all").view.tables[0].columns]
+    assert heads[:4] == ["controller", "worst error", "in case", "failures"]
+
+
+def test_tuning_on_some_cases_leaves_the_others(task):
+    """The cost is the mean over the cases that are named, and the result says which they are and how many there are."""
+    pytest.importorskip("optuna")
+    task = replace(task, tuning={"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}})
+    tuning = fp.tune(task, trials=2, seed=0, folder=Path("tuning"), cases=["heavy"], compiled=False)
+    assert tuning.conditions == "cases stiff, known: 2 of 8"
+    bench = Bench(task, Conditions(0, COMPARING, 0.0, compiled=False, named=True))
+    errors = [bench.record(k, "CTC+FPI")["error"] for k in (2, 3)]
+    assert tuning.entries[0].cost_before == pytest.approx(np.mean(errors), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("nadr", "Did you mean 'nadir'"), ("rms_error", r"give one: 'rms_error\.NAME'")]
+)
+def test_wrong_headlines(name, message, task):
+    with pytest.raises((InvalidName, InvalidValue), match=message):
+        compared(judged_by(task, name), "all")
+
+
 # --- Wrong uses -------------------------------------------------------------------------------------------------------
 
 WRONG_CASES: dict[str, tuple[Any, str]] = {

@@ -17,7 +17,9 @@ def summary(name: str, interval: tuple[float, float] | None) -> Summary:
     """A controller whose error differs from the baseline's by this interval."""
     difference = None if interval is None else ConfidenceInterval(sum(interval) / 2, *interval)
     errors = np.full(5, 0.1)
-    return Summary(name, errors, errors, 0.1, 0.1, 0, "0", {"rms_error": {}}, {"finished": 5}, {}, difference, 1.0, 2)
+    return Summary(
+        name, errors, errors, errors, 0.1, 0.1, 0, "0", {"rms_error": {}}, {}, {"finished": 5}, {}, difference, 1.0, 2
+    )
 
 
 @pytest.mark.parametrize(

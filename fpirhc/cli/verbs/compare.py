@@ -38,6 +38,7 @@ _EXAMPLES = (
         "fpirhc compare my_arm.py --scenarios 50 --mismatch 30 --controllers RHC RHC+FPI --baseline RHC --out results/arm",
         "two controllers, compared with the first",
     ),
+    ("fpirhc compare my_arm.py --cases all --headline settling.q1", "by another number than the error"),
     ("fpirhc compare my_arm.py --cases all", "every case of the problem file; the worst one is named"),
     ("fpirhc compare anaesthesia --cases elderly 'patient 0*' --processes 2", "cases by name, or by group"),
 )
@@ -59,6 +60,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, "the noise, and of scenarios")
     add_no_compile(parser)
     add_json(parser, "the table")
+    text = "number that the verdict speaks of, such as in_band or rms_error.q1 (default: the problem's headline_metric, or errors)"
+    parser.add_argument("--headline", metavar="NAME", help=text)
     text = "use the settings in a file that 'fpirhc tune' wrote, and name them in the report"
     parser.add_argument("--tuned", metavar="FILE", help=text)
     _add_scenarios(parser)
@@ -93,6 +96,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
             task,
             seed=options.seed,
             controllers=controllers,
+            headline=options.headline,
             compiled=not options.no_compile,
             command=_command(options),
             progress=progress,
@@ -125,6 +129,8 @@ def _command(options: argparse.Namespace) -> str:
         words += ["--optimisers", *options.optimisers]
     if options.tuned:
         words += ["--tuned", options.tuned]
+    if options.headline:
+        words += ["--headline", options.headline]
     if options.no_compile:
         words.append("--no-compile")
     return shlex.join(words)
@@ -208,6 +214,7 @@ def _compared(options: argparse.Namespace, task: Task, folder: Path) -> Scenario
             folder=folder,
             controllers=options.controllers,
             baseline=options.baseline,
+            headline=options.headline,
             processes=options.processes,
             tuned=tuned.values if tuned else None,
             tuning=tuned.notes if tuned else None,
@@ -222,7 +229,7 @@ def _scenarios_command(options: argparse.Namespace) -> str:
     words = ["fpirhc", "compare", options.problem, "--seed", str(options.seed)]
     drawn = ["--scenarios", str(options.scenarios), "--mismatch", f"{options.mismatch or 0:g}"]
     words += ["--cases", *options.cases] if options.cases else drawn
-    for name in ("baseline", "tuned"):
+    for name in ("baseline", "tuned", "headline"):
         if getattr(options, name):
             words += [f"--{name}", getattr(options, name)]
     if options.controllers:

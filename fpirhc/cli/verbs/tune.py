@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.cli.options import add_controllers, add_mismatch, add_out, add_problem, add_scenarios, add_seed
+from fpirhc.cli.options import add_cases, add_controllers, add_mismatch, add_out, add_problem, add_scenarios, add_seed
 from fpirhc.cli.output import results_folder, resumable
 from fpirhc.cli.verb import ExitCode, Verb
 
@@ -23,7 +23,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, "the proposals and scenarios")
     add_scenarios(parser, 1, "scenarios in every trial (default: 1)")
     add_mismatch(parser)
-    text = "tune by this number of a run, such as settling.q1 (default: the relative error)"
+    add_cases(parser, "tune on these cases of the problem file in place of scenarios")
+    text = "tune by this number of a run, such as settling.q1 (default: the problem's headline metric, or the relative error)"
     parser.add_argument("--metric", metavar="NAME", help=text)
     text = "compile every trial of settings that decide what the loop is made of; others share one compiled loop anyway"
     compiling = parser.add_mutually_exclusive_group()
@@ -40,7 +41,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.tuning.tune import LEDGER, tune
     from fpirhc.studies.tuning.tuned_file import write_tuned
 
-    name = f"tuning_{options.scenarios}x{options.mismatch:g}percent_seed{options.seed}"
+    drawn = f"{options.scenarios}x{options.mismatch:g}percent"
+    name = f"tuning_{'cases' if options.cases else drawn}_seed{options.seed}"
     name += f"_by_{options.metric}" if options.metric else ""
     folder = results_folder(options.out, task.name, name)
     with resumable(folder / LEDGER), progress_bars() as progress:
@@ -52,6 +54,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
             controllers=options.controllers,
             count=options.scenarios,
             percent=options.mismatch,
+            cases=options.cases,
             metric=options.metric,
             compiled=options.compiled,
             progress=progress,
@@ -108,6 +111,7 @@ VERB = Verb(
 A problem file lists the settings to tune, by dotted path:
   tuning = {"RHC+FPI": {"deformation.gain": fp.LogSpan(-1.5, -0.05), "deformation.scale": fp.LogSpan(5, 500)}}
 The cost is the rms error divided by the reference's range, the mean over the scenarios; runs that fail cost 10 to 20.
-The scenarios of tuning are never those of a comparison.
+The scenarios of tuning are never those of a comparison. Cases are those that you name, and the file says which:
+compare on the others.
 """,
 )

@@ -42,6 +42,7 @@ from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.side_by_side import Built, beside_each_other, null_tests, with_reviewed_gains
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
+from fpirhc.studies.tuning.objective import objective
 from fpirhc.task.problem import Problem
 
 Progress = Callable[[str, int, int], None]
@@ -69,6 +70,7 @@ def compare(
     *,
     seed: Seed,
     controllers: Sequence[str] | None = None,
+    headline: str | None = None,
     compiled: bool = True,
     command: str = "",
     progress: Progress | None = None,
@@ -82,15 +84,18 @@ def compare(
         task: the loaded problem file.
         seed: of the disturbances and the noise.
         controllers: names of controllers; None: all.
+        headline: number of which the verdict speaks first, 'in_band' or 'rms_error.q1'; None: the problem's, or errors alone.
         compiled: whether runs use compiled C.
         command: the command line, for the report.
         progress: function of (controller, cycles done, cycles in all).
         changes: numbers of settings from a time on, by time in s, by controller.
 
     Raises:
+        InvalidName, InvalidValue: an unknown headline, or one without a better direction.
         InvalidProblem: unknown controllers, or deformations with a gain of the wrong sign.
     """
     begin = time.perf_counter()
+    figure = objective(headline or task.headline_metric, task.metrics, task.problem)
     selected = select(task, controllers)
     mistakes = Mistakes("changes")
     mistakes.unknown("controller", changes or (), selected)
@@ -112,10 +117,11 @@ def compare(
         yardstick=yardstick_of(task.problem, seed=seed),
         partners=alone,
         unjudged=unjudged,
+        figure=figure,
     )
     entries = with_reviewed_gains(task.problem, entries, built, judge(entries))
     judged = judge(entries)
-    pairs = [finding.pair for finding in judged if finding.pair]
+    pairs = list(dict.fromkeys(finding.pair for finding in judged if finding.pair))
     nulls = null_tests(task.problem, pairs, [*entries, *alone], built, sizes, seed=seed, broken=broken)
     return Comparison(
         problem=task.name,

@@ -18,6 +18,7 @@ from fpirhc.studies.comparison.caveats import Yardstick, caveats, leaves_referen
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
 from fpirhc.studies.comparison.outcome import Finding, Outcome
+from fpirhc.studies.tuning.objective import Objective
 from fpirhc.summary import written_out
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ def findings(
     *,
     partners: Sequence[Entry] = (),
     unjudged: Mapping[str, str] | None = None,
+    figure: Objective | None = None,
 ) -> tuple[Finding, ...]:
     """Return the verdict's sentences: the headline pair first, the other pairs, what other rows show, what was not run.
 
@@ -42,6 +44,7 @@ def findings(
         yardstick: what errors are measured against; None: each in its own unit.
         partners: runs without adaptation that are no rows, of rows whose pair they are.
         unjudged: why adaptive rows without a pair are not judged, by name.
+        figure: the number of which the first sentences speak; None: errors alone.
     """
     measure = yardstick or Yardstick()
     by_name = {e.name: e for e in (*entries, *partners)}
@@ -49,6 +52,9 @@ def findings(
     first = [p for p in pairs if headline and (p[0].name, p[1].name) == headline]
     receding = [p for p in pairs if "solve" in p[1].run.layout]
     ordered = list(dict.fromkeys([*first, *receding, *pairs]))
+    by_figure = (
+        [_by_figure(*pair, figure) for pair in ordered] if figure is not None and figure.metric is not None else []
+    )
     judged = [_told_of_partner(judge(*pair, measure), pair[0] in partners) for pair in ordered] or [_no_pair(entries)]
     left = (leaves_reference(entry, measure) for entry in entries)
     judged += [Finding(text) for text in left if text]
@@ -57,7 +63,39 @@ def findings(
     judged += remarks(entries, ordered[0] if ordered else None, measure.scales)
     if skipped:
         judged.append(Finding("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + "."))
-    return tuple(judged)
+    return (*by_figure, *judged)
+
+
+def _by_figure(plain: Entry, adaptive: Entry, figure: Objective) -> Finding:
+    """What adaptation does to the number that the problem is judged by."""
+    pair, metric = (plain.name, adaptive.name), figure.metric
+    assert metric is not None
+    before, after = (
+        math.nan if e.run.stop is not None else e.metrics[metric.name].get(figure.element, math.nan)
+        for e in (plain, adaptive)
+    )
+    name = figure.noun
+    if not math.isfinite(before + after):
+        lost = " and ".join(e.name for e, v in ((plain, before), (adaptive, after)) if not math.isfinite(v))
+        outcome = {(True, False): Outcome.BETTER, (False, True): Outcome.WORSE}.get(
+            (not math.isfinite(before), not math.isfinite(after)), Outcome.NOT_COMPARABLE
+        )
+        return Finding(
+            f"By {name} {adaptive.name} and {plain.name} cannot be set side by side: {lost} has none.", outcome, pair
+        )
+    sign = -1 if metric.better == "larger" else 1
+    change = Change(name, abs(before), abs(after))
+    gained = sign * (before - after)
+    outcome = Outcome.NO_DIFFERENCE
+    if change.outcome is not Outcome.NO_DIFFERENCE or before * after < 0:
+        outcome = Outcome.BETTER if gained > 0 else Outcome.WORSE
+    text = (
+        f"{figure.text(sign * after)} after {figure.text(sign * before)} without adaptation; {figure.better} is better"
+    )
+    verb = {Outcome.BETTER: "improves", Outcome.WORSE: "worsens", Outcome.NO_DIFFERENCE: "does not clearly change"}[
+        outcome
+    ]
+    return Finding(f"{adaptive.name} {verb} {name} ({text}).", outcome, pair, {name: change.ratio})
 
 
 def _told_of_partner(finding: Finding, apart: bool) -> Finding:

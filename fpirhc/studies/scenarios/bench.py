@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError
+from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.problem_files.problem_file import Task
@@ -187,6 +187,44 @@ def scenarios(task: Task, conditions: Conditions) -> Scenarios:
         assert task.cases is not None
         return NamedCases(task.cases, task.problem, conditions.seed)
     return RandomScenarios(task.problem, conditions.seed, conditions.use, conditions.percent)
+
+
+def scenario_numbers(
+    task: Task, count: int | None, percent: float, cases: Sequence[str] | None, *, same: bool = False
+) -> Sequence[int]:
+    """Return the numbers of the scenarios of a study.
+
+    Args:
+        task: the task.
+        count: number of random scenarios; None beside cases.
+        percent: range of the exact parameters, percent.
+        cases: patterns of cases.
+        same: whether all scenarios may be the same one.
+
+    Raises:
+        InvalidName: a pattern without a case.
+        InvalidProblem: a case that does not fit the problem.
+        InvalidValue: nothing to run, or all scenarios the same.
+    """
+    if cases is not None:
+        if count is not None or percent:
+            raise InvalidValue("cases are what they are: give either cases, or a number of scenarios and a mismatch")
+        if task.cases is None:
+            raise InvalidValue(
+                f"problem '{task.name}' has no cases; add to its file cases = fpirhc.Cases({{'heavy': {{'exact.mass': 2.0}}}}), or "
+                "fpirhc.Cases.from_csv('cases.csv')"
+            )
+        wanted = task.cases.matching(cases)
+        for name in wanted:  # what is wrong with a case is said before the first run
+            task.cases.problem(name, task.problem)
+        return [task.cases.names.index(name) for name in wanted]
+    if count is None or count < 1:
+        raise InvalidValue(f"scenarios {count}: expected at least 1")
+    if percent == 0 and not task.problem.disturbances and not same:
+        raise InvalidValue(
+            "every scenario would be the same: the problem has no disturbances and no parameter is drawn; give --mismatch P"
+        )
+    return range(count)
 
 
 def _finite(value: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,40 +12,45 @@ import numpy as np
 from fpirhc.by_name import FoundByName
 from fpirhc.simulation.metrics import Metric, known_metrics
 from fpirhc.studies.comparison.outcome import Outcome
-from fpirhc.summary import in_percent
+from fpirhc.studies.tuning.objective import Objective
 
 Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Summary(FoundByName):
-    """One controller over all scenarios; errors are relative (see `score`), infinite for runs that ended early.
+    """One controller over all scenarios. Values are relative errors, or those of another figure with the sign that makes smaller
+    better; they are infinite for runs that ended early.
 
     Args:
         name: name of the controller.
         errors: relative errors by scenario, shape (n,).
+        values: of the figure of the comparison by scenario, shape (n,).
         mismatch: mismatch of the model by scenario, shape (n,).
-        median: median of the errors.
-        worst: largest error.
-        worst_scenario: number of the scenario with the largest error.
+        median: median of the values.
+        worst: worst value.
+        worst_scenario: number of the scenario with the worst value.
         worst_name: its name; the number as text where scenarios are random.
         metrics: median over the scenarios, by metric and element; a run without the number counts as worse than any
             other.
+        worst_metrics: the worst number over the scenarios, by metric and element, of metrics with a better direction.
         outcomes: number of scenarios by outcome.
         statuses: number of cycles by status, over all scenarios.
-        difference: this error minus the baseline's in the same scenario; None for the baseline itself.
-        ratio: median of this error over the baseline's.
-        better: number of scenarios in which this error is the smaller one.
+        difference: this value minus the baseline's in the same scenario; None for the baseline itself.
+        ratio: median of this value over the baseline's.
+        better: number of scenarios in which this value is the smaller one.
     """
 
     name: str
     errors: np.ndarray
+    values: np.ndarray
     mismatch: np.ndarray
     median: float
     worst: float
     worst_scenario: int
     worst_name: str
     metrics: Mapping[str, Mapping[str, float]]
+    worst_metrics: Mapping[str, Mapping[str, float]]
     outcomes: Mapping[str, int]
     statuses: Mapping[str, int]
     difference: ConfidenceInterval | None
@@ -77,6 +82,7 @@ def summarise(
     baseline: Sequence[Record] | None,
     seed: int,
     metrics: Sequence[Metric] | None = None,
+    figure: Objective | None = None,
 ) -> Summary:
     """Return the summary of one controller's records against the baseline's of the same scenarios, in the same order.
 
@@ -86,42 +92,48 @@ def summarise(
         baseline: the baseline's records; None for the baseline itself.
         seed: of the resampling.
         metrics: metrics with which the records were measured; None: the shipped and the installed ones.
+        figure: by which controllers are compared; None: the relative error.
     """
-    errors = errors_of(records)
-    before = errors if baseline is None else errors_of(baseline)
-    worst = int(np.argmax(errors))
+    figure, known = figure or Objective(), known_metrics() if metrics is None else metrics
+    values = np.array([figure.value(r) for r in records])
+    before = values if baseline is None else np.array([figure.value(r) for r in baseline])
+    worst = int(np.argmax(values))
     return Summary(
         name=name,
-        errors=errors,
+        errors=np.array([Objective().value(r) for r in records]),
+        values=values,
         mismatch=np.array([r["mismatch"] for r in records]),
-        median=float(middle(errors)),
-        worst=float(errors[worst]),
+        median=float(middle(values)),
+        worst=float(values[worst]),
         worst_scenario=int(records[worst]["scenario"]),
         worst_name=str(records[worst].get("name", records[worst]["scenario"])),
-        metrics=_medians(records, known_metrics() if metrics is None else metrics),
+        metrics=_over(records, known, lambda values, _: float(middle(values))),
+        worst_metrics=_over(
+            records,
+            [metric for metric in known if metric.better != "neither"],
+            lambda values, larger: float(values.min() if larger else values.max()),
+        ),
         outcomes=dict(Counter(str(r["outcome"]) for r in records)),
         statuses=dict(sum((Counter(r["metrics"]["status"]) for r in records), Counter())),
-        difference=None if baseline is None else median_interval(_differences(errors, before), seed),
-        ratio=float(middle(_ratios(errors, before))),
-        better=int(np.sum(errors < before)),
+        difference=None if baseline is None else median_interval(_differences(values, before), seed),
+        ratio=float(middle(_ratios(values, before))),
+        better=int(np.sum(values < before)),
     )
 
 
-def _medians(records: Sequence[Record], metrics: Sequence[Metric]) -> dict[str, dict[str, float]]:
-    """Median of every number that some scenario has."""
-    medians: dict[str, dict[str, float]] = {}
+def _over(
+    records: Sequence[Record], metrics: Sequence[Metric], one_of: Callable[[np.ndarray, bool], float]
+) -> dict[str, dict[str, float]]:
+    """One of all scenarios' numbers, for every number that some scenario has; `one_of` is given whether larger ones are better."""
+    numbers_of: dict[str, dict[str, float]] = {}
     for metric in metrics:
         by_element = [r["metrics"].get(metric.name, {}) for r in records]
-        missing = -np.inf if metric.better == "larger" else np.inf
+        larger = metric.better == "larger"
+        missing = -np.inf if larger else np.inf
         for element in dict.fromkeys(e for numbers in by_element for e in numbers):
             values = _numbers([numbers.get(element) for numbers in by_element], missing)
-            medians.setdefault(metric.name, {})[element] = float(middle(values))
-    return medians
-
-
-def errors_of(records: Sequence[Record]) -> np.ndarray:
-    """Relative errors, infinite where a run ended early."""
-    return _numbers([r["error"] for r in records])
+            numbers_of.setdefault(metric.name, {})[element] = one_of(values, larger)
+    return numbers_of
 
 
 def _numbers(values: Sequence[float | None], missing: float = np.inf) -> np.ndarray:
@@ -146,19 +158,23 @@ def noun(named: bool) -> str:
     return "cases" if named else "scenarios"
 
 
-def verdict(summaries: Sequence[Summary], skipped: Mapping[str, str], what: str = "scenarios") -> tuple[str, ...]:
+def verdict(
+    summaries: Sequence[Summary], skipped: Mapping[str, str], what: str = "scenarios", figure: Objective | None = None
+) -> tuple[str, ...]:
     """Return sentences: every controller against the baseline, failures, and controllers that were not run.
 
     Args:
         summaries: the baseline first.
         skipped: reasons why controllers were not run, by name.
         what: what the scenarios are called.
+        figure: by which controllers are compared; None: the relative error.
     """
-    sentences = [_sentence(summaries[0], s, what) for s in summaries[1:]]
+    figure = figure or Objective()
+    sentences = [_sentence(summaries[0], s, what, figure) for s in summaries[1:]]
     if len(summaries) == 1:
         only = summaries[0]
         sentences.append(
-            f"{only.name} has a median error of {percent(only.median)}; there is nothing to compare it with."
+            f"{only.name} has a median {figure.noun} of {figure.text(only.median)}; there is nothing to compare it with."
         )
     elif not summaries:
         sentences.append("No controller could serve the problem, so nothing can be compared.")
@@ -168,38 +184,27 @@ def verdict(summaries: Sequence[Summary], skipped: Mapping[str, str], what: str 
     return tuple(sentences)
 
 
-def _sentence(baseline: Summary, one: Summary, what: str) -> str:
+def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> str:
     difference = one.difference
     assert difference is not None
     count = one.errors.size
     numbers = (
-        f"median difference of the error {signed(difference.median)}, "
-        f"95 % interval {signed(difference.low)} to {signed(difference.high)}; smaller in {one.better} of {count} {what}"
+        f"median difference of the {figure.noun} {figure.difference(difference.median)}, 95 % interval "
+        f"{figure.interval(difference.low, difference.high)}; "
+        f"{figure.better} in {one.better} of {count} {what}"
     )
+    times = f"{one.ratio:.3g} times its {figure.noun}"
+    worse = "larger" if figure.better == "smaller" else "smaller"
     if one.outcome is Outcome.BETTER:
-        return f"{one.name} has a smaller error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
+        return f"{one.name} has a {figure.better} {figure.noun} than {baseline.name} ({numbers}; {times})."
     if one.outcome is Outcome.WORSE:
-        return f"{one.name} has a larger error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
+        return f"{one.name} has a {worse} {figure.noun} than {baseline.name} ({numbers}; {times})."
     return f"{one.name} and {baseline.name} show no clear difference ({numbers})."
 
 
 def _failed(one: Summary, what: str) -> str:
     parts = [f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished"]
     return f"{one.name} fails in {one.failures} of {one.errors.size} {what} ({', '.join(parts)})."
-
-
-def percent(share: float) -> str:
-    """Return a share as text."""
-    return in_percent(share) if np.isfinite(share) else "none (failed)"
-
-
-def signed(share: float) -> str:
-    """Return a difference of shares as text."""
-    return (
-        f"{100 * share:+.3g} %"
-        if np.isfinite(share)
-        else ("worse by a failure" if share > 0 else "better by a failure")
-    )
 
 
 RESAMPLES = 4000

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import Any
 
 from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.simulation.metrics.columns import Column as Number
-from fpirhc.studies.scenarios.paired import Record, Summary, noun, percent, signed
+from fpirhc.studies.scenarios.paired import Record, Summary, noun
+from fpirhc.studies.tuning.objective import Objective
 from fpirhc.studies.view import View, status_shares
 from fpirhc.summary import Column, Table, line, written_out
 
+_ERRORS = "Errors are rms errors divided by the range of the reference, root mean square over the judged coordinates. "
 _MEANING = (
-    "Errors are rms errors divided by the range of the reference, root mean square over the judged coordinates. Every scenario "
-    "has the same noise, disturbances and drawn parameters for all controllers; differences are taken within scenarios, and their "
-    "intervals are 95 % percentile bootstrap intervals of the median. A run whose error exceeds the reference's range has "
-    "diverged; a run that ended early counts as worse than every other run."
+    "Every scenario has the same noise, disturbances and parameters for all controllers; differences are taken within scenarios, "
+    "and their intervals are 95 % percentile bootstrap intervals of the median. A run whose error exceeds the reference's range "
+    "has diverged; a run that ended early counts as worse than every other run."
 )
 _UNTUNED = "No file of tuned settings was given: all settings are those of the problem file."
 
@@ -34,6 +35,8 @@ class ScenarioComparison(FoundByName):
         description: its description.
         count: number of scenarios.
         named: whether they are cases of the problem file.
+        figure: by which controllers are compared.
+        groups: summaries of the scenarios of every group, the baseline first.
         percent: range of the exact parameters' draws, percent.
         seed: of all draws.
         measure_from: time from which errors count.
@@ -69,6 +72,8 @@ class ScenarioComparison(FoundByName):
     elapsed: float
     time_unit: str = "s"
     named: bool = False
+    figure: Objective = field(default_factory=Objective)
+    groups: Mapping[str, tuple[Summary, ...]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"
@@ -104,8 +109,8 @@ def _view(comparison: ScenarioComparison) -> View:
         title=comparison.title,
         about=comparison.description,
         sentences=tuple(zip_longest(comparison.verdict, outcomes)),
-        conditions=f"{conditions} {_MEANING} {'' if comparison.tuning else _UNTUNED}",
-        tables=(_controllers(comparison, conditions),),
+        conditions=f"{conditions} {'' if comparison.figure.metric else _ERRORS}{_MEANING} {'' if comparison.tuning else _UNTUNED}",
+        tables=(_controllers(comparison, conditions), _groups(comparison)),
         lists={"Tuning": [f"{name}: {note}" for name, note in comparison.tuning.items()]},
         skipped=comparison.skipped,
         settings=comparison.settings,
@@ -117,34 +122,68 @@ def _view(comparison: ScenarioComparison) -> View:
 
 
 def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
+    """The controllers, what is worst of them first."""
+    figure = comparison.figure
     heads = (
         Column("controller"),
-        Column("median error", "median"),
+        Column(f"worst {figure.noun}", "worst"),
+        Column(f"in {noun(comparison.named).removesuffix('s')}", "in" if comparison.named else None),
+        Column("failures", "failed"),
+        *(Column(f"worst {c.short}", None) for c in comparison.columns),
+        Column(f"median {figure.noun}", "median"),
         Column("difference (95 %)"),
         Column("ratio"),
-        Column("smaller in", None),
+        Column(f"{figure.better} in", None),
         *(Column(f"median {c.short}", None) for c in comparison.columns),
-        Column("worst"),
-        Column(f"in {noun(comparison.named).removesuffix('s')}", None),
-        Column("failures", "failed"),
         Column("status", None, left=True),
     )
-    table = Table(f"{comparison.problem}: {comparison.count} {noun(comparison.named)}", heads, conditions)
+    title = f"{comparison.problem}: {comparison.count} {noun(comparison.named)}"
+    table = Table(title, heads, conditions)
     for one in comparison.summaries:
-        beside = ["baseline", "", ""]
-        if one.difference is not None:
-            d = one.difference
-            apart = f"{signed(d.median)} ({signed(d.low)} to {signed(d.high)})"
-            beside = [apart, written_out(one.ratio), str(one.better)]
-        failed = ", ".join(f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished")
-        medians = [_median(c, one) for c in comparison.columns]
-        worst = [percent(one.worst), one.worst_name, failed or "0"]
-        table.add([one.name, percent(one.median), *beside, *medians, *worst, status_shares(one.statuses)])
+        worst = [_number(c, one.worst_metrics) for c in comparison.columns]
+        medians = [_number(c, one.metrics) for c in comparison.columns]
+        beside = [figure.text(one.median), *_beside(one, figure)]
+        table.add([one.name, *_worst(one, figure), *worst, *beside, *medians, status_shares(one.statuses)])
     return table
 
 
-def _median(column: Number, one: Summary) -> str:
-    value = one.metrics.get(column.metric.name, {}).get(column.element)
+def _groups(comparison: ScenarioComparison) -> Table:
+    """The same in short for every group."""
+    figure = comparison.figure
+    heads = (
+        "group",
+        "controller",
+        f"worst {figure.noun}",
+        "in case",
+        "failures",
+        f"median {figure.noun}",
+        "difference (95 %)",
+        "ratio",
+    )
+    table = Table("Groups", [*map(Column, heads), Column(f"{figure.better} in")], names=2)
+    for name, summaries in comparison.groups.items():
+        for one in summaries:
+            table.add([name, one.name, *_worst(one, figure), figure.text(one.median), *_beside(one, figure)])
+    return table
+
+
+def _worst(one: Summary, figure: Objective) -> list[str]:
+    """The worst value, where it is, and failures."""
+    failed = ", ".join(f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished")
+    return [figure.text(one.worst), one.worst_name, failed or "0"]
+
+
+def _beside(one: Summary, figure: Objective) -> list[str]:
+    """What it is beside the baseline."""
+    d = one.difference
+    if d is None:
+        return ["baseline", "", ""]
+    apart = f"{figure.difference(d.median)} ({figure.interval(d.low, d.high)})"
+    return [apart, written_out(one.ratio), f"{one.better} of {one.values.size}"]
+
+
+def _number(column: Number, of: Mapping[str, Mapping[str, float]]) -> str:
+    value = of.get(column.metric.name, {}).get(column.element)
     return column.metric.text(value) if value is not None and math.isfinite(value) else "none"
 
 
@@ -155,7 +194,9 @@ def _facts(comparison: ScenarioComparison) -> dict[str, Any]:
         "seed": comparison.seed,
         "mismatch": comparison.percent,
         "versions": comparison.versions,
+        "headline": comparison.figure.name,
         "verdict": comparison.verdict,
+        "groups": {name: {one.name: _summary(one) for one in some} for name, some in comparison.groups.items()},
         "controllers": {one.name: _summary(one) for one in comparison.summaries},
         "skipped": comparison.skipped,
         "tuning": comparison.tuning,
@@ -176,6 +217,8 @@ def _summary(one: Summary) -> dict[str, Any]:
         "metrics": one.metrics,
         "outcomes": one.outcomes,
         "statuses": one.statuses,
+        "worst_metrics": one.worst_metrics,
         "errors": one.errors.tolist(),
+        "values": one.values.tolist(),
         "mismatch": one.mismatch.tolist(),
     }

@@ -18,12 +18,13 @@ from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
 from fpirhc.simulation.metrics.columns import Column
 from fpirhc.studies.comparison.compare import check_gains, select, versions
-from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint
+from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint, scenario_numbers
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import Record, Summary, noun, summarise, verdict
 from fpirhc.studies.scenarios.processes import Workers
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
+from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import with_tuned
 
 LEDGER = "scenarios.jsonl"
@@ -41,6 +42,7 @@ def compare_scenarios(
     folder: Path,
     controllers: Sequence[str] | None = None,
     baseline: str | None = None,
+    headline: str | None = None,
     processes: int = 1,
     tuned: Mapping[str, Values] | None = None,
     tuning: Mapping[str, str] | None = None,
@@ -59,6 +61,7 @@ def compare_scenarios(
         folder: folder to which finished scenarios are written, one by one.
         controllers: names of controllers; None: all.
         baseline: name of the controller with which the others are compared; None: the first.
+        headline: number by which controllers are compared, 'in_band' or 'rms_error.q1'; None: the problem's, or the relative error.
         processes: number of processes; more than 1 need a task that is the same as its file.
         tuned: settings to change, by controller and path.
         tuning: sentences about the origin of these settings, by controller.
@@ -67,13 +70,15 @@ def compare_scenarios(
         progress: function of (controller, scenarios done, scenarios in all) that is called after every scenario.
 
     Raises:
+        InvalidName, InvalidValue: an unknown headline, or one without a better direction; a pattern without a case.
         InvalidProblem: unknown controllers or settings, gains of the wrong sign, draws that could leave physical
             bounds.
         OutputError: the folder cannot be written, or holds results under other conditions.
         WorkerDied: processes die again and again.
     """
     begin = time.perf_counter()
-    numbers = _numbers(task, count, percent, cases)
+    figure = objective(headline or task.headline_metric, task.metrics, task.problem)
+    numbers = scenario_numbers(task, count, percent, cases)
     if processes < 1:
         raise InvalidValue(f"processes {processes}: expected at least 1")
     task = with_tuned(task, tuned or {})
@@ -85,51 +90,30 @@ def compare_scenarios(
     workers = Workers(__package__ + ".worker", opening, header, processes)
     with Ledger(folder / LEDGER, header, RecordFields) as ledger:
         records, skipped = _completed(ledger, bench, workers if processes > 1 else None, numbers, names, progress)
-    summaries = _summaries(records, seed, task.metrics)
+    summaries = _summaries(records, seed, task.metrics, figure)
     return ScenarioComparison(
         problem=task.name,
         title=task.title,
         description=task.description,
         count=len(numbers),
         named=conditions.named,
+        figure=figure,
+        groups=_groups(records, seed, task.metrics, figure),
         percent=float(percent),
         seed=seed,
         measure_from=task.problem.measure_from,
         time_unit=task.problem.time_unit,
-        columns=_columns(task, summaries),
+        columns=_columns(task, summaries, figure),
         summaries=summaries,
         records=records,
         skipped=skipped,
-        verdict=verdict(summaries, skipped, noun(conditions.named)),
+        verdict=verdict(summaries, skipped, noun(conditions.named), figure),
         tuning={n: note for n, note in (tuning or {}).items() if n in names},
         settings={"problem": describe(task.problem), **{n: describe(task.controllers[n]) for n in names}},
         versions=versions(),
         command=command,
         elapsed=time.perf_counter() - begin,
     )
-
-
-def _numbers(task: Task, count: int | None, percent: float, cases: Sequence[str] | None) -> Sequence[int]:
-    """Numbers of the scenarios; an error where there is nothing to run, or where all scenarios would be the same."""
-    if cases is not None:
-        if count is not None or percent:
-            raise InvalidValue("cases are what they are: give either cases, or a number of scenarios and a mismatch")
-        if task.cases is None:
-            raise InvalidValue(
-                f"problem '{task.name}' has no cases; add to its file cases = fpirhc.Cases({{'heavy': {{'exact.mass': 2.0}}}}), or "
-                "fpirhc.Cases.from_csv('cases.csv')"
-            )
-        wanted = task.cases.matching(cases)
-        for name in wanted:  # what is wrong with a case is said before the first run
-            task.cases.problem(name, task.problem)
-        return [task.cases.names.index(name) for name in wanted]
-    if count is None or count < 1:
-        raise InvalidValue(f"scenarios {count}: expected at least 1")
-    if percent == 0 and not task.problem.disturbances:
-        raise InvalidValue(
-            "every scenario would be the same: the problem has no disturbances and no parameter is drawn; give --mismatch P"
-        )
-    return range(count)
 
 
 def _completed(
@@ -173,18 +157,35 @@ def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, st
             yield record
 
 
-def _summaries(records: Mapping[str, Sequence[Record]], seed: int, metrics: Sequence[Metric]) -> tuple[Summary, ...]:
+def _groups(
+    records: Mapping[str, Sequence[Record]], seed: int, metrics: Sequence[Metric], figure: Objective
+) -> dict[str, tuple[Summary, ...]]:
+    """The summaries of every group of scenarios; none where no scenario has a group."""
+    names = sorted({str(r["group"]) for some in records.values() for r in some} - {""})
+    return {
+        name: _summaries(
+            {c: [r for r in some if r["group"] == name] for c, some in records.items()}, seed, metrics, figure
+        )
+        for name in names
+    }
+
+
+def _summaries(
+    records: Mapping[str, Sequence[Record]], seed: int, metrics: Sequence[Metric], figure: Objective
+) -> tuple[Summary, ...]:
     if not records:
         return ()
     first, *others = records
     against = [(first, None), *((name, records[first]) for name in others)]
-    return tuple(summarise(name, records[name], before, seed, metrics) for name, before in against)
+    return tuple(summarise(name, records[name], before, seed, metrics, figure) for name, before in against)
 
 
-def _columns(task: Task, summaries: Sequence[Summary]) -> tuple[Column, ...]:
+def _columns(task: Task, summaries: Sequence[Summary], figure: Objective) -> tuple[Column, ...]:
+    """The numbers of a short table; that of the comparison has columns of its own."""
     return tuple(
         Column(metric, element, metric.unit_of(task.problem, element))
         for metric in task.metrics
         if metric.headline
         for element in dict.fromkeys(e for one in summaries for e in one.metrics.get(metric.name, {}))
+        if (metric, element) != (figure.metric, figure.element)
     )

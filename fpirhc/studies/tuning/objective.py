@@ -1,13 +1,17 @@
-"""The cost of a trial: the relative error, or any metric that has a better direction."""
+"""The figure by which controllers are compared and tuned: the relative error, or any metric that has a better direction."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
+from fpirhc.plant.units import with_space
 from fpirhc.simulation.metrics import Metric
+from fpirhc.summary import in_percent
+from fpirhc.task.problem import Problem
 
 PENALTY = 10.0  # relative error that no run can exceed; one that ended early costs up to twice as much, less if it lasted long
 RELATIVE_ERROR = "relative error"
@@ -16,7 +20,7 @@ _NO_METRIC = 1e12  # instead of `PENALTY` for a metric, whose size is not known
 
 @dataclass(frozen=True)
 class Objective:
-    """The cost of one run.
+    """The figure of one run, and its cost.
 
     The cost is a number of the metric, with the opposite sign where larger is better. A run that ended early, or without the
     number, costs between one and two penalties, less if it lasted long.
@@ -24,10 +28,12 @@ class Objective:
     Args:
         metric: the metric; None: the relative rms error (see `score`).
         element: element of the metric.
+        unit: of the number.
     """
 
     metric: Metric | None = None
     element: str = ""
+    unit: str = ""
 
     @property
     def name(self) -> str:
@@ -43,6 +49,52 @@ class Objective:
     def _penalty(self) -> float:
         return PENALTY if self.metric is None else _NO_METRIC
 
+    @property
+    def noun(self) -> str:
+        """What a sentence calls it."""
+        return "error" if self.metric is None else self.name
+
+    @property
+    def better(self) -> str:
+        """What a sentence calls an improvement."""
+        return "larger" if self._sign < 0 else "smaller"
+
+    @property
+    def _sign(self) -> int:
+        return -1 if self.metric is not None and self.metric.better == "larger" else 1
+
+    def text(self, value: float) -> str:
+        """Return a value as text, in the unit and with the sign of the metric."""
+        if not math.isfinite(value):
+            return "none (failed)"
+        if self.metric is None:
+            return in_percent(value)
+        return self.metric.text(self._sign * value) + self._unit
+
+    def difference(self, value: float) -> str:
+        """Return a difference of two values as text."""
+        if not math.isfinite(value):
+            return "worse by a failure" if value > 0 else "better by a failure"
+        shown = (100 if self.metric is None else self._sign) * value + 0.0
+        return f"{shown:+.3g}" + (" %" if self.metric is None else self._unit)
+
+    def interval(self, low: float, high: float) -> str:
+        """Return an interval of differences as text, the smaller number first."""
+        return " to ".join(map(self.difference, (low, high)[:: self._sign]))
+
+    @property
+    def _unit(self) -> str:
+        return "" if self.unit in ("", "1") else with_space(self.unit)
+
+    def value(self, record: Mapping[str, Any]) -> float:
+        """Return the number of a scenario's record with the sign that makes smaller better; infinite where the run failed.
+
+        Raises:
+            InvalidName: a run that finished has no such number.
+        """
+        value = record["error"] if self.metric is None else self._number(record)
+        return math.inf if value is None else float(value)
+
     def cost(self, record: Mapping[str, Any]) -> float:
         """Return the cost of a scenario's record.
 
@@ -51,10 +103,8 @@ class Objective:
         """
         if "skipped" in record:
             return self.refused
-        value = record["error"] if self.metric is None else self._number(record)
-        if value is None:
-            return float(self._penalty * (2 - record["lasted"]))
-        return float(min(value, self._penalty))
+        value = self.value(record)
+        return min(value, self._penalty) if math.isfinite(value) else float(self._penalty * (2 - record["lasted"]))
 
     def _number(self, record: Mapping[str, Any]) -> float | None:
         assert self.metric is not None
@@ -65,11 +115,16 @@ class Objective:
                 f"metric '{self.name}': a run of '{record['controller']}' has none.{nearest(self.name, names)}"
             )
         value = None if record["outcome"] == "ended early" else numbers.get(self.element)
-        return None if value is None else value * (-1 if self.metric.better == "larger" else 1)
+        return None if value is None else value * self._sign
 
 
-def objective(name: str | None, metrics: Sequence[Metric]) -> Objective:
+def objective(name: str | None, metrics: Sequence[Metric], problem: Problem | None = None) -> Objective:
     """Return the objective by the name of a number: None for the relative error, else 'at_limit' or 'overshoot.q1'.
+
+    Args:
+        name: of the number.
+        metrics: those that there are.
+        problem: whose units it has; None: it is shown without one.
 
     Raises:
         InvalidName: an unknown metric.
@@ -82,10 +137,10 @@ def objective(name: str | None, metrics: Sequence[Metric]) -> Objective:
         if name != metric.key(element):
             continue
         if metric.better == "neither":
-            raise InvalidValue(f"metric '{metric.name}' has no better direction, so nothing can be tuned by it")
+            raise InvalidValue(f"metric '{metric.name}' has no better direction, so nothing can be judged by it")
         if metric.by is not None and not element:
             raise InvalidValue(
                 f"metric '{metric.name}' has a number for every {metric.by}; give one: '{metric.name}.NAME'"
             )
-        return Objective(metric, element)
+        return Objective(metric, element, metric.unit_of(problem, element) if problem else "")
     raise InvalidName(f"metric '{name}' is unknown.{nearest(name, [RELATIVE_ERROR, *(m.name for m in metrics)])}")

@@ -29,7 +29,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.harm import harm_of_adaptation
-from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
+from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint, scenario_numbers
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
@@ -124,6 +124,7 @@ def tune(
     controllers: Sequence[str] | None = None,
     count: int = 1,
     percent: float = 0.0,
+    cases: Sequence[str] | None = None,
     metric: str | None = None,
     compiled: bool | None = None,
     progress: Progress | None = None,
@@ -138,8 +139,10 @@ def tune(
         controllers: names of controllers; None: all that the task's tuning has.
         count: number of scenarios in a trial.
         percent: range of the exact parameters' draws, percent.
+        cases: in place of random scenarios, those cases of the task that these patterns name. The result says which they are, so
+            that the others can judge it.
         metric: number that is the cost, for example 'settling.q1' or 'at_limit'; the cost has the opposite sign
-            where larger is better. None: the relative error.
+            where larger is better. None: the problem's headline metric, or the relative error.
         compiled: whether runs use compiled C. None: where all settings of the search can be live, so that one compiled loop
             serves all trials; other settings are other C code, and compiling pays only where runs last longer than the compiler.
         progress: function of (controller, trials done, trials in all) that is called after every trial.
@@ -152,15 +155,23 @@ def tune(
     """
     optuna = _optuna()
     names = _tunable(task, controllers)
-    for name, value in (("trials", trials), ("scenarios", count)):
-        if value < 1:
-            raise InvalidValue(f"{name} {value}: expected at least 1")
-    conditions = Conditions(seed, TUNING, float(percent), compiled)
-    aim = objective(metric, task.metrics)
-    header = {**fingerprint(task, conditions), "scenarios": count, "optuna": optuna.__version__, "metric": aim.name}
+    if trials < 1:
+        raise InvalidValue(f"trials {trials}: expected at least 1")
+    # One scenario may be without draws: it is the problem itself.
+    numbers = scenario_numbers(task, None if cases is not None and count == 1 else count, percent, cases, same=True)
+    conditions = Conditions(seed, TUNING, float(percent), compiled, named=cases is not None)
+    aim = objective(metric or task.headline_metric, task.metrics)
+    header = {
+        **fingerprint(task, conditions),
+        "scenarios": list(numbers),
+        "optuna": optuna.__version__,
+        "metric": aim.name,
+    }
     with Ledger(folder / LEDGER, header, TrialFields) as ledger:
-        entries = tuple(_tuned(optuna, task, n, conditions, count, trials, aim, ledger, progress) for n in names)
+        entries = tuple(_tuned(optuna, task, n, conditions, numbers, trials, aim, ledger, progress) for n in names)
     words = f"{count} scenario{'s' if count > 1 else ''} within {percent:g} %"
+    if cases is not None and task.cases is not None:
+        words = f"cases {', '.join(task.cases.names[k] for k in numbers)}: {len(numbers)} of {len(task.cases.names)}"
     untouched = tuple(n for n in task.controllers if n not in names)
     return Tuning(task.name, trials, seed, words, aim.name, entries, untouched)
 
@@ -205,7 +216,7 @@ def _tuned(
     task: Task,
     name: str,
     conditions: Conditions,
-    count: int,
+    numbers: Sequence[int],
     trials: int,
     aim: Objective,
     ledger: Ledger,
@@ -214,7 +225,7 @@ def _tuned(
     spans = task.tuning[name]
     known = {r["trial"]: r for r in ledger.records if r["controller"] == name}
     before = {path: current_setting(task.controllers[name], path) for path in spans}
-    judge = _Judge(task, name, tuple(spans), conditions, count, aim)
+    judge = _Judge(task, name, tuple(spans), conditions, numbers, aim)
     study = optuna.create_study()
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
     for number in range(_PRESENT, trials):
@@ -259,12 +270,18 @@ class _Judge:
     """Judges settings of one controller in all scenarios: with one loop where the settings can be live, else one for each."""
 
     def __init__(
-        self, task: Task, name: str, paths: Sequence[str], conditions: Conditions, count: int, aim: Objective
+        self,
+        task: Task,
+        name: str,
+        paths: Sequence[str],
+        conditions: Conditions,
+        numbers: Sequence[int],
+        aim: Objective,
     ) -> None:
         # A trial keeps its cost alone, so no other metric is measured.
         needed = {"rms_error", aim.metric.name if aim.metric else ""}
         self._task = replace(task, metrics=[metric for metric in task.metrics if metric.name in needed])
-        self._name, self._conditions, self._count, self._aim = name, conditions, count, aim
+        self._name, self._conditions, self._scenarios, self._aim = name, conditions, numbers, aim
         self._paths, self._bench = paths, cast(Bench | None, None)
 
     def judged(self, settings: Mapping[str, float]) -> dict[str, float]:
@@ -272,16 +289,16 @@ class _Judge:
         try:
             records = self._records(settings)
         except (InvalidValue, InvalidProblem):
-            return {"cost": self._aim.refused, "failures": self._count}
+            return {"cost": self._aim.refused, "failures": len(self._scenarios)}
         costs = [self._aim.cost(record) for record in records]
         failures = sum(r.get("outcome") != "finished" for r in records)
-        return {"cost": math.fsum(costs) / self._count, "failures": failures}
+        return {"cost": math.fsum(costs) / len(self._scenarios), "failures": failures}
 
     def _records(self, settings: Mapping[str, float]) -> list[dict[str, Any]]:
         if self._bench is None:
             self._bench = Bench(self._task, self._conditions, {self._name: self._paths})
-        if self._bench.changes(self._name):
-            return [self._bench.record(k, self._name, settings) for k in range(self._count)]
+        if all(self._bench.changes(self._name, k) for k in self._scenarios):
+            return [self._bench.record(k, self._name, settings) for k in self._scenarios]
         changed = with_settings(self._task.controllers[self._name], settings)
         bench = Bench(replace(self._task, controllers={self._name: changed}), self._conditions)
-        return [bench.record(k, self._name) for k in range(self._count)]
+        return [bench.record(k, self._name) for k in self._scenarios]
