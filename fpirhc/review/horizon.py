@@ -25,7 +25,7 @@ from fpirhc.review.stages import stiff_advice
 from fpirhc.review.state_slopes import state_slopes
 from fpirhc.summary import in_percent
 from fpirhc.task.limits import Limits
-from fpirhc.task.problem import Problem, cycles_per_plan
+from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
 
 QUESTION = "Is the horizon long enough?"
 _SAME = 0.1  # relative change of the plan's feedback
@@ -83,7 +83,8 @@ def plan_gain(
     plant, believed, n = problem.plant, problem.plant.approximate, horizon.stages
     assert problem.cost is not None
     ends = [] if plant.outputs else [plant.state.elements.index(name) for name in horizon.terminal]
-    horizon = replace(horizon, margins={}, terminal=horizon.terminal if plant.outputs else ())
+    cycles, stage = (count(horizon, problem.period) for count in (cycles_per_plan, cycles_per_stage))
+    horizon = replace(horizon, margins={}, terminal=horizon.terminal if plant.outputs else (), share=cycles / stage)
     start = problem.start_state if plant.outputs else None
     ocp = transcribe(plant, problem.reference, horizon, problem.cost, Limits(), start=start)
     data = np.asarray(stage_data(plant, problem.reference, horizon, problem.cost)(0.0, believed).full())

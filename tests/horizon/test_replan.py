@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from chains import chain
 from plants import pendulum
 
 import fpirhc as fp
@@ -15,6 +16,7 @@ from fpirhc.controllers.contract import with_optimiser
 from fpirhc.controllers.receding_horizon import _optimal_control
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
+from fpirhc.review.horizon import plan_gain
 from fpirhc.task.problem import cycles_per_plan
 
 STAGES, STEP, PERIOD = 6, 0.08, 0.02
@@ -273,3 +275,20 @@ def test_a_run_has_its_cost_per_cycle_whatever_the_stages_are():
         expected = WEIGHTS["angle"] * (angle - q) ** 2 + WEIGHTS["angle'"] * (rate - v) ** 2
         expected += EFFORT * run["command"][:, 0] ** 2
         np.testing.assert_allclose(run["cost"].sum(axis=1) / PERIOD, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("replan", ["stage", 5])
+def test_the_feedback_that_a_review_judges_is_that_of_the_plans(replan):
+    """Changes of an input count from the last plan: the first command after moved states and inputs has the gains K and L."""
+    cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, rate={"u": 1e-3})
+    horizon = fp.Horizon(stages=20, step=0.02, replan=replan)
+    problem = replace(chain(2, 1.0), horizon=horizon, cost=cost)
+    size, small = 1e-3, replace(problem, duration=2e-3, measure_from=0.0)
+
+    def first(y=0.0, rate=0.0, before=0.0):
+        moved = replace(small, start={"y": y, "y'": rate}, input_before={"u": before})
+        return fp.simulate(moved, planning(), seed=0, compiled=False)["command"][0, 0]
+
+    still = first()
+    moved = [(first(**{name: size}) - still) / size for name in ("y", "rate", "before")]
+    np.testing.assert_allclose(plan_gain(problem, horizon)[0], moved, rtol=1e-4)
