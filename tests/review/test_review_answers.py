@@ -17,13 +17,13 @@ from fpirhc.contraction.gains import assess_gain
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.commands import commands_inside
-from fpirhc.review.convergence import box_converges, converges
+from fpirhc.review.convergence import _NEAR, _without, box_converges, converges
 from fpirhc.review.gain import gain_admissible, gain_of_target
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.recommended_gain import FAR, recommended_gain
-from fpirhc.review.slew import slew_enough
+from fpirhc.review.slew import effect, range_enough, slew_enough
 from fpirhc.review.wording import duration, per_cycle
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
@@ -74,14 +74,14 @@ def convergence(grid: ReviewGrid, ours: Loops, deformation: Any = None, doubts: 
 @pytest.mark.parametrize(
     ("logarithms", "verdict"),
     [
-        ((-1.01 * EDGE,), "yes"),
-        ((-0.99 * EDGE,), "unknown"),
-        ((0.99 * EDGE,), "unknown"),
-        ((1.01 * EDGE,), "no"),
-        ((-5 * EDGE, -0.99 * EDGE), "unknown"),
-        ((-5 * EDGE, -1.01 * EDGE), "yes"),
-        ((5 * EDGE, 0.99 * EDGE), "unknown"),
-        ((5 * EDGE, 1.01 * EDGE), "no"),
+        ((-1.001 * EDGE,), "yes"),
+        ((-0.999 * EDGE,), "unknown"),
+        ((0.999 * EDGE,), "unknown"),
+        ((1.001 * EDGE,), "no"),
+        ((-5 * EDGE, -0.999 * EDGE), "unknown"),
+        ((-5 * EDGE, -1.001 * EDGE), "yes"),
+        ((5 * EDGE, 0.999 * EDGE), "unknown"),
+        ((5 * EDGE, 1.001 * EDGE), "no"),
         ((-math.inf,), "yes"),
     ],
 )
@@ -93,6 +93,18 @@ def test_convergence_is_a_hundredfold_change_over_the_run(grid, logarithms, verd
     assert one.evidence.startswith(f"the slowest mode of the linear loop is multiplied by {max(radii):.6g} per cycle")
     assert one.numbers == {"radius": max(radii), "smallest_radius": min(radii)}
     assert bool(one.change) == (verdict != "yes")
+
+
+@pytest.mark.parametrize(("share", "left"), [(0.99, 0.5), (-0.99, 0.5), (1.01, None), (-1.01, None)])
+def test_a_decaying_mode_of_the_zero_dynamics_takes_the_pole_beside_it(share, left):
+    """A pole within the stated share of its distance from 1; a mode that grows takes none, nor does a pole that does not decay."""
+    rate = -2.0
+    exact = math.exp(rate * PERIOD)
+    pole = exact + share * _NEAR * (1 - exact)
+    both = linear(np.diag([pole, 0.5]), np.eye(2), np.eye(2), np.arange(2), PERIOD)
+    assert _without(both, np.array([rate])) == pytest.approx(pole if left is None else left)
+    assert _without(both, np.array([-rate])) == pytest.approx(max(pole, 0.5))
+    assert _without(loop(1.0), np.array([-1e-9])) == 1.0
 
 
 def test_poles_and_times_are_in_the_units_of_the_field():
@@ -302,6 +314,43 @@ def test_disturbances_ask_for_speed_as_well():
     assert two.evidence.endswith("; a jump of a disturbance takes the map 3 cycles")
     both = {"u": fp.Step(at=1.0, size=3.0), "q": fp.Step(at=1.0, size=2.0)}
     assert slew(mass(disturbances=both), 0.7).numbers["jump"] == pytest.approx(2.0)
+
+
+def test_a_jump_that_fits_into_one_step_takes_one_cycle():
+    one = slew(mass(disturbances={"u": fp.Step(at=1.0, size=-3.0)}), 2.0)
+    assert one.evidence.endswith("; a jump of a disturbance takes the map 1 cycle")
+
+
+def test_a_disturbance_of_a_state_acts_on_the_response_of_the_output():
+    """With y = a, a' = 3 b (1 + a), b' = u, one unit on b' is 3 (1 + a) = 4.5 on y'' at the start, where a = 0.5; on y none."""
+    plant = fp.Plant.of_states(
+        states={"a": "m", "b": "m"},
+        inputs={"u": "m/s"},
+        outputs={"y": fp.Output("m", lambda x, p: x.a)},
+        rates=lambda x, u, p: {"a": p.k * x.b * (1 + x.a), "b": u.u},
+        parameters={"k": fp.Parameter(3.0, 3.0, "1/s")},
+    )
+    problem = fp.Problem(
+        plant,
+        fp.Trajectory(lambda t: {"y": 0.5 + ca.sin(t)}),
+        start={"a": 0.5, "b": 0.2},
+        period=PERIOD,
+        duration=PERIOD * CYCLES,
+    )
+    own = review_grid(problem, 0.0, 0)
+    assert [effect(own, name) for name in ("b", "y", "u")] == pytest.approx([4.5, 0.0, 4.5])
+
+
+@pytest.mark.parametrize(("ratio", "verdict"), [(10.1, "yes"), (9.9, "unknown"), (1.01, "unknown"), (0.99, "no")])
+def test_a_constant_of_a_map_is_ten_times_the_largest_request(grid, ratio, verdict):
+    """Requests of 4.667 and responses of 4.5 at the same time are 6.48; a map without such a constant is not asked."""
+    largest = math.hypot(14 / 3, 4.5)
+    one = range_enough(grid, fp.RFPT(offset=-ratio * largest, sign=1, gain=1e-3), grid.problem.plant.approximate)
+    assert one is not None
+    assert one.verdict == verdict
+    assert one.numbers == {"ratio": pytest.approx(ratio, rel=1e-3)}
+    assert one.change == ("" if verdict == "yes" else "Use offset = 65 or more.")
+    assert range_enough(grid, fp.Affine(-0.5), grid.problem.plant.approximate) is None
 
 
 def test_a_start_off_the_reference_asks_for_speed():

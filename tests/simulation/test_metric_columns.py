@@ -186,9 +186,10 @@ def test_plans_that_return_are_counted_once():
 
 
 def test_plans_that_differ_by_one_everywhere_are_two():
-    """Cost, residuals, iterations and status of the second are each larger by one."""
-    solve = np.repeat(step(0.0, 1.0, 50)[:, None], 5, axis=1)
-    assert fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve))).solve["plans"] == 2
+    """Cost, residuals, iterations and status of one are each larger by one than those of the other, whichever is first."""
+    for first in (0, 1):
+        solve = np.repeat((first + np.arange(CYCLES))[:, None] % 2, 5, axis=1)
+        assert fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve))).solve["plans"] == 2
 
 
 def test_a_plan_that_is_not_finite_has_iterations_and_no_residual():
