@@ -1,6 +1,10 @@
-"""How much faster scenarios run in two processes: whole commands, from start to report.
+"""What a record of a scenario costs, and how much faster scenarios run in two processes: whole commands, from start to report.
 
-    python benchmarks/scenarios.py [--write]          --write puts the table into docs/performance.md
+    python benchmarks/scenarios.py [--write] [--records]     --write puts the tables into docs/performance.md
+                                                             --records measures records alone, in seconds
+
+A record is one run of one controller in one scenario, with its metrics: processor time, the smallest of many, bytes
+of memory are those of a thousand more records that are read from a file.
 
 Libraries are compiled before anything is timed. In every round the three ways take turns, so that whatever else the machine does
 falls on all: one process, two processes, and, for what the machine can give, the same work cut in halves by hand and run as two
@@ -10,19 +14,32 @@ machine with other work.
 
 from __future__ import annotations
 
+import json
 import resource
 import subprocess
 import sys
 import tempfile
 import time
+import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+import fpirhc as fp
+from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.ledger import Ledger
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table
 
 ROUNDS = 3
+RECORDS, SOME, MORE = (
+    25,
+    40,
+    80,
+)  # records that are timed; and how often they are read in the smaller and the larger file
 STUDIES = (("two_mass", ("CTC", "CTC+FPI (eq 6)"), 2000), ("van_der_pol", ("RHC", "RHC+FPI", "RHC exact model"), 600))
 
 
@@ -82,18 +99,56 @@ def study(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ...
     )
 
 
+def record(name: str, controller: str) -> tuple[str, ...]:
+    """One row: what a record costs."""
+    task = fp.load_problem(name)
+    bench = Bench(task, Conditions(seed=0, use=COMPARING, percent=10.0, compiled=True))
+    made, taken = [bench.record(0, controller)], []
+    for number in range(1, RECORDS):
+        begin = time.process_time()
+        made.append(bench.record(number, controller))
+        taken.append(time.process_time() - begin)
+    memory = [held([{**one, "scenario": k} for k, one in enumerate(made * times)]) for times in (SOME, MORE)]
+    lines = [len(json.dumps(one, separators=(",", ":"))) for one in made]
+    return (
+        f"{name}: {controller}, {task.problem.cycles} cycles",
+        f"{1e3 * min(taken):.1f}",
+        f"{(memory[1] - memory[0]) / (RECORDS * (MORE - SOME)):.0f}",
+        f"{np.mean(lines):.0f}",
+    )
+
+
+def held(records: list[dict[str, Any]]) -> int:
+    """Bytes of memory of records that are read from a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scenarios.jsonl"
+        with Ledger(path, {}) as ledger:
+            for one in records:
+                ledger.append(one)
+        tracemalloc.start()
+        with Ledger(path, {}) as ledger:
+            assert len(ledger.records) == len(records)
+            size, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    return size
+
+
 def main() -> None:
     """Measure and print."""
+    heads = ("a record", "ms", "bytes of memory", "bytes in the file")
+    write_table("records", heads, [record(name, one) for name, names, _ in STUDIES for one in names[:2]])
+    if "--records" in sys.argv:
+        return
     rows = []
     for name, controllers, count in STUDIES:
         with tempfile.TemporaryDirectory() as folder:
             measured(command(name, controllers, 1, 1, Path(folder)))  # compiles
         rows.append(study(name, controllers, count))
-    heads = (
+    heads_of_commands = (
         *("problem", "runs", "s, one process", "s, two processes", "times faster", "halves by hand: times faster"),
         *("CPU s, one process", "CPU s, two processes"),
     )
-    write_table("scenarios", heads, rows)
+    write_table("scenarios", heads_of_commands, rows)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ import random
 import signal
 import subprocess
 import sys
+import time
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,7 @@ from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import median_interval, middle, summarise, verdict
 from fpirhc.studies.scenarios.processes import DEATHS, Workers
+from fpirhc.studies.scenarios.records import Records
 
 LINE = line_text(
     "period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}", bounds="(0.5, 2.4)", more=EXACT
@@ -256,6 +259,95 @@ def test_a_torn_line_is_cut_off_wherever_it_is_torn(tmp_path):
             for k in range(complete, 3):
                 ledger.append({"k": k})
         assert path.read_bytes() == whole
+
+
+def test_records_reach_the_disk_in_groups(tmp_path, monkeypatch):
+    """Other processes read a record at once; the disk is waited for after 100 records, after a second, and at the end."""
+    forced, now = [], [0.0]
+    monkeypatch.setattr(os, "fsync", lambda _: forced.append(now[0]))
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    path = tmp_path / "l.jsonl"
+    with Ledger(path, {}) as ledger:
+        forced.clear()
+        for k in range(250):
+            ledger.append({"k": k})
+            assert path.read_bytes().count(b"\n") == k + 2
+        assert len(forced) == 2
+        now[0] = 1.5
+        ledger.append({"k": 250})
+        ledger.append({"k": 251})
+        assert forced == [0.0, 0.0, 1.5]
+    assert len(forced) == 4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_records_in_columns_are_what_they_were(seed):
+    """Every value with its type and place, whatever forms follow each other; parts of all, and equality as of lists."""
+    random_ = random.Random(seed)
+    pool: list[Any] = [
+        None,
+        True,
+        0,
+        -1,
+        127,
+        128,
+        -(2**31),
+        2**40,
+        2**70,
+        0.1,
+        -0.0,
+        1e300,
+        "",
+        "a",
+        "µ\0x",
+        [1, "b"],
+        {},
+    ]
+
+    def value(depth: int) -> Any:
+        if depth and random_.random() < 0.3:
+            return {f"k{k}": value(depth - 1) for k in range(random_.randrange(4))}
+        return random_.choice([*pool, f"text {random_.random()}", random_.random()])
+
+    wanted = [{f"n{k}": value(2) for k in range(random_.randrange(1, 6))} for _ in range(3000)]
+    records = Records()
+    for one in wanted:
+        records.append(one)
+    assert repr(records) == repr(wanted)
+    assert records == wanted
+    assert records[5:50:7] == wanted[5:50:7]
+    assert records.at([7, 3]) == [wanted[7], wanted[3]]
+    assert (records[-1], len(records), records != wanted[1:]) == (wanted[-1], 3000, True)
+
+
+def test_a_record_takes_two_hundred_bytes(tmp_path):
+    """Read from a file, with the twenty-five numbers and texts that two masses have."""
+    numbers, header = random.Random(0), {"of": "this"}
+    metrics = {
+        name: dict.fromkeys(("q1", "q2"), 0.0) for name in ("rms", "max", "iae", "settling", "effort", "variation")
+    }
+    with Ledger(tmp_path / "l.jsonl", header) as ledger:
+        for k in range(5000):
+            own = {name: {e: numbers.random() for e in both} for name, both in metrics.items()}
+            own |= {"cycles": {"": 10000}, "at_limit": {"": 0.0}, "status": {"OK": 10000, "HELD": 0, "INFEASIBLE": 0}}
+            one = {
+                "scenario": k,
+                "name": f"{k}",
+                "group": "",
+                "controller": "RHC",
+                "mismatch": 0.3,
+                "outcome": "finished",
+            }
+            ledger.append({**one, "error": numbers.random(), "metrics": own, "lasted": 1.0, "stop": None})
+    tracemalloc.start()
+    try:
+        with Ledger(tmp_path / "l.jsonl", header) as ledger:
+            assert len(ledger.records) == 5000
+            taken, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert (taken - 1000 * 200) / 5000 < 200  # a thousand texts are remembered, however many records there are
+    assert most < 10 * 2**20
 
 
 def test_other_results_damage_and_other_users_are_refused(tmp_path):

@@ -2,8 +2,9 @@
 
 Every line is one JSON object. The first line is a header with the conditions of the results; a file with another header is refused.
 The last entry of a line is its checksum, 'sum', so that a damaged digit is noticed; a file of an older version has none at all.
-Every line is on the disk before `append` returns. A last line that is torn was never acknowledged: it is cut off, and its
-result is computed again. Only one process may have the file open.
+Every line is with the system before `append` returns, so a killed process loses none. It is on the disk a second or 100 records
+later: what a machine loses that goes down is computed again. A last line that is torn is cut off. Only one process may have the
+file open.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import contextlib
 import json
 import os
 import sys
+import time
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,8 +21,11 @@ from typing import IO, Any, Self
 
 from fpirhc.errors import InvalidField, OutputError
 from fpirhc.fields.checked import Checked, field_names
+from fpirhc.studies.scenarios.records import Records
 
 _SUM = "sum"  # entry with the checksum of a line
+_BLOCK = 2**20  # bytes that are read at once
+_GROUP, _WAIT = 100, 1.0  # records and seconds after which what was written is forced to the disk
 
 
 class Ledger:
@@ -37,6 +42,7 @@ class Ledger:
 
     def __init__(self, path: Path, header: Mapping[str, Any], record: type[Checked] | None = None) -> None:
         self._path, self._record = path, record
+        self._waiting, self._forced = 0, time.monotonic()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open(
@@ -52,17 +58,24 @@ class Ledger:
             raise
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Write one record and wait until it is on the disk.
+        """Write one record; every so often, wait until all are on the disk.
 
         Raises:
             OutputError: the file cannot be written.
         """
         self._write(record)
-        self.records.append(dict(record))
+        self.records.append(record)
 
     def close(self) -> None:
-        """Close the file; another process may open it then."""
-        self._file.close()
+        """Force all to the disk and close the file; another process may open it then.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        try:
+            self._force()
+        finally:
+            self._file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -76,27 +89,34 @@ class Ledger:
             written = self._file.write(line)
             while written < len(line):
                 written += self._file.write(line[written:])
-            os.fsync(self._file.fileno())
         except OSError as error:
-            raise OutputError(
-                f"cannot write to '{self._path}': {error.strerror}; finished results are kept, and the same command "
-                "continues from them"
-            ) from None
+            raise self._full(error) from None
+        self._waiting += 1
+        if self._waiting >= _GROUP or time.monotonic() - self._forced >= _WAIT:
+            self._force()
 
-    def _read(self, header: dict[str, Any]) -> list[dict[str, Any]]:
-        self._file.seek(0)
-        content = self._file.read()
-        whole = content[: content.rfind(b"\n") + 1]
-        lines = list(self._parsed(whole))
-        if len(whole) != len(content):
-            self._file.truncate(len(whole))
-        if not lines:
-            self._write(header)
-            _sync_folder(self._path.parent)
-            return []
-        summed = _SUM in lines[0]
-        for number, line in enumerate(lines, 1):
-            if number > 1:
+    def _force(self) -> None:
+        """Wait until everything that was written is on the disk."""
+        try:
+            if self._waiting:
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            raise self._full(error) from None
+        self._waiting, self._forced = 0, time.monotonic()
+
+    def _full(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"cannot write to '{self._path}': {error.strerror}; finished results are kept, and the same command continues from them"
+        )
+
+    def _read(self, header: dict[str, Any]) -> Records:
+        """The records, one line after the other; a torn last line is cut off."""
+        records, whole, summed = Records(), 0, True
+        for number, text in enumerate(self._whole_lines(), 1):
+            line = self._parsed(number, text)
+            if number == 1:
+                summed = _SUM in line
+            else:
                 self._check(number, line)
             if summed and line.pop(_SUM, "") != _sum(line):
                 what = (
@@ -105,9 +125,25 @@ class Ledger:
                     else "remove the file to begin again"
                 )
                 raise OutputError(f"'{self._path}', line {number} is damaged: its checksum does not fit; {what}")
-        if lines[0] != header:
-            raise OutputError(_refusal(self._path, lines[0], header))
-        return lines[1:]
+            if number == 1 and line != header:
+                raise OutputError(_refusal(self._path, line, header))
+            if number > 1:
+                records.append(line)
+            whole += len(text)
+        if whole != self._file.seek(0, os.SEEK_END):
+            self._file.truncate(whole)
+        if not whole:
+            self._write(header)
+            self._force()
+            _sync_folder(self._path.parent)
+        return records
+
+    def _whole_lines(self) -> Iterator[bytes]:
+        self._file.seek(0)
+        begun = b""
+        while block := self._file.read(_BLOCK):
+            *lines, begun = (begun + block).split(b"\n")
+            yield from (line + b"\n" for line in lines)
 
     def _check(self, number: int, line: Mapping[str, Any]) -> None:
         """Refuse a record that lacks a field, or has one of a wrong type; other fields may stand beside them."""
@@ -121,15 +157,14 @@ class Ledger:
                 f"'{self._path}', line {number} is damaged: {error.text}; remove the line, and its result is computed again"
             ) from None
 
-    def _parsed(self, content: bytes) -> Iterator[dict[str, Any]]:
-        for number, line in enumerate(content.splitlines(), 1):
-            try:
-                value = json.loads(line)
-            except ValueError:
-                value = None
-            if not isinstance(value, dict):
-                raise OutputError(f"'{self._path}', line {number} is damaged; remove the file to begin again")
-            yield value
+    def _parsed(self, number: int, text: bytes) -> dict[str, Any]:
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = None
+        if not isinstance(value, dict):
+            raise OutputError(f"'{self._path}', line {number} is damaged; remove the file to begin again")
+        return value
 
 
 def _text(value: Mapping[str, Any]) -> str:

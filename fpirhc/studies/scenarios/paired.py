@@ -125,19 +125,16 @@ def _over(
     records: Sequence[Record], metrics: Sequence[Metric], one_of: Callable[[np.ndarray, bool], float]
 ) -> dict[str, dict[str, float]]:
     """One of all scenarios' numbers, for every number that some scenario has; `one_of` is given whether larger ones are better."""
-    numbers_of: dict[str, dict[str, float]] = {}
-    for metric in metrics:
-        by_element = [r["metrics"].get(metric.name, {}) for r in records]
-        larger = metric.better == "larger"
-        missing = -np.inf if larger else np.inf
-        for element in dict.fromkeys(e for numbers in by_element for e in numbers):
-            values = _numbers([numbers.get(element) for numbers in by_element], missing)
-            numbers_of.setdefault(metric.name, {})[element] = one_of(values, larger)
-    return numbers_of
-
-
-def _numbers(values: Sequence[float | None], missing: float = np.inf) -> np.ndarray:
-    return np.array([missing if v is None else v for v in values], dtype=float)
+    larger = {m.name: m.better == "larger" for m in metrics}
+    columns: dict[str, dict[str, np.ndarray]] = {name: {} for name in larger}
+    for k, record in enumerate(records):  # once, because a record is made of columns anew
+        for name, numbers in record["metrics"].items():
+            for element, value in numbers.items() if name in columns else ():
+                if element not in columns[name]:
+                    columns[name][element] = np.full(len(records), -np.inf if larger[name] else np.inf)
+                if value is not None:
+                    columns[name][element][k] = value
+    return {name: {e: one_of(v, larger[name]) for e, v in one.items()} for name, one in columns.items() if one}
 
 
 def _differences(after: np.ndarray, before: np.ndarray) -> np.ndarray:

@@ -9,6 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import checked_call
@@ -125,9 +127,12 @@ def _completed(
     progress: Progress | None,
 ) -> tuple[dict[str, Sequence[Record]], dict[str, str]]:
     """Run the jobs that the ledger lacks; return all records by controller in order, and the skipped with reasons."""
-    records = {(r["scenario"], r["controller"]): r for r in ledger.records}
-    jobs = [(k, name) for k in numbers for name in names if (k, name) not in records]
-    done = {name: sum((k, name) in records for k in numbers) for name in names}
+    records, places = ledger.records, {name: np.full(max(numbers) + 1, -1, dtype=np.int32) for name in names}
+    for place, record in enumerate(records):
+        if record["controller"] in places and record["scenario"] <= max(numbers):
+            places[record["controller"]][record["scenario"]] = place
+    jobs = [(k, name) for k in numbers for name in names if places[name][k] < 0]
+    done = {name: int((places[name][list(numbers)] >= 0).sum()) for name in names}
     skipped: dict[str, str] = {}
     # Closed whatever happens: the workers end with it.
     with closing(_answers(bench, workers, jobs)) as answers:
@@ -137,11 +142,11 @@ def _completed(
                 skipped[name] = record["skipped"]
             else:
                 ledger.append(record)
-                records[record["scenario"], name] = record
+                places[name][record["scenario"]] = len(records) - 1
             done[name] += 1
             if progress:
                 progress(name, done[name], len(numbers))
-    return {n: [records[k, n] for k in numbers] for n in names if n not in skipped}, skipped
+    return {n: records.at(places[n][list(numbers)].tolist()) for n in names if n not in skipped}, skipped
 
 
 def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, str]]) -> Generator[dict[str, Any]]:
