@@ -6,8 +6,10 @@ so that a user sees them together.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from typing import Any
 
 
 class FpirhcError(Exception):
@@ -77,6 +79,20 @@ class NotContractive(FpirhcError, ValueError):
 
 class NotSupported(FpirhcError, ValueError):
     """A valid setting that this member of a family cannot serve; the message names a member that can."""
+
+
+def package(name: str, extra: str, what: str = "this") -> Any:
+    """Import a package of an extra.
+
+    Raises:
+        NotSupported: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as missing:
+        raise NotSupported(
+            f"{what} needs {missing.name}, which is not installed: pip install 'fpirhc[{extra}]'"
+        ) from None
 
 
 class ConcurrentUse(FpirhcError, RuntimeError):

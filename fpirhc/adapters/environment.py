@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import package
-from fpirhc.errors import NotSupported
+from fpirhc.errors import NotSupported, package
 from fpirhc.simulation.held_input import HELD_INPUT, HeldInput
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
@@ -40,7 +39,7 @@ def as_env(problem: Problem, *, reward: Reward | None = None, setpoints: Setpoin
     Raises:
         NotSupported: Gymnasium is not installed, or the plant is an object outside.
     """
-    gymnasium = package("gymnasium")
+    gymnasium = package("gymnasium", "outside")
     if problem.foreign is not None:
         raise NotSupported("as_env: the plant is an object outside; make the environment from that object itself")
     play = _Play(problem, reward or _squared_error, setpoints)

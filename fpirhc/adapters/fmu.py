@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import counterparts, package
-from fpirhc.errors import InvalidProblem, Mistakes
+from fpirhc.adapters.names import counterparts
+from fpirhc.errors import InvalidProblem, Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
@@ -42,7 +42,7 @@ def fmu_body(
         NotSupported: FMPy is not installed.
         InvalidProblem: a name that the FMU or the model does not have, or an FMU without co-simulation.
     """
-    fmpy = package("fmpy")
+    fmpy = package("fmpy", "outside")
     described = fmpy.read_model_description(str(path))
     if described.coSimulation is None:
         raise InvalidProblem(

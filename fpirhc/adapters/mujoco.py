@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import base_and_order, counterparts, package, steps_per_cycle
-from fpirhc.errors import Mistakes
+from fpirhc.adapters.names import base_and_order, counterparts, steps_per_cycle
+from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
@@ -42,7 +42,7 @@ def mujoco_body(
         NotSupported: MuJoCo is not installed.
         InvalidProblem: a name that the body or the model does not have, or a period that is no whole number of time steps.
     """
-    mujoco = package("mujoco")
+    mujoco = package("mujoco", "outside")
     body = (
         mujoco.MjModel.from_xml_string(mjcf)
         if str(mjcf).lstrip().startswith("<")

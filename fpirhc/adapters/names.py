@@ -1,26 +1,10 @@
-"""What the adapters share: a package that may be missing, and the names of one world in the other."""
+"""What the adapters share: the names of one world in the other."""
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable, Mapping
-from typing import Any
 
-from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
-
-
-def package(name: str) -> Any:
-    """Import a package of the extra.
-
-    Raises:
-        NotSupported: it is not installed.
-    """
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as missing:
-        raise NotSupported(
-            f"this needs {missing.name}, which is not installed: pip install 'fpirhc[outside]'"
-        ) from None
+from fpirhc.errors import InvalidProblem, Mistakes
 
 
 def counterparts(

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import package
 from fpirhc.adapters.real_time import RealTime
-from fpirhc.errors import InvalidProblem, Mistakes
+from fpirhc.errors import InvalidProblem, Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
@@ -48,7 +47,7 @@ def opcua_body(
         NotSupported: asyncua is not installed.
         InvalidProblem: a quantity that the model does not have, or an input without node.
     """
-    package("asyncua")
+    package("asyncua", "outside")
     units, mistakes = quantities(model), Mistakes("opcua_body")
     mistakes.unknown("measures: quantity", measures, units)
     mistakes.unknown("inputs: input", inputs, model.inputs)
@@ -89,7 +88,7 @@ class _Body:
         del seed
         if self._client is not None:
             self._client.disconnect()
-        sync = package("asyncua.sync")
+        sync = package("asyncua.sync", "outside")
         loop = sync.ThreadLoop()
         loop.daemon = True  # a session that nobody ends must not keep the process alive
         loop.start()

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import package
 from fpirhc.adapters.real_time import RealTime
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
@@ -36,7 +35,7 @@ def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) ->
         NotSupported: tclab is not installed.
         InvalidProblem: the model has other names.
     """
-    tclab, mistakes = package("tclab"), Mistakes("tclab_body")
+    tclab, mistakes = package("tclab", "outside"), Mistakes("tclab_body")
     mistakes.unknown("measured", model.output.elements, _SENSORS)
     mistakes.unknown("input", model.inputs, _HEATERS)
     mistakes.raise_if_any()

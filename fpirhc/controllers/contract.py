@@ -353,10 +353,7 @@ def with_optimiser(controller: Controller, optimiser: Optimiser) -> Controller:
     Raises:
         NotSupported: it has no optimiser that can be replaced.
     """
-    changed = with_setting(controller, "optimiser", optimiser)
-    if changed is None:
-        raise NotSupported(f"{type(innermost(controller)).__name__} has no optimiser that can be replaced")
-    return changed
+    return _replaceable(controller, "optimiser", optimiser, "optimiser that can be replaced")
 
 
 def with_margins(controller: Controller, margins: Mapping[str, Sequence[float]]) -> Controller:
@@ -365,9 +362,13 @@ def with_margins(controller: Controller, margins: Mapping[str, Sequence[float]])
     Raises:
         NotSupported: it does not plan over the problem's horizon.
     """
-    changed = with_setting(controller, "margins", margins)
+    return _replaceable(controller, "margins", margins, "plan that could keep margins")
+
+
+def _replaceable(controller: Controller, name: str, value: object, what: str) -> Controller:
+    changed = with_setting(controller, name, value)
     if changed is None:
-        raise NotSupported(f"{type(innermost(controller)).__name__} has no plan that could keep margins")
+        raise NotSupported(f"{type(innermost(controller)).__name__} has no {what}")
     return changed
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 from fpirhc.controllers.mirror_path import NONE
@@ -26,15 +27,7 @@ def check_outputs(problem: Problem, controller: _Controller) -> None:
     Raises:
         NotSupported: with the reason.
     """
-    _check_order_zero(problem)
-    plant, mirror = problem.plant, nominal(controller.deformation).mirror
-    late = 0.0 if mirror is None else mirror.measurement
-    if plant.outputs and (late % 1 > NONE or (plant.step and late)):
-        raise NotSupported(
-            f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
-            f"({', '.join(plant.chains)}): its twin moves from the state that is given with the samples, and these are late by "
-            f"{late:g} cycles; believe in whole cycles, and for a map in none"
-        )
+    _refuse(_of_outputs(problem, controller))
 
 
 def check_form(problem: Problem, controller: _Controller) -> None:
@@ -44,44 +37,59 @@ def check_form(problem: Problem, controller: _Controller) -> None:
         NotSupported: the number of dead times or lags differs from the plant's number of channels; a wrapper changes what a
             model-referenced form inside it compares.
     """
-    deformation, plant = nominal(controller.deformation), problem.plant
-    channels, controlled = deformation.iteration.channels, len(plant.controlled_names)
-    if channels is not None and channels != controlled:
-        raise NotSupported(
-            f"{type(deformation).__name__}: {channels} dead times are given, but the plant has {controlled} controlled coordinates "
-            f"({', '.join(plant.controlled_names)}); give one for each, or one number for all"
+    _refuse(_of_form(problem, nominal(controller.deformation)))
+
+
+def _refuse(reasons: Iterator[str]) -> None:
+    for reason in reasons:
+        raise NotSupported(reason)
+
+
+def _of_outputs(problem: Problem, controller: _Controller) -> Iterator[str]:
+    """Reasons against outputs; those of order 0 have a response that is measured."""
+    plant, mirror = problem.plant, nominal(controller.deformation).mirror
+    instant = [name for name, order in plant.response_orders.items() if not order]
+    if instant and not problem.sensing.estimator.measures_all:
+        yield (
+            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
+            "need none; leave the estimator out: Sensing(sensors=...)"
         )
-    outer, mirror = form_inside(deformation), deformation.mirror
-    if outer is not None:
+    late = 0.0 if mirror is None else mirror.measurement
+    if plant.outputs and (late % 1 > NONE or (plant.step and late)):
+        yield (
+            f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
+            f"({', '.join(plant.chains)}): its twin moves from the state that is given with the samples, and these are late by "
+            f"{late:g} cycles; believe in whole cycles, and for a map in none"
+        )
+
+
+def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
+    """Reasons against the form, the first one first."""
+    plant, channels, mirror = problem.plant, deformation.iteration.channels, deformation.mirror
+    if channels not in (None, len(plant.controlled_names)):
+        yield (
+            f"{type(deformation).__name__}: {channels} dead times are given, but the plant has {len(plant.controlled_names)} "
+            f"controlled coordinates ({', '.join(plant.controlled_names)}); give one for each, or one number for all"
+        )
+    if (outer := form_inside(deformation)) is not None:
         name = type(outer).__name__
-        raise NotSupported(
+        yield (
             f"{name} around a model-referenced form changes what the form compares, the model's response with the measured one; "
             f"put it inside: ModelReferenced({name}(map, ...))"
         )
     if mirror is None:
         return
-    for name, values in (("cycles", every(mirror.cycles)), ("lag", every(mirror.lag))):
+    for field, values in (("cycles", every(mirror.cycles)), ("lag", every(mirror.lag))):
         if len(values) not in (1, len(plant.inputs)):
-            raise NotSupported(
-                f"ModelReferenced({name}={values!r}): the plant has {len(plant.inputs)} inputs ({', '.join(plant.inputs)}); give "
+            yield (
+                f"ModelReferenced({field}={values!r}): the plant has {len(plant.inputs)} inputs ({', '.join(plant.inputs)}); give "
                 "one number for each, or one for all"
             )
-    if plant.step is not None and (
-        any(every(mirror.lag)) or any(c % 1 for c in every(mirror.cycles)) or mirror.measurement % 1
-    ):
-        raise NotSupported(
+    parts = any(c % 1 for c in (*every(mirror.cycles), mirror.measurement))
+    if plant.step is not None and (any(every(mirror.lag)) or parts):
+        yield (
             f"{type(deformation).__name__}: a map has no lag, and no dead time of parts of a cycle; write an actuator as a state "
             "of the map, and dead times in whole cycles"
-        )
-
-
-def _check_order_zero(problem: Problem) -> None:
-    """Raise for outputs of order 0 beside an estimator: their response is measured."""
-    instant = [name for name, order in problem.plant.response_orders.items() if not order]
-    if instant and not problem.sensing.estimator.measures_all:
-        raise NotSupported(
-            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
-            "need none; leave the estimator out: Sensing(sensors=...)"
         )
 
 

@@ -17,7 +17,7 @@ from typing import cast
 import numpy as np
 
 from fpirhc.controllers.contract import Controller, checked, resolved
-from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.given import described
 from fpirhc.fields.kinds import real_number
@@ -25,7 +25,7 @@ from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
-from fpirhc.symbolic.live import PREFIX, copied, live_number
+from fpirhc.symbolic.live import PREFIX, copied, live_number, not_live
 from fpirhc.symbolic.paths import changed_at, content_at, names_in, opened, paths_to
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -110,9 +110,9 @@ class LiveSettings:
         """Raise for a number that no block reads, unless the loop is the same one for others: then checks or tables read it."""
         elsewhere = self._in_problem(path) and path.partition(".")[0] not in _IN_TABLES
         if elsewhere or not all(self._same_with(path, share, composite, compose) for share in _NUDGES):
-            raise NotSupported(
-                f"setting '{path}' cannot be live: the loop of {type(self.controller).__name__} does not use it, or uses only "
-                "numbers that are computed from it while the loop is built"
+            loop = f"the loop of {type(self.controller).__name__}"
+            raise not_live(
+                [path], f"{loop} does not use it, or uses only numbers that are computed from it while it is built"
             )
 
     def _same_with(
@@ -138,9 +138,8 @@ class LiveSettings:
         lost = [path for path in self.start if f"{PREFIX}{path}" in str(error)]
         if lost:
             what = "a part of the loop that is built by itself needs its number"
-            return NotSupported(f"setting '{lost[0]}' cannot be live here: {what}")
-        names = ", ".join(f"'{path}'" for path in self.start)
-        return NotSupported(f"settings {names} cannot be live together: the loop cannot be built with them ({error})")
+            return not_live(lost[:1], what, " here")
+        return not_live(self.start, f"the loop cannot be built with them ({error})", " together")
 
     def held(self, blocks: Sequence[Block]) -> list[Delay]:
         """Return the settings and derived numbers that some blocks read, as constants of a memory."""
@@ -273,10 +272,8 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
             raise InvalidValue(f"setting '{path}' is {content!r}: there is no limit that could change")
         return ends
     if isinstance(content, bool) or (isinstance(content, int | float) and _is_structure(owner, path)):
-        raise NotSupported(
-            f"setting '{path}' is {content!r} and cannot be live: a whole number or a switch, or what stands for one, decides what "
-            "the loop is made of; build one loop for each"
-        )
+        what = f"{content!r} is a whole number or a switch, or stands for one, and decides what the loop is made of"
+        raise not_live([path], f"{what}; build one loop for each")
     if not isinstance(content, int | float | np.number):
         ways = ", ".join(names_in(content)) or "none"
         hint = "give it a number first" if content is None else f"go on with one of: {ways}"
@@ -339,10 +336,7 @@ def _refuse_lost(composite: Composite, paths: Sequence[str]) -> None:
     """
     for block in composite.blocks:
         if holds_nan(block.function):
-            names = ", ".join(map(repr, paths))
-            raise NotSupported(
-                f"settings {names} cannot be live together: block '{block.name}' turns one of them into a number, which is NaN"
-            )
+            raise not_live(paths, f"block '{block.name}' turns one of them into a number, which is NaN", " together")
 
 
 def _differences(before: object, after: object, path: str = "") -> Iterator[str]:

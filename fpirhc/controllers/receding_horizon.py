@@ -52,7 +52,7 @@ from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.functions import nan_where, numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, live_numbers, nominal, settled
+from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, live_numbers, nominal, not_live, settled
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
 
@@ -241,10 +241,8 @@ def _check_reference(problem: Problem) -> None:
     assert problem.horizon is not None
     moving = live_numbers(problem.reference)
     if moving and not problem.reference.rests(float(problem.horizon.nodes[-1])):
-        raise NotSupported(
-            f"setting '{next(iter(moving))}' cannot be live with a plan: the reference moves within the first horizon, from which "
-            "the optimiser's scale and the first plan are taken; let it rest there"
-        )
+        why = "the reference moves within the first horizon, from which the optimiser's scale and the first plan are taken"
+        raise not_live([next(iter(moving))], f"{why}; let it rest there", " with a plan")
 
 
 def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.Function:

@@ -12,7 +12,6 @@ from typing import NoReturn
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward
@@ -20,7 +19,7 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX
+from fpirhc.symbolic.live import DERIVED, PREFIX, not_live
 from fpirhc.task.reference import Reference
 
 SCALE, STEEPEST = "input_scale", "steepest"
@@ -202,11 +201,9 @@ class Withheld:
 
     def refuse(self, *_: object) -> NoReturn:
         """Raise NotSupported with the names of the settings."""
-        names = ", ".join(f"'{path}'" for path in self._paths if not path.startswith(DERIVED))
-        raise NotSupported(
-            f"setting {names} cannot be live with this optimiser: its code keeps numbers that follow from it; use FixedPoint() "
-            "without limits of states, or leave it out of live=[...]"
-        )
+        own = [path for path in self._paths if not path.startswith(DERIVED)]
+        why = "its code keeps numbers that follow; use FixedPoint() without limits of states, or leave it out of live=[...]"
+        raise not_live(own, why, " with this optimiser")
 
     __getitem__ = __iter__ = __len__ = __array__ = __float__ = __bool__ = refuse
     __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = __rtruediv__ = __neg__ = __pow__ = (

@@ -16,12 +16,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
-from typing import Literal, cast
+from typing import ClassVar, Literal, cast
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
@@ -40,6 +40,9 @@ _SHRINKING = 0.9  # a violation counts as shrinking below this share of the last
 
 class Optimiser(Checked, ABC):
     """Contract: one improvement of a warm-started plan as a Function, with a fixed amount of work where possible."""
+
+    cannot_keep: ClassVar[tuple[str, ...]] = ()
+    """Limits that it cannot keep: of "inputs", of "states", those of states with "prices"."""
 
     @property
     def exportable(self) -> bool:
@@ -74,6 +77,12 @@ class Optimiser(Checked, ABC):
         Raises:
             NotSupported: the problem has something that this optimiser cannot keep.
         """
+        priced = [e for e, hard in zip(ocp.state.elements, ocp.hard, strict=True) if not hard]
+        inputs = np.isfinite(ocp.input_lower).any() or np.isfinite(ocp.input_upper).any()
+        limited = {"inputs": inputs or ocp.bounds_states, "states": ocp.bounds_states, "prices": priced}
+        for limit in self.cannot_keep:
+            if limited[limit]:
+                raise NotSupported(f"{type(self).__name__} {_REMEDIES[limit].format(', '.join(priced))}")
 
     @abstractmethod
     def memory(self, ocp: OptimalControl) -> Layout:
@@ -113,6 +122,14 @@ class Optimiser(Checked, ABC):
             data: of the first horizon, shape (ntheta, N + 1).
         """
         return self.memory(ocp).start()
+
+
+_REMEDIES = {
+    "inputs": "serves problems without limits only (it is a baseline); for limits use FixedPoint()",
+    "states": "keeps input limits only; for state limits use FixedPoint(), Ipopt(), Fatrop() or SequentialQuadratic(), or remove "
+    "them from Problem(limits=...)",
+    "prices": "keeps limits or weighs them (soft), but takes no prices ({}); use FixedPoint()",
+}
 
 
 def built(optimiser: Optimiser, ocp: OptimalControl, form: Literal["step", "converging"]) -> ca.Function:

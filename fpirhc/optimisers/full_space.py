@@ -15,7 +15,7 @@ import numpy as np
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_own_requests
-from fpirhc.errors import NotContractive, NotSupported
+from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
@@ -44,6 +44,8 @@ class FullSpaceFixedPoint(Optimiser):
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
+    cannot_keep = ("inputs",)
+
     iterations: Count
     tolerance: float
     map: Deformation | None = None
@@ -60,10 +62,7 @@ class FullSpaceFixedPoint(Optimiser):
             NotSupported: some input or state has limits.
             NotContractive: a gain outside (0, 2 / sigma_max(H)^2).
         """
-        if ocp.bounds_states or np.isfinite(ocp.input_lower).any() or np.isfinite(ocp.input_upper).any():
-            raise NotSupported(
-                "FullSpaceFixedPoint serves problems without limits only (it is a baseline); for limits use FixedPoint()"
-            )
+        super().check(ocp)
         if self.map is not None:
             require_own_requests("FullSpaceFixedPoint", self.map)
             largest = 2 / _scaling(ocp, self.scaled)[1] ** 2

@@ -20,7 +20,7 @@ import casadi as ca
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_own_requests
-from fpirhc.errors import NotContractive, NotSupported
+from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.problem import OptimalControl, steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
@@ -47,6 +47,8 @@ class GradientFixedPoint(Optimiser):
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
+    cannot_keep = ("states",)
+
     iterations: Count
     tolerance: float
     map: Deformation | None = None
@@ -62,8 +64,7 @@ class GradientFixedPoint(Optimiser):
             NotSupported: projection keeps bounds of inputs only.
             NotContractive: a gain outside (0, 2 / L).
         """
-        if ocp.bounds_states:
-            raise NotSupported("GradientFixedPoint keeps input limits only; for state limits use FixedPoint()")
+        super().check(ocp)
         largest = 2 / _steepest(ocp)
         map_in_use = self._map(ocp)
         require_own_requests("GradientFixedPoint", map_in_use)

@@ -18,7 +18,7 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Count, Positive
 from fpirhc.horizon.problem import OptimalControl
@@ -45,6 +45,8 @@ class MultipleShooting(Optimiser):
         InvalidValue: a tolerance that is not positive.
     """
 
+    cannot_keep = ("prices",)
+
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
@@ -64,18 +66,6 @@ class MultipleShooting(Optimiser):
     def exportable(self) -> bool:
         """Solver libraries are called, not written out."""
         return False
-
-    def check(self, ocp: OptimalControl) -> None:
-        """Raise if limits have a price.
-
-        Raises:
-            NotSupported: they would be kept as hard ones.
-        """
-        if not ocp.hard.all():
-            names = ", ".join(e for e, hard in zip(ocp.state.elements, ocp.hard, strict=True) if not hard)
-            raise NotSupported(
-                f"{type(self).__name__} keeps limits or weighs them (soft), but takes no prices ({names}); use FixedPoint()"
-            )
 
     def memory(self, ocp: OptimalControl) -> Layout:
         """The plan, and the multipliers of variables and constraints."""

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.errors import NotSupported
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
@@ -45,23 +44,13 @@ class ReducedGradient(Optimiser):
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
+    cannot_keep = ("states",)
+
     iterations: Count
     tolerance: float
 
     def __post_init__(self) -> None:
         require_settings("ReducedGradient", self.iterations, self.tolerance)
-
-    def check(self, ocp: OptimalControl) -> None:
-        """Raise if states are bounded.
-
-        Raises:
-            NotSupported: projection keeps bounds of inputs only.
-        """
-        if ocp.bounds_states:
-            raise NotSupported(
-                "ReducedGradient keeps input limits only; for state limits use FixedPoint(), Ipopt(), Fatrop() or "
-                "SequentialQuadratic(), or remove them from Problem(limits=...)"
-            )
 
     def memory(self, ocp: OptimalControl) -> Layout:
         """The plan and the spectral step length."""

@@ -237,7 +237,7 @@ class Sensing(Checked):
         sensor = self.sensors.get(name)
         if sensor is None or sensor.quantum is None:
             return value
-        quantum = float(sensor.quantum)  # not live: a division by a symbol rounds otherwise than one by a number
+        quantum = float(sensor.quantum)  # not live: CasADi folds products with numbers, and symbols round otherwise
         return quantum * ca.floor(value / quantum + 0.5)
 
     def _columns(self) -> tuple[str, ...]:

@@ -150,11 +150,16 @@ class LiveNumber(SymbolicNumber):
         self._refuse("its number in a text")
 
     def _refuse(self, what: str) -> NoReturn:
-        names = " and ".join(f"'{path}'" for path in self.paths)
-        raise NotSupported(f"setting {names} cannot be live here: {what} is needed while the loop is built")
+        raise not_live(self.paths, f"{what} is needed while the loop is built", " here")
 
 
 Number = float | LiveNumber  # a field that may be live
+
+
+def not_live(paths: Iterable[str], why: str, where: str = "") -> NotSupported:
+    """Return the error of settings that cannot be live, with the reason; `where` says in which case they cannot, after a space."""
+    names = [f"'{path}'" for path in paths]
+    return NotSupported(f"setting{'s' if len(names) > 1 else ''} {', '.join(names)} cannot be live{where}: {why}")
 
 
 def live_number(path: str, value: float) -> LiveNumber:

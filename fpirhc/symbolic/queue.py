@@ -13,11 +13,10 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.errors import NotSupported
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.functions import ceil, entry_at
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.live import expressed, is_live, live_numbers, nominal
+from fpirhc.symbolic.live import expressed, is_live, live_numbers, nominal, not_live
 
 MOST = 1000  # cycles of dead time; the memory has a fixed size
 Cycles = float | tuple[float, ...]  # one dead time for all channels, or one for each
@@ -50,9 +49,8 @@ class Queue:
         if self.longest is not None:
             return math.ceil(self.longest - _WHOLE) + self.width + 1
         for path in live_numbers(self.cycles):
-            raise NotSupported(
-                f"setting '{path}' cannot be live here without its longest value, which is the length of a queue; state it as "
-                "longest=..."
+            raise not_live(
+                [path], "it is the length of a queue; state it as longest=...", " here without its longest value"
             )
         return self._reach(nominal(self.cycles))
 

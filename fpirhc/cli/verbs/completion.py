@@ -22,12 +22,9 @@ def script(shell: str) -> str:
     Raises:
         NotSupported: shtab is not installed, or it does not know the shell.
     """
-    from fpirhc.errors import NotSupported
+    from fpirhc.errors import NotSupported, package
 
-    try:
-        import shtab
-    except ImportError:
-        raise NotSupported("completion needs shtab: python -m pip install 'fpirhc[completion]'") from None
+    shtab = package("shtab", "completion", "completion")
     if shell not in shtab.SUPPORTED_SHELLS:
         raise NotSupported(f"this version of shtab has no completion for {shell}; install a newer one")
     return str(shtab.complete(whole_parser(), shell))

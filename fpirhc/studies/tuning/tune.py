@@ -22,7 +22,7 @@ from typing import Any, cast
 import numpy as np
 
 from fpirhc.by_name import FoundByName
-from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue, package
 from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
@@ -189,10 +189,7 @@ class TrialFields(Checked):
 
 
 def _optuna() -> ModuleType:
-    try:
-        import optuna
-    except ImportError:
-        raise NotSupported("tuning needs Optuna, which is not installed: pip install 'fpirhc[tune]'") from None
+    optuna: ModuleType = package("optuna", "tune", "tuning")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
 
