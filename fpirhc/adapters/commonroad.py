@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import base_and_order, counterparts, package, steps_per_cycle
-from fpirhc.errors import Mistakes
+from fpirhc.adapters.names import base_and_order, counterparts, steps_per_cycle
+from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 

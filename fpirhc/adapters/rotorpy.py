@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import package
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
@@ -53,7 +52,7 @@ def rotorpy_body(
     for name in (name for name in (*_SEEN[:3], *_SENT) if name not in (*model.coordinates, *model.inputs)):
         mistakes.add(f"the model has no {name}; it needs x, y, z and thrust_x, thrust_y, thrust_z")
     mistakes.raise_if_any()
-    parameters = vehicle or package("rotorpy.vehicles.hummingbird_params").quad_params
+    parameters = vehicle or package("rotorpy.vehicles.hummingbird_params", "outside").quad_params
     first = [(start or {}).get(name, 0.0) for name in _SEEN[:6]]
     order = [list(model.inputs).index(name) for name in _SENT]
     units = {name: quantities(model)[name] for name in _SEEN}
@@ -92,7 +91,7 @@ class _Quadrotor:
             "wind": wind,
             "rotor_speeds": np.full(4, hover),
         }
-        multirotor = package("rotorpy.vehicles.multirotor").Multirotor
+        multirotor = package("rotorpy.vehicles.multirotor", "outside").Multirotor
         self._vehicle = multirotor(own, initial_state=self._first, control_abstraction="cmd_acc", aero=True)
         self._period, self._order = period, order
 
