@@ -137,10 +137,12 @@ _ERRORS: Latest[ResponseErrors] = Latest(8)  # several questions ask for the sam
 
 
 def _errors(nominal: NominalRun, deformation: Deformation, exact: np.ndarray) -> ResponseErrors:
-    step = _recursion(nominal, deformation, exact)
-    reads = (nominal.states[:-1], nominal.desired, nominal.states[1:])
-    run: Any = step.function.mapaccum(f"{step.function.name()}_run", nominal.cycles)
-    log = np.asarray(run(step.memory.start(), *(rows.T for rows in reads))[1].full()).T
+    made = identity(deformation), nominal.cycles, nominal.believed.tobytes()
+    step, run = _RECURSIONS.of((nominal.problem,), made, lambda: _recursion(nominal, deformation))
+    reads, start = (nominal.states[:-1], nominal.desired, nominal.states[1:]), step.memory.start()
+    if exact.size:  # an empty signal has one entry
+        start[step.memory.slice("_exact")] = exact
+    log = np.asarray(run(start, *(rows.T for rows in reads))[1].full()).T
     columns = ("response_error", "response_force", "command")
     return ResponseErrors(*(log[:, step.trace.slice(name)] for name in columns))
 
@@ -150,8 +152,8 @@ def errors_without_adaptation(nominal: NominalRun) -> ResponseErrors:
     return response_errors(nominal, deformation=Identity())
 
 
-def _recursion(nominal: NominalRun, deformation: Deformation, exact: np.ndarray) -> Composite:
-    """One cycle: (memory, state, desired, next state) -> (memory, trace)."""
+def _recursion(nominal: NominalRun, deformation: Deformation) -> tuple[Composite, Any]:
+    """One cycle, (memory, state, desired, next state) -> (memory, trace), and all cycles; exact parameters are in the memory."""
     plant = nominal.problem.plant
     closing, delays = closing_blocks(nominal.problem, deformation)
     reads = Layout((plant.state, plant.response_signal("desired"), like(plant.state, "_state_after")))
@@ -159,10 +161,14 @@ def _recursion(nominal: NominalRun, deformation: Deformation, exact: np.ndarray)
         Delay(
             Signal("parameters", plant.parameter.elements, plant.parameter.units, tuple(nominal.believed)), "parameters"
         ),
-        Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, tuple(map(float, exact))), "_exact"),
+        Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units), "_exact"),
     ]
     blocks = with_measured_state(plant, [_answer_block(plant), *closing, _judge_block(plant)])
-    return compose("prediction", reads, blocks, [*delays, *held])
+    step = compose("prediction", reads, blocks, [*delays, *held])
+    return step, step.function.mapaccum(f"{step.function.name()}_run", nominal.cycles)
+
+
+_RECURSIONS: Latest[tuple[Composite, Any]] = Latest(8)  # with the exact parameters and with those of a right model
 
 
 def _answer_block(plant: Plant) -> Block:
