@@ -192,7 +192,7 @@ def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, flo
     sign = "positive" if sum(linear) > 0 else "negative"
     bounds = f"{_size(linear):.3g} (linear limit: small errors converge)"
     if not np.isclose(_size(linear), _size(sector)):
-        bounds += f" and < {_size(sector):.3g} (sector limit: errors of any size converge)"
+        bounds += f" and < {_size(sector):.3g} (sector limit: by itself it converges from errors of any size)"
     return f"a {sign} {name}, 0 < |{name}| < {bounds}"
 
 

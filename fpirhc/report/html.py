@@ -88,12 +88,24 @@ def render(comparison: Comparison) -> str:
         pairs=_pairs(*pair) if pair else [],
         own=own_pictures(comparison),
         contraction=[Image(contraction.address, _CONTRACTION)] if contraction else [],
-        contracts=[f"{e.name}: {e.contraction.report.text}" for e in entries if e.contraction],
+        contracts=_contracts(comparison),
         lyapunov=[Image(lyapunov.address, "Lyapunov function over time with its ultimate bound", _LYAPUNOV)]
         if lyapunov
         else [],
         in_force=_in_force(comparison),
     )
+
+
+def _contracts(comparison: Comparison) -> list[str]:
+    """A sentence per adaptive row about its iteration by itself; the verdict is named where the row does no better."""
+    bad = (Outcome.WORSE, Outcome.MIXED, Outcome.DOUBTFUL, Outcome.NOT_COMPARABLE)
+    lost = {f.pair[1] for f in comparison.findings if f.pair and f.outcome in bad}
+    return [
+        f"{e.name}: {e.contraction.report.text}"
+        + (" This is of the iteration by itself; what the whole loop did is in the verdict." if e.name in lost else "")
+        for e in comparison.entries
+        if e.contraction
+    ]
 
 
 def headline_pair(comparison: Comparison) -> tuple[Entry, Entry] | None:

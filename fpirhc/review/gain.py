@@ -42,7 +42,10 @@ def gain_admissible(
     )
     if not _within(near, near.linear_limit, share):
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
-    good = 0 < value / advice.limit < 1 and _within(wide, wide.sector_limit, share)
+    inside = 0 < value / advice.limit < 1 and _within(wide, wide.sector_limit, share)
+    if inside and advice.why_not:
+        change = f"It is inside its limits, which does not say that it helps: see whether a comparison does. {change}"
+    good = inside and not advice.why_not
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, "" if good else change, numbers)
 
 

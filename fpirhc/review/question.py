@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pkgutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -73,6 +73,16 @@ class Case:
         return Trials(self.grid.real or self.problem, without_deformation(self.controller), cycles=TRIED)
 
     @cached_property
+    def _later(self) -> Trials | None:
+        """Runs that go on where errors count; None where the short ones do."""
+        problem = self.grid.real or self.problem
+        if 2 * problem.measure_from <= TRIED * problem.period:
+            return None
+        end = min(problem.duration, problem.measure_from + TRIED * problem.period)
+        problem = replace(problem, duration=end)
+        return Trials(problem, without_deformation(self.controller), cycles=problem.cycles)
+
+    @cached_property
     def _tried(self) -> dict[str, tuple[ErrorPair | None, ErrorPair] | str]:
         return {}
 
@@ -81,7 +91,11 @@ class Case:
         name = repr(deformation)
         if name not in self._tried:
             try:
-                self._tried[name] = self._trials.errors(self.controller.with_deformation(deformation))
+                controller = self.controller.with_deformation(deformation)
+                found = self._trials.errors(controller)
+                if found[0] is not None and not found[0].passes and self._later:  # may be an error of the start alone
+                    found = self._later.on_plant(controller), found[1]
+                self._tried[name] = found
             except FpirhcError as error:
                 self._tried[name] = f"it cannot be tried ({error})"
         return self._tried[name]

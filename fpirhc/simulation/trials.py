@@ -8,7 +8,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.simulation.error_pair import ErrorPair, errors_of
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import simulator
+from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.task.problem import Problem
 
 
@@ -62,6 +62,15 @@ class Trials:
         names = weighed(self.problem, loop.controller)
         model = self._model.behind(loop.controller.deformation)
         null = errors_of(model.problem, (model.run(self._bare), model.run(loop)), names)
-        if self.problem.foreign is not None:
-            return None, null
-        return errors_of(self.problem, (self._plain, loop.run(seed=0)), names), null
+        return None if self.problem.foreign is not None else self._on_plant(loop), null
+
+    def on_plant(self, controller: Controller) -> ErrorPair:
+        """Return the errors on the plant, of coordinates that the cost weighs.
+
+        Raises:
+            FpirhcError: every error that the controller raises about the problem.
+        """
+        return self._on_plant(simulator(self.problem, controller, compiled=False))
+
+    def _on_plant(self, loop: Simulator) -> ErrorPair:
+        return errors_of(self.problem, (self._plain, loop.run(seed=0)), weighed(self.problem, loop.controller))

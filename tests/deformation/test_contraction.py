@@ -193,8 +193,8 @@ def test_wrong_sign_in_words() -> None:
         check_gain(Sigmoid(gain=0.5), Spectrum(np.array([[1.5, 1.3]])))
     assert str(caught.value) == (
         "Sigmoid(gain=0.5) has the wrong sign, so every cycle enlarges the error; use a negative gain, "
-        "0 < |gain| < 3.36 (linear limit: small errors converge) and < 2.82 (sector limit: errors of any size "
-        "converge)"
+        "0 < |gain| < 3.36 (linear limit: small errors converge) and < 2.82 (sector limit: by itself it "
+        "converges from errors of any size)"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from html import unescape
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from test_verdict import case
 from test_verdict_sentences import EFFORT, entry, first, no_difference
 
 import fpirhc as fp
+from fpirhc.report.html import render
 from fpirhc.review.gain_advice import recommended_for
 from fpirhc.review.slow_gain import reviewed_gain
 from fpirhc.studies.comparison.outcome import Outcome
@@ -34,6 +36,11 @@ def test_a_gentle_gain_is_blamed_and_not_the_limits_that_it_swings_between(daily
     assert comparison.outcome is Outcome.WORSE
     assert f" Its gain is too small: {slow.evidence}. {slow.change}" in comparison.verdict[0]
     assert "stands at a limit" not in comparison.verdict[0]
+    iteration = comparison[GENTLE].contraction
+    assert iteration is not None
+    assert iteration.report.within_sector  # which says nothing of the loop, so that the page does not leave it at that
+    said = f"{iteration.report.text} This is of the iteration by itself; what the whole loop did is in the verdict."
+    assert said in unescape(render(comparison))
     assert reviewed_gain(daily.problem, daily.controllers["RHC+FPI"], grows=False) == ""
     assert reviewed_gain(daily.problem, daily.controllers["RHC"], grows=True) == ""
 
