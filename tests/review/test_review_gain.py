@@ -106,7 +106,7 @@ def test_an_error_of_the_start_is_no_harm():
     admissible = answer(task.problem, one, "gain admissible")
     assert admissible.verdict == "yes"
     assert admissible.numbers["recommended"] == pytest.approx(8e-4, rel=0.01)
-    recommended = one.with_deformation(replace(one.deformation, gain=admissible.numbers["recommended"]))
+    recommended = one.with_deformation(replace(one.deformation, gain=admissible.numbers["recommended"]))  # type: ignore[type-var]
     start = replace(task.problem, duration=1000 * task.problem.period, measure_from=500 * task.problem.period)
     early, late = (
         [
