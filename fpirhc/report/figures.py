@@ -304,7 +304,11 @@ def _draw_factor(axis: Panel, name: str, scale: float, entries: Sequence[Entry],
 
 def mismatch_figure(comparison: ScenarioComparison) -> Drawing:
     """Return the figure of the error of every scenario against its mismatch, one colour per controller."""
-    figure = new_figure(9, 4.8, f"{comparison.problem}: error against mismatch, {comparison.count} scenarios")
+    figure = new_figure(
+        9,
+        4.8,
+        f"{comparison.problem}: error against mismatch, {comparison.count} {'cases' if comparison.named else 'scenarios'}",
+    )
     axis = figure.subplots()
     finite = np.concatenate([s.errors[np.isfinite(s.errors)] for s in comparison.summaries])
     edge = 200 * float(finite.max(initial=1e-3))

@@ -48,8 +48,8 @@ class Cases(Checked):
         cases = fp.Cases({"heavy": {"exact.mass": 2.0, "start.angle": 0.3}, "late": {"dead_time.measurement": 0.01}})
         cases = fp.Cases.from_csv("patients.csv")
 
-    A run in a case is that of `problem(name, ...)`. What a case changes is known to the controllers as everything in a problem is,
-    except exact parameters and the reality.
+    A run in a case is that of `problem(name, ...)`. A gain beyond its limit there is refused in a single run; a comparison shows
+    what it does. Controllers know of a case's changes as of everything in a problem, except exact parameters and the reality.
 
     Args:
         changes: by name of the case and path. The path is 'exact.NAME' (the parameter of what moves), 'approximate.NAME' (of the

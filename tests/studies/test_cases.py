@@ -19,7 +19,8 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
-from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.problem_file import Task, in_case
+from fpirhc.studies.comparison.compare import check_gains
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import COMPARING
 
@@ -196,6 +197,26 @@ def test_the_command(task, capsys):
     error = fp.measure(task.cases.problem("far", task.problem), run).rms_error["y"]
     record = next(r for r in compared(task, "far").records["CTC"])
     assert record["metrics"]["rms_error"]["y"] == error
+
+
+@pytest.mark.slow
+def test_patients_for_whom_the_gain_is_too_large():
+    """In 14 of the gallery's 44 the gain is beyond its limit, and there adaptation is worse; in 24 of the others it is better."""
+    task = fp.load_problem("anaesthesia")
+    assert task.cases is not None
+    bench = Bench(task, Conditions(0, COMPARING, 0.0, compiled=True, named=True))
+    beyond, better = [], []
+    for number, name in enumerate(task.cases.names):
+        one = in_case(task, name)
+        try:
+            check_gains(one, {"CTC+FPI": one.controllers["CTC+FPI"]})
+        except InvalidProblem:
+            beyond.append(name)
+        plain, adaptive = (bench.record(number, controller)["error"] for controller in ("CTC", "CTC+FPI"))
+        better += [name] if adaptive < plain else []
+    assert len(beyond) == 14
+    assert len(better) == 24
+    assert not set(beyond) & set(better)
 
 
 # --- The figure -------------------------------------------------------------------------------------------------------

@@ -18,7 +18,22 @@ def summary(name: str, interval: tuple[float, float] | None) -> Summary:
     difference = None if interval is None else ConfidenceInterval(sum(interval) / 2, *interval)
     errors = np.full(5, 0.1)
     return Summary(
-        name, errors, errors, errors, 0.1, 0.1, 0, "0", {"rms_error": {}}, {}, {"finished": 5}, {}, difference, 1.0, 2
+        name,
+        errors,
+        errors,
+        errors,
+        0.1,
+        0.1,
+        0,
+        "0",
+        {"rms_error": {}},
+        {},
+        {"finished": 5},
+        {},
+        difference,
+        1.0,
+        2,
+        0,
     )
 
 

@@ -39,6 +39,7 @@ class Summary(FoundByName):
         difference: this value minus the baseline's in the same scenario; None for the baseline itself.
         ratio: median of this value over the baseline's.
         better: number of scenarios in which this value is the smaller one.
+        equal: number of scenarios in which both are equal, or failed; 0 for the baseline itself.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Summary(FoundByName):
     difference: ConfidenceInterval | None
     ratio: float
     better: int
+    equal: int
 
     @property
     def rms_error(self) -> Mapping[str, float]:
@@ -118,6 +120,7 @@ def summarise(
         difference=None if baseline is None else median_interval(_differences(values, before), seed),
         ratio=float(middle(_ratios(values, before))),
         better=int(np.sum(values < before)),
+        equal=0 if baseline is None else int(np.sum(values == before)),
     )
 
 
@@ -175,6 +178,9 @@ def verdict(
         )
     elif not summaries:
         sentences.append("No controller could serve the problem, so nothing can be compared.")
+    if summaries:
+        worst = (f"{s.name} {figure.text(s.worst)} in {s.worst_name}" for s in summaries)
+        sentences.append(f"Worst {what}: {'; '.join(worst)}.")
     sentences += [_failed(s, what) for s in summaries if s.failures]
     if skipped:
         sentences.append("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + ".")
@@ -186,9 +192,9 @@ def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> 
     assert difference is not None
     count = one.errors.size
     numbers = (
-        f"median difference of the {figure.noun} {figure.difference(difference.median)}, 95 % interval "
+        f"median difference of {figure.subject} {figure.difference(difference.median)}, 95 % interval "
         f"{figure.interval(difference.low, difference.high)}; "
-        f"{figure.better} in {one.better} of {count} {what}"
+        f"{figure.better} in {one.better} of {count} {what}{f', equal in {one.equal}' if one.equal else ''}"
     )
     times = f"{one.ratio:.3g} times its {figure.noun}"
     worse = "larger" if figure.better == "smaller" else "smaller"

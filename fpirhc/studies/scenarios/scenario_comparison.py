@@ -123,13 +123,13 @@ def _view(comparison: ScenarioComparison) -> View:
 
 def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
     """The controllers, what is worst of them first."""
-    figure = comparison.figure
+    figure, directed = comparison.figure, [c for c in comparison.columns if c.metric.better != "neither"]
     heads = (
         Column("controller"),
         Column(f"worst {figure.noun}", "worst"),
         Column(f"in {noun(comparison.named).removesuffix('s')}", "in" if comparison.named else None),
         Column("failures", "failed"),
-        *(Column(f"worst {c.short}", None) for c in comparison.columns),
+        *(Column(f"worst {c.short}", None) for c in directed),
         Column(f"median {figure.noun}", "median"),
         Column("difference (95 %)"),
         Column("ratio"),
@@ -140,7 +140,7 @@ def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
     title = f"{comparison.problem}: {comparison.count} {noun(comparison.named)}"
     table = Table(title, heads, conditions)
     for one in comparison.summaries:
-        worst = [_number(c, one.worst_metrics) for c in comparison.columns]
+        worst = [_number(c, one.worst_metrics) for c in directed]
         medians = [_number(c, one.metrics) for c in comparison.columns]
         beside = [figure.text(one.median), *_beside(one, figure)]
         table.add([one.name, *_worst(one, figure), *worst, *beside, *medians, status_shares(one.statuses)])

@@ -55,6 +55,11 @@ class Objective:
         return "error" if self.metric is None else self.name
 
     @property
+    def subject(self) -> str:
+        """The same with its article."""
+        return "the error" if self.metric is None else self.name
+
+    @property
     def better(self) -> str:
         """What a sentence calls an improvement."""
         return "larger" if self._sign < 0 else "smaller"
