@@ -40,6 +40,7 @@ from fpirhc.symbolic.gap import GAP, SETTLING, is_long
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
 
 _ABSURD = 1e4  # times the largest response that limits allow; a loop that diverges stays far below
 
@@ -478,3 +479,27 @@ def _settling(plant: Plant, deformation: Deformation, block: Block) -> Block:
 def _keeping(block: Block, name: str) -> Step:
     """The step of a block, and a further signal that stays."""
     return lambda s: {**block.step(s), f"{name}_next": getattr(s, name)}
+
+
+def bounded(problem: Problem, tracking: Tracking) -> Tracking:
+    """Return the law with its memory bounded by what the problem's limits can need."""
+    return tracking.within(largest_response(problem))
+
+
+def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
+    """Return the blocks reference, target, nominal and tracking: together they write 'desired'."""
+    plant = problem.plant
+    return [
+        reference_block(problem),
+        rename("target", like(plant.output, "reference"), like(plant.output, "_target")),
+        rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
+        bounded(problem, tracking).law(plant, problem.period),
+    ]
+
+
+def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
+    """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
+    plant = problem.plant
+    closing, delays = closing_blocks(problem, deformation)
+    update = bounded(problem, tracking).update(plant, problem.period)
+    return [*desired_blocks(problem, tracking), *closing, update], [*delays, *tracking.delays(plant)]

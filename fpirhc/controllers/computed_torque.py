@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fpirhc.controllers.base import Controller
-from fpirhc.controllers.tracking_cycle import tracked_blocks
+from fpirhc.controllers.base import Controller, tracked_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.sigmoid import Sigmoid

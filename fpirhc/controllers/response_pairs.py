@@ -14,7 +14,7 @@ from functools import cached_property
 
 import casadi as ca
 
-from fpirhc.controllers.mirror_path import MEASURED, measured_output, measured_state
+from fpirhc.controllers.mirror import MEASURED, measured_output, measured_state
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import ceil, larger
 from fpirhc.symbolic.gap import straightened

@@ -17,7 +17,7 @@ import numpy as np
 
 from fpirhc.fields.given import shortened
 from fpirhc.fields.kinds import Range, real_number
-from fpirhc.symbolic.number import SymbolicNumber
+from fpirhc.symbolic.live import SymbolicNumber
 
 
 class Expected(ABC):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import operator
+from abc import ABC
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from types import FunctionType
@@ -22,7 +23,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
-from fpirhc.symbolic.number import SymbolicNumber
+
+
+class SymbolicNumber(ABC):  # noqa: B024 -- a marker without methods
+    """A number that is a symbol while blocks are built. Checks of fields accept it wherever they accept a number.
+
+    A bare CasADi symbol is no such number and is refused: nobody would give it a value.
+    """
+
 
 PREFIX = "setting."  # of the names of signals that are settings
 DERIVED = "derived."  # of the paths of numbers that Python computes from settings

@@ -28,7 +28,7 @@ from fpirhc.controllers.contract import checked
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidField
 from fpirhc.fields.checked import Checked, expects_whole_number
-from fpirhc.symbolic.number import SymbolicNumber
+from fpirhc.symbolic.live import SymbolicNumber
 
 
 @dataclass(frozen=True)

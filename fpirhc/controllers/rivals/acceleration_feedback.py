@@ -24,8 +24,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, commanding_blocks, invert_block
-from fpirhc.controllers.tracking_cycle import bounded, desired_blocks
+from fpirhc.controllers.base import Controller, bounded, commanding_blocks, desired_blocks, invert_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue

@@ -22,10 +22,9 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like
+from fpirhc.controllers.base import Controller, bounded, commanding_blocks, desired_blocks, like
 from fpirhc.controllers.contract import Deforms, PlantModel
 from fpirhc.controllers.scale_selection import command_demand
-from fpirhc.controllers.tracking_cycle import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation, Mirror, automatic
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number

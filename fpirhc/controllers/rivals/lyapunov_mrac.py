@@ -34,7 +34,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.controllers.form_check import check_derivatives
+from fpirhc.controllers.contract import check_derivatives
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
