@@ -8,16 +8,16 @@ A value with a bad status, and one that is too old, are bad answers: they are he
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.real_time import RealTime
-from fpirhc.errors import InvalidProblem, Mistakes, package
+from fpirhc.adapters.real_time import RealTime, Setup, device
+from fpirhc.errors import InvalidProblem, package
 from fpirhc.plant.plant import Plant
-from fpirhc.task.external_plant import ExternalPlant, quantities
+from fpirhc.task.external_plant import ExternalPlant
 
 
 def opcua_body(
@@ -47,73 +47,47 @@ def opcua_body(
         NotSupported: asyncua is not installed.
         InvalidProblem: a quantity that the model does not have, or an input without node.
     """
-    package("asyncua", "outside")
-    units, mistakes = quantities(model), Mistakes("opcua_body")
-    mistakes.unknown("measures: quantity", measures, units)
-    mistakes.unknown("inputs: input", inputs, model.inputs)
-    for name in (name for name in model.inputs if name not in inputs):
-        mistakes.add(f"inputs: {name} has no node; add inputs={{'{name}': 'ns=2;s=...'}}")
-    mistakes.raise_if_any()
-    sent = [inputs[name] for name in model.inputs]
-    body = _Body(address, sent, list(measures.values()), period, oldest, clock or RealTime())
-    return ExternalPlant(body, measures={name: units[name] for name in measures}, holds=holds)
+    sync = package("asyncua.sync", "outside")
+    setup = Setup("opcua_body", period, oldest, holds, clock, "'ns=2;s=...'")
+    return device(setup, model, measures, inputs, lambda sent, read: _Session(sync, address, sent, read))
 
 
-class _Body:
+class _Session:
     """A session with the server.
 
     Args:
+        sync: the package's module.
         address: of the server.
         sent: nodes of the inputs.
         read: nodes of the measurements.
-        period: s.
-        oldest: age of a value, s.
-        clock: of the cycles.
     """
 
-    def __init__(
-        self, address: str, sent: list[str], read: list[str], period: float, oldest: float | None, clock: RealTime
-    ) -> None:
-        self._address, self._names, self._period, self._oldest, self._clock = (
-            address,
-            (sent, read),
-            period,
-            oldest,
-            clock,
-        )
+    def __init__(self, sync: Any, address: str, sent: list[str], read: list[str]) -> None:
+        self._sync, self._address, self._names = sync, address, (sent, read)
         self._client: Any = None
 
-    def reset(self, seed: int) -> np.ndarray:
-        """Connect, and measure."""
-        del seed
+    def open(self) -> None:
+        """Connect; the loop of a session that nobody ends must not keep the process alive."""
         if self._client is not None:
             self._client.disconnect()
-        sync = package("asyncua.sync", "outside")
-        loop = sync.ThreadLoop()
-        loop.daemon = True  # a session that nobody ends must not keep the process alive
+        loop = self._sync.ThreadLoop()
+        loop.daemon = True
         loop.start()
-        self._client = sync.Client(self._address, tloop=loop)
+        self._client = self._sync.Client(self._address, tloop=loop)
         self._client.connect()
         self._sent, self._read = ([self._client.get_node(name) for name in names] for names in self._names)
         self._types = [node.read_data_type_as_variant_type() for node in self._sent]
-        self._clock.begin()
-        return self._measured()
 
-    def step(self, time: float, command: np.ndarray) -> np.ndarray:
-        """Write the command, and read at the end of the cycle."""
+    def write(self, command: np.ndarray) -> None:
+        """Write every node, as the type that it has."""
         for node, kind, value in zip(self._sent, self._types, command, strict=True):
             node.write_value(float(value), kind)
-        self._clock.wait_until(time + self._period)
-        return self._measured()
 
-    def _measured(self) -> np.ndarray:
-        return np.array([self._good(node, name) for node, name in zip(self._read, self._names[1], strict=True)])
-
-    def _good(self, node: Any, name: str) -> float:
-        value = node.read_data_value(raise_on_bad_status=False)
-        if not value.StatusCode.is_good():
-            raise InvalidProblem(f"{name} has the status {value.StatusCode.name}")
-        age = (datetime.now(UTC) - value.SourceTimestamp).total_seconds() if value.SourceTimestamp else 0.0
-        if self._oldest is not None and age > self._oldest:
-            raise InvalidProblem(f"{name} is {age:.3g} s old, and the oldest that is used is {self._oldest:g} s")
-        return float(value.Value.Value)
+    def read(self) -> Iterator[tuple[float, float]]:
+        """Values with a good status, and the ages of their source time stamps."""
+        for node, name in zip(self._read, self._names[1], strict=True):
+            value = node.read_data_value(raise_on_bad_status=False)
+            if not value.StatusCode.is_good():
+                raise InvalidProblem(f"{name} has the status {value.StatusCode.name}")
+            age = (datetime.now(UTC) - value.SourceTimestamp).total_seconds() if value.SourceTimestamp else 0.0
+            yield float(value.Value.Value), age

@@ -1,10 +1,23 @@
-"""Waiting for the end of a control cycle, for bodies that move by themselves."""
+"""Devices that move by themselves: the clock of their cycles, and the form that field buses share.
+
+A bus is a link: it is opened, takes the values of the inputs, and gives those of the measurements with their ages. A bad status
+is an exception of the link, and a value that is too old is one of the device: both are bad answers, see `ExternalPlant`.
+"""
 
 from __future__ import annotations
 
 import time as wall
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from fpirhc.errors import InvalidProblem, Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.task.external_plant import ExternalPlant, quantities
+
+Address = TypeVar("Address")
 
 
 @dataclass
@@ -27,3 +40,101 @@ class RealTime:
     def wait_until(self, time: float) -> None:
         """Return at this time of the run, at once where it has passed."""
         self.sleep(max(self._begin + time - self.clock(), 0.0))
+
+
+class Link(Protocol):
+    """A bus on which inputs are written and measurements are read, in the order of their addresses."""
+
+    def open(self) -> None:
+        """Connect; an earlier connection is closed."""
+
+    def write(self, command: np.ndarray) -> None:
+        """Send the values of the inputs."""
+
+    def read(self) -> Iterable[tuple[float, float]]:
+        """Return (value, age in s) of every measurement; age 0 where the bus does not say it."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What the buses have in common.
+
+    Args:
+        where: function whose arguments these are, for messages.
+        period: of the problem, s.
+        oldest: age of a value beyond which it is bad, s; None: any age.
+        holds: consecutive bad answers that are bridged; see `ExternalPlant`.
+        clock: of the cycles; None: the clock on the wall.
+        example: of an address, for messages.
+    """
+
+    where: str
+    period: float
+    oldest: float | None
+    holds: int
+    clock: RealTime | None
+    example: str
+
+
+def device(
+    setup: Setup,
+    model: Plant,
+    measures: Mapping[str, Address],
+    inputs: Mapping[str, Address],
+    connect: Callable[[list[Address], list[Address]], Link],
+) -> ExternalPlant:
+    """Return a device on a bus as a reality.
+
+    Args:
+        setup: what the buses have in common.
+        model: the controller's model; the device has its units.
+        measures: quantity of the model -> address that holds it.
+        inputs: input of the model -> address that takes it; all inputs.
+        connect: function (addresses of the inputs, of the measurements) -> link.
+
+    Raises:
+        InvalidProblem: a quantity that the model does not have, or an input without address.
+    """
+    units, mistakes = quantities(model), Mistakes(setup.where)
+    mistakes.unknown("measures: quantity", measures, units)
+    mistakes.unknown("inputs: input", inputs, model.inputs)
+    for name in (name for name in model.inputs if name not in inputs):
+        mistakes.add(f"inputs: {name} has no address; add inputs={{'{name}': {setup.example}}}")
+    mistakes.raise_if_any()
+    link = connect([inputs[name] for name in model.inputs], list(measures.values()))
+    body = _Device(link, tuple(measures), setup)
+    return ExternalPlant(body, measures={name: units[name] for name in measures}, holds=setup.holds)
+
+
+class _Device:
+    """A link in the rhythm of the cycles.
+
+    Args:
+        link: to the device.
+        names: of what is measured.
+        setup: see `Setup`.
+    """
+
+    def __init__(self, link: Link, names: tuple[str, ...], setup: Setup) -> None:
+        self._link, self._names, self._setup, self._clock = link, names, setup, setup.clock or RealTime()
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Connect, and measure."""
+        del seed
+        self._link.open()
+        self._clock.begin()
+        return self._measured()
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Write the command, and read at the end of the cycle."""
+        self._link.write(command)
+        self._clock.wait_until(time + self._setup.period)
+        return self._measured()
+
+    def _measured(self) -> np.ndarray:
+        oldest, values = self._setup.oldest, []
+        for name, (value, age) in zip(self._names, self._link.read(), strict=True):
+            if oldest is not None and age > oldest:
+                raise InvalidProblem(f"{name} is {age:.3g} s old, and the oldest that is used is {oldest:g} s")
+            values.append(value)
+        return np.array(values)

@@ -1,0 +1,112 @@
+"""Devices on a CAN bus as the reality of a problem, by python-can.
+
+    bus = can.Bus(interface="socketcan", channel="can0")
+    speed, torque = Field(0x181, "<h", scale=0.1), Field(0x201, "<f")
+    body = can_body(bus, model, period=2e-3, measures={"w": speed}, inputs={"M": torque}, oldest=5e-3)
+
+A value is that of the newest message of its identifier, and its age that of the message's time stamp. Error frames are bad answers.
+"""
+
+from __future__ import annotations
+
+import struct
+import time as wall
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fpirhc.adapters.real_time import RealTime, Setup, device
+from fpirhc.errors import InvalidProblem, package
+from fpirhc.plant.plant import Plant
+from fpirhc.task.external_plant import ExternalPlant
+
+
+@dataclass(frozen=True)
+class Field:
+    """Where a value is: the identifier of its message, its format (see `struct`) at a byte, and value = scale x number."""
+
+    identifier: int
+    format: str = "<f"
+    byte: int = 0
+    scale: float = 1.0
+    extended: bool = False
+
+
+def can_body(
+    bus: Any,
+    model: Plant,
+    *,
+    period: float,
+    measures: Mapping[str, Field],
+    inputs: Mapping[str, Field],
+    oldest: float | None = None,
+    holds: int = 0,
+    clock: RealTime | None = None,
+) -> ExternalPlant:
+    """Return what hangs on a CAN bus as a reality.
+
+    Args:
+        bus: `can.Bus(...)`.
+        model: the controller's model; scaled numbers have its units.
+        period: of the problem, s.
+        measures: quantity of the model -> field of the message that holds it.
+        inputs: input of the model -> field of the message that takes it; fields of one identifier go in one message.
+        oldest: age of a message beyond which its values are bad, s; None: any age.
+        holds: consecutive bad answers that are bridged; see `ExternalPlant`.
+        clock: of the cycles; None: the clock on the wall.
+
+    Raises:
+        NotSupported: python-can is not installed.
+        InvalidProblem: a quantity that the model does not have, or an input without field.
+    """
+    can, setup = package("can", "outside"), Setup("can_body", period, oldest, holds, clock, "Field(0x201)")
+    return device(setup, model, measures, inputs, lambda sent, read: _Traffic(can, bus, sent, read))
+
+
+class _Traffic:
+    """The newest messages of a bus.
+
+    Args:
+        can: the package.
+        bus: its bus.
+        sent: fields of the inputs.
+        read: fields of the measurements.
+    """
+
+    def __init__(self, can: Any, bus: Any, sent: list[Field], read: list[Field]) -> None:
+        self._can, self._bus, self._sent, self._read = can, bus, sent, read
+        self._newest: dict[int, Any] = {}
+
+    def open(self) -> None:
+        """Forget what came before the last message of every identifier that waits."""
+        self._newest = {}
+
+    def write(self, command: np.ndarray) -> None:
+        """Send one message per identifier."""
+        data: dict[int, bytearray] = {}
+        for at, value in zip(self._sent, command, strict=True):
+            number, whole = float(value) / at.scale, at.format[-1] not in "efd"
+            content = data.setdefault(at.identifier, bytearray())
+            content.extend(bytes(max(at.byte + struct.calcsize(at.format) - len(content), 0)))
+            struct.pack_into(at.format, content, at.byte, round(number) if whole else number)
+        extended = {at.identifier: at.extended for at in self._sent}
+        for identifier, content in data.items():
+            wide = extended[identifier]
+            self._bus.send(self._can.Message(arbitration_id=identifier, data=content, is_extended_id=wide))
+
+    def read(self) -> Iterator[tuple[float, float]]:
+        """Values of the newest messages, and their ages."""
+        while (message := self._bus.recv(timeout=0)) is not None:
+            if message.is_error_frame:
+                raise InvalidProblem("the bus has an error frame")
+            self._newest[message.arbitration_id] = message
+        for at in self._read:
+            newest = self._newest.get(at.identifier)
+            if newest is None:
+                raise InvalidProblem(f"no message 0x{at.identifier:X} has arrived")
+            if len(newest.data) < at.byte + struct.calcsize(at.format):
+                raise InvalidProblem(f"message 0x{at.identifier:X} has {len(newest.data)} bytes, too few for its field")
+            (number,) = struct.unpack_from(at.format, newest.data, at.byte)
+            yield at.scale * float(number), wall.time() - newest.timestamp

@@ -1,0 +1,126 @@
+"""A device with Modbus TCP as the reality of a problem, by pymodbus.
+
+    body = modbus_body("10.0.0.7", model, period=0.1, measures={"T": Register(30, "INT16", 0.1)}, inputs={"Q": Register(40)})
+
+An exception response of the device is a bad answer. Modbus has no time stamps: `alive` names a register that the device counts up;
+where it stands still for longer than `oldest`, the values are old.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fpirhc.adapters.real_time import RealTime, Setup, device
+from fpirhc.errors import InvalidProblem, package
+from fpirhc.plant.plant import Plant
+from fpirhc.task.external_plant import ExternalPlant
+
+
+@dataclass(frozen=True)
+class Register:
+    """Where a value is: its first register, its type there (INT16, UINT16, INT32, ..., FLOAT64), and value = scale x register.
+
+    `readonly` registers are those of the table of input registers.
+    """
+
+    address: int
+    type: str = "FLOAT32"
+    scale: float = 1.0
+    readonly: bool = False
+
+
+def modbus_body(
+    host: str,
+    model: Plant,
+    *,
+    period: float,
+    measures: Mapping[str, Register],
+    inputs: Mapping[str, Register],
+    port: int = 502,
+    unit: int = 1,
+    alive: Register | None = None,
+    oldest: float | None = None,
+    holds: int = 0,
+    clock: RealTime | None = None,
+) -> ExternalPlant:
+    """Return a device with Modbus TCP as a reality; it is connected to at the start of a run.
+
+    Args:
+        host: its address.
+        model: the controller's model; scaled registers have its units.
+        period: of the problem, s.
+        measures: quantity of the model -> register that holds it.
+        inputs: input of the model -> register that takes it; all inputs.
+        port: of the server.
+        unit: number of the device behind the address.
+        alive: register that changes whenever the device has measured.
+        oldest: time for which `alive` may stand still, s; None: any.
+        holds: consecutive bad answers that are bridged; see `ExternalPlant`.
+        clock: of the cycles; None: the clock on the wall.
+
+    Raises:
+        NotSupported: pymodbus is not installed.
+        InvalidProblem: a quantity that the model does not have, or an input without register.
+    """
+    client, now = package("pymodbus.client", "outside").ModbusTcpClient(host, port=port), clock or RealTime()
+    setup = Setup("modbus_body", period, oldest, holds, now, "Register(40)")
+    return device(setup, model, measures, inputs, lambda sent, read: _Unit(client, unit, sent, read, alive, now))
+
+
+class _Unit:
+    """Registers of one device.
+
+    Args:
+        client: of the package.
+        unit: number of the device.
+        sent: registers of the inputs.
+        read: registers of the measurements.
+        alive: register that counts.
+        now: its clock measures for how long it stands still.
+    """
+
+    def __init__(
+        self, client: Any, unit: int, sent: list[Register], read: list[Register], alive: Register | None, now: RealTime
+    ) -> None:
+        self._client, self._unit, self._sent, self._read, self._alive, self._now = client, unit, sent, read, alive, now
+        weakref.finalize(self, client.close)
+        self._types, self._count, self._since = client.DATATYPE, np.nan, 0.0
+
+    def open(self) -> None:
+        """Connect anew."""
+        self._client.close()
+        if not self._client.connect():
+            raise InvalidProblem(f"no device answers at {self._client.comm_params.host}")
+        self._count, self._since = np.nan, self._now.clock()
+
+    def write(self, command: np.ndarray) -> None:
+        """Write the registers of every input."""
+        for at, value in zip(self._sent, command, strict=True):
+            kind, number = self._types[at.type], float(value) / at.scale
+            words = self._client.convert_to_registers(number if "FLOAT" in at.type else round(number), kind)
+            self._good(self._client.write_registers(at.address, words, device_id=self._unit), at)
+
+    def read(self) -> Iterator[tuple[float, float]]:
+        """Values, and for how long the register `alive` stands still."""
+        if self._alive is not None:
+            count, now = self._value(self._alive), self._now.clock()
+            if count != self._count:
+                self._count, self._since = count, now
+        age = 0.0 if self._alive is None else self._now.clock() - self._since
+        return ((self._value(at), age) for at in self._read)
+
+    def _value(self, at: Register) -> float:
+        kind = self._types[at.type]
+        ask = self._client.read_input_registers if at.readonly else self._client.read_holding_registers
+        words = self._good(ask(at.address, count=kind.value[1], device_id=self._unit), at).registers
+        return at.scale * float(self._client.convert_from_registers(words, kind))
+
+    def _good(self, answer: Any, at: Register) -> Any:
+        if answer.isError():
+            raise InvalidProblem(f"register {at.address} answers {answer}")
+        return answer

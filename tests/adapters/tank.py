@@ -1,0 +1,66 @@
+"""A tank that moves by itself whenever the clock of its cycles waits, for tests of field buses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import fpirhc as fp
+from fpirhc.adapters.real_time import RealTime
+
+PERIOD = 0.1
+TANK = fp.Plant(
+    {"h": "m"},
+    {"q": "m/s"},
+    {"outlet": fp.Parameter(approximate=0.3, exact=0.3, unit="1/s")},
+    lambda q, u, p: {"h": u.q - p.outlet * q.h},
+    order=1,
+)
+
+
+class Tank:
+    """Another outlet than the model's.
+
+    Args:
+        inflow: function that returns what is sent.
+        show: function that takes the level.
+    """
+
+    def __init__(self, inflow: Callable[[], float], show: Callable[[float], None]) -> None:
+        self.inflow, self.show, self.now, self.level = inflow, show, 0.0, 1.0
+
+    @property
+    def clock(self) -> RealTime:
+        """The clock that moves it."""
+        return RealTime(lambda: self.now, self.sleep)
+
+    def begin(self) -> None:
+        """Full to a metre."""
+        self.level = 1.0
+        self.show(self.level)
+
+    def sleep(self, seconds: float) -> None:
+        """Move on."""
+        self.now += seconds
+        self.level += seconds * (self.inflow() - 0.5 * self.level)
+        self.show(self.level)
+
+
+def errors(tank: Tank, body: fp.ExternalPlant) -> list[float]:
+    """The errors of the level on a ramp: without adaptation, and with it."""
+    found = []
+    for form in (fp.Identity(), fp.ModelReferenced(fp.Affine(gain=-0.5))):
+        tank.begin()
+        task = fp.Problem(
+            plant=TANK,
+            reality=body,
+            sensing=fp.Sensing(estimator=fp.PositionDifference()),
+            reference=fp.Trajectory(lambda t: {"h": 1.0 + 0.1 * t}),
+            start={"h": 1.0},
+            period=PERIOD,
+            duration=3.0,
+            measure_from=1.0,
+        )
+        run = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=2.0), form), seed=0, compiled=False)
+        assert run.stop is None
+        found.append(fp.measure(task, run).rms_error["h"])
+    return found
