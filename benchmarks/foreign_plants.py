@@ -1,4 +1,4 @@
-"""Twelve plants of textbooks and of other tools' examples under a wrong model: comparisons beside an independent integration.
+"""Fourteen plants of textbooks and of other tools' examples under a wrong model: comparisons beside an independent integration.
 
 Each is written as a user would write it, from its source. `by_hand` runs the same loop without the library: scipy integrates the
 user's own equations, a root finder inverts them, and the tracking law and the model-referenced affine map are a few lines:
@@ -459,11 +459,100 @@ def ball_and_beam() -> ForeignPlant:
     )
 
 
+def blending() -> ForeignPlant:
+    """Volume and composition of a stirred blending tank by its two feeds (Seborg et al., section 2.2).
+
+    V' = (w1 + w2 - w) / rho,  x' = (w1 (x1 - x) + w2 (x2 - x)) / (V rho); the model has wrong compositions of the feeds.
+    """
+
+    def rates(x, u, p):
+        return {"V": (u.w1 + u.w2 - p.w) / p.rho, "x": (u.w1 * (p.x1 - x.x) + u.w2 * (p.x2 - x.x)) / (x.V * p.rho)}
+
+    def chain(x, u, p):
+        feed = u.w1 * (p.x1 - x["x"]) + u.w2 * (p.x2 - x["x"])
+        return {
+            "level": (x["V"] / 0.8, (u.w1 + u.w2 - p.w) / p.rho / 0.8),
+            "percent": (100 * x["x"], 100 * feed / (x["V"] * p.rho)),
+        }
+
+    plant = fp.Plant.of_states(
+        states={"V": "m^3", "x": "1"},
+        inputs={"w1": "kg/min", "w2": "kg/min"},
+        parameters=known(
+            rho=(900.0, 900.0, "kg/m^3"), w=(620.0, 700.0, "kg/min"), x1=(0.45, 0.4, "1"), x2=(0.7, 0.75, "1")
+        ),
+        rates=rates,
+        outputs={"level": fp.Output("m", lambda x, p: x.V / 0.8), "percent": fp.Output("1", lambda x, p: 100 * x.x)},
+        time_unit="min",
+    )
+    return ForeignPlant(
+        fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(
+                lambda t: {"level": 2.5 + 0.2 * ca.sin(0.2 * t), "percent": 50 + 3 * ca.sin(0.3 * t)}
+            ),
+            start={"V": 2.0, "x": 0.5},
+            period=0.05,
+            duration=40.0,
+            measure_from=15.0,
+            limits=fp.Limits(inputs={"w1": (0.0, 2000.0), "w2": (0.0, 2000.0)}),
+        ),
+        rate=0.5,
+        chain=chain,
+    )
+
+
+def stocking() -> ForeignPlant:
+    """Adult and young fish by fishing and by setting out young ones, a map (Beverton and Holt 1957; stages as in H. Caswell 2001).
+
+    A+ = s A + m J - q A e,  J+ = b A / (1 + A / K) + u.
+    """
+
+    def following(x, u, p):
+        return {
+            "adults": p.s * x.adults + p.m * x.young - p.q * x.adults * u.effort,
+            "young": p.b * x.adults / (1 + x.adults / p.K) + u.stocked,
+        }
+
+    def chain(x, u, p):
+        adults = p.s * x["adults"] + p.m * x["young"] - p.q * x["adults"] * u.effort
+        young = p.b * x["adults"] / (1 + x["adults"] / p.K) + u.stocked
+        return {"adults": (x["adults"], adults - x["adults"]), "young": (x["young"], young - x["young"])}
+
+    plant = fp.Plant.discrete(
+        states={"adults": "kt", "young": "kt"},
+        inputs={"effort": "kd", "stocked": "kt"},
+        parameters=known(
+            s=(0.7, 0.8, "1"), m=(0.6, 0.5, "1"), q=(0.3, 0.4, "1/kd"), b=(0.8, 1.0, "1"), K=(60.0, 50.0, "kt")
+        ),
+        next=following,
+        step=1.0,
+        outputs={"adults": fp.Output("kt", lambda x, p: x.adults), "young": fp.Output("kt", lambda x, p: x.young)},
+        time_unit="year",
+    )
+    return ForeignPlant(
+        fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(
+                lambda t: {"adults": 60.0 + 8.0 * ca.sin(0.2 * t), "young": 40.0 + 4.0 * ca.sin(0.3 * t)}
+            ),
+            start={"adults": 55.0, "young": 38.0},
+            period=1.0,
+            duration=80.0,
+            measure_from=20.0,
+            limits=fp.Limits(inputs={"effort": (0.0, 3.0), "stocked": (0.0, 100.0)}),
+        ),
+        rate=0.5,
+        chain=chain,
+    )
+
+
 PLANTS: dict[str, Callable[[], ForeignPlant]] = {
     one.__name__: one
     for one in (
         *(cruise, steering, servomechanism, pvtol, conical_tank, magnet),
         *(underwater, rocket, unicycle, masses, generator, ball_and_beam),
+        *(blending, stocking),
     )
 }
 

@@ -52,6 +52,7 @@ def _simulated(grid: ReviewGrid) -> str:
     names = [grid.problem.plant.state.elements[k] for k in grid.inner]
     if not names:
         return ""
-    lacking = "reference" if grid.problem.plant.outputs else "task"
     has, are = ("has", "is") if len(names) == 1 else ("have", "are")
-    return f"; {', '.join(names)} {has} no {lacking} and {are} simulated"
+    if grid.problem.plant.outputs:
+        return f"; {', '.join(names)} {are} simulated, while the outputs follow their reference"
+    return f"; {', '.join(names)} {has} no task and {are} simulated"

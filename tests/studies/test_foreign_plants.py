@@ -9,12 +9,14 @@ import pytest
 from foreign_plants import (
     PLANTS,
     ball_and_beam,
+    blending,
     magnet,
     masses,
     planned_by_hand,
     plans,
     rms_by_hand,
     rocket,
+    stocking,
     underwater,
 )
 from reviewed import answer, case
@@ -27,7 +29,7 @@ from fpirhc.review.review import predict
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import written_out
 
-QUICK = ("cruise", "conical_tank", "magnet", "masses")
+QUICK = ("cruise", "conical_tank", "magnet", "masses", "stocking")
 INVERTED = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in PLANTS if name != "ball_and_beam"
 ]
@@ -74,6 +76,19 @@ def test_plans_are_those_of_opti_in_closed_loop():
     hand = planned_by_hand(underwater(), problem)
     assert np.abs(hand).max() > 0.1
     assert errors[: len(hand)] == pytest.approx(hand, abs=1e-6)
+
+
+@pytest.mark.parametrize(("plant", "states"), [(blending, "V, x"), (stocking, "adults, young")])
+def test_a_review_of_two_outputs_answers_no_question_with_no(plant, states):
+    """Two inputs and two outputs, of a flow and of a map: states that are simulated are named, and a gain is recommended."""
+    one = plant()
+    answers = fp.review(one.problem, {"CTC+FPI": one.controllers["CTC+FPI"]}, mismatch=10.0, seed=0)
+    every = (*answers.problem, *answers.controllers["CTC+FPI"])
+    assert not [a.question for a in every if a.verdict is Verdict.NO]
+    assert every[0].evidence.endswith(f"; {states} are simulated, while the outputs follow their reference")
+    [admissible] = [a for a in every if "gain admissible" in a.question]
+    assert admissible.verdict is Verdict.YES
+    assert admissible.numbers["recommended"] == pytest.approx(admissible.numbers["limit"] / 2, rel=1e-6)
 
 
 def test_a_force_by_the_square_of_its_current_is_inverted():

@@ -339,6 +339,9 @@ def test_unequal_rates_are_stated():
             assert texts[1].startswith(
                 "Rates: FPI corrects in every cycle, RLS only at every plan, that is every 10 cycles."
             )
+    both = entry("FPI", "RHC", facts={"plan_every": 10}), entry("FPI, plain", "RHC", facts={"plan_every": 10})
+    texts = said(entry("RHC", facts={"plan_every": 10}), *both, entry("RLS", facts={"plan_every": 10, "learns": True}))
+    assert any(t.startswith("Rates: FPI and FPI, plain correct in every cycle, RLS only at every plan") for t in texts)
 
 
 # Why

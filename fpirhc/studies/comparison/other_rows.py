@@ -115,7 +115,11 @@ def _rates(entries: Sequence[Entry]) -> list[str]:
         return []
     stride = planners[0].plan_every
     return [
-        f"Rates: {', '.join(every_cycle)} corrects in every cycle, {', '.join(every_plan)} only at every plan, that is every "
+        f"Rates: {_both(every_cycle)} in every cycle, {' and '.join(every_plan)} only at every plan, that is every "
         f"{stride} cycles. A part of their difference is an effect of the rate; a period as long as a stage gives both the same "
         "rate."
     ]
+
+
+def _both(names: Sequence[str]) -> str:
+    return f"{' and '.join(names)} correct{'s' if len(names) == 1 else ''}"
