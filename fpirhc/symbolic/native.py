@@ -31,6 +31,7 @@ from pathlib import Path
 import casadi as ca
 
 from fpirhc.errors import CompileError, NotSupported
+from fpirhc.symbolic import driver
 from fpirhc.symbolic.driver import of_type, substitute, with_less_work
 from fpirhc.symbolic.private_folder import BUILDING, own_name, private_folder, read_own
 
@@ -92,7 +93,12 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
     if compiler is None:
         return Native(function, False, _why_no_compiler())
     try:
-        return Native(_library(generate(function), compiler, flags), True, "")
+        note = _note(function, compiler, flags)
+        known = _noted(note) if note else None
+        if known is None:
+            key, known = _library(generate(function), compiler, flags)
+            _remember(note, key)
+        return Native(known, True, "")
     except (NotSupported, CompileError) as error:
         if required and isinstance(error, CompileError):
             raise
@@ -220,8 +226,61 @@ def _machine_flags() -> tuple[str, ...]:
     return ("-DALWAYS_WIDE",) if platform.machine() == "x86_64" and " avx2 " in facts else ()
 
 
-def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) -> ca.Function:
-    """Return the external Function of the library for these files, compiling it when needed."""
+def _note(function: ca.Function, compiler: str, more: Sequence[str]) -> Path | None:
+    """The file that says which library a Function has; None for a Function that cannot be written down.
+
+    Its name is a hash of the Function, in which the names of drivers have a hash of their text, and of all else that decides the
+    library: compiler, flags, machine, CasADi, and the code that writes C. So what is in the cache is found without writing C.
+    """
+    try:
+        content = function.serialize()
+    except RuntimeError:
+        return None
+    link, command = (compiler, *more, *_LINK), _unit("", compiler, more).command
+    facts = (_writer(), _version(compiler), platform.machine(), ca.CasadiMeta.version(), *command, *link, content)
+    return cache_folder() / f"{hashlib.sha256(chr(0).join(facts).encode()).hexdigest()[:32]}.note"
+
+
+@cache
+def _writer() -> str:
+    """Hash of the code that writes C."""
+    files = (Path(__file__), Path(driver.__file__))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+def _noted(note: Path) -> ca.Function | None:
+    """The library that a note names; None where there is no whole note or no whole library."""
+    try:
+        key, check = read_own(note).decode("ascii").split()
+    except (OSError, ValueError):
+        return None
+    path = cache_folder() / f"{key}{_suffix()}"
+    if check != _check_of(note, key):
+        return None
+    if key not in _loaded and _is_intact(path):
+        with contextlib.suppress(RuntimeError):  # made on another system
+            _loaded[key] = ca.external(f"fpirhc_{key}", str(path))
+    return _loaded.get(key)
+
+
+def _remember(note: Path | None, key: str) -> None:
+    """Write a note; without it the library is found by its C."""
+    if note is None:
+        return
+    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=note.parent, prefix=BUILDING) as work:
+        new = Path(work) / note.name
+        new.write_text(f"{key} {_check_of(note, key)}", encoding="ascii")
+        new.chmod(0o600)
+        new.replace(note)
+
+
+def _check_of(note: Path, key: str) -> str:
+    """Checksum of a note: a damaged key is no other model's."""
+    return hashlib.sha256(f"{note.stem} {key}".encode()).hexdigest()
+
+
+def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) -> tuple[str, ca.Function]:
+    """Return key and external Function of the library for these files, compiling it when needed."""
     own, *drivers = (_unit(source, compiler, more) for source in sources)
     link = (compiler, *more, *_LINK)
     key = hashlib.sha256("\0".join((own.key, *(d.key for d in drivers), *link)).encode()).hexdigest()[:32]
@@ -230,7 +289,7 @@ def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) ->
         name = f"fpirhc_{key}"
         named = _Unit(own.source.replace(_NAME, name), own.command)
         _loaded[key] = _load(path, name, [named, *drivers], link)
-    return _loaded[key]
+    return key, _loaded[key]
 
 
 def _suffix() -> str:

@@ -11,6 +11,7 @@ import stat
 import subprocess
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -109,6 +110,57 @@ def test_cache_is_by_content(cache, monkeypatch):
     native(model(3.0))
     assert len(_libraries(cache)) == 2
     assert not [p for p in cache.iterdir() if p.name.startswith("building-")]
+
+
+@needs_compiler
+def test_a_library_is_found_without_writing_c(cache, monkeypatch):
+    """By a note of the same Function, compiler, flags and writer of C; whatever differs writes C, and its own library is found."""
+    native(model(2.0))
+    written: list[ca.Function] = []
+    generate = module.generate
+
+    def noticed(function):
+        written.append(function)
+        return generate(function)
+
+    monkeypatch.setattr(module, "generate", noticed)
+
+    def writes(function, flags=()):
+        monkeypatch.setattr(module, "_loaded", {})
+        written.clear()
+        found = native(function, flags)
+        assert found.compiled
+        np.testing.assert_array_equal(found.function(np.ones(3)).full(), function(np.ones(3)).full())
+        return bool(written)
+
+    assert not writes(model(2.0))
+    assert writes(model(3.0))
+    assert writes(model(2.0), ["-DOTHER"])
+    assert not writes(model(2.0), ["-DOTHER"])
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_version", lambda _: "another compiler")
+        assert writes(model(2.0))
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_writer", lambda: "another program")
+        assert writes(model(2.0))
+    assert not writes(model(2.0))
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["exchanged", "cut", "strange", "no library"])
+def test_a_wrong_note_finds_nothing(cache, monkeypatch, damage):
+    """A note of another Function, half of one, other words, and one whose library is gone: the numbers are the model's own."""
+    native(model(2.0))
+    [own] = cache.glob("*.note")
+    native(model(3.0))
+    [other] = set(cache.glob("*.note")) - {own}
+    text = own.read_text()
+    own.write_text({"exchanged": other.read_text(), "cut": text[:40], "strange": "a b c"}.get(damage, text))
+    if damage == "no library":
+        Path(cache / f"{text.split()[0]}{module._suffix()}").unlink()
+    monkeypatch.setattr(module, "_loaded", {})
+    np.testing.assert_array_equal(native(model(2.0)).function(np.ones(3)).full(), model(2.0)(np.ones(3)).full())
+    assert own.read_text() == text
 
 
 @needs_compiler
