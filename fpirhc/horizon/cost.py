@@ -36,8 +36,9 @@ class View:
         input_before: input of the stage before; NaN unless the cost uses it.
         feedforward: the model's input along the reference; NaN unless the cost uses it.
         parameters: of the model.
-        time: s.
+        time: in the problem's unit of time.
         output: the model's outputs and their derivatives, view.output.bis; the state of a plant without outputs.
+        outside: signals from outside at this stage, as the controllers know them, view.outside.price.
     """
 
     state: Named
@@ -48,6 +49,7 @@ class View:
     parameters: Named
     time: Expression
     output: Named
+    outside: Named
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +59,7 @@ class Linearisation:
     Args:
         a: shape (nx, nx).
         b: shape (nx, nu).
-        step: length of the stage, s.
+        step: length of the stage, in the problem's unit of time.
     """
 
     a: np.ndarray
@@ -110,7 +112,7 @@ class Cost(Checked, ABC):
 
     @abstractmethod
     def stage(self, view: View) -> Mapping[str, Expression]:
-        """Return the stage cost's terms, each as cost per second."""
+        """Return the stage cost's terms, each as cost per unit of time."""
 
     @abstractmethod
     def terminal_cost(
@@ -299,7 +301,7 @@ class CustomCost(Cost):
     """A cost given as CasADi expressions.
 
     Args:
-        terms: function of a View that returns {term: cost per second}.
+        terms: function of a View that returns {term: cost per unit of time of the problem}, 1/min where that is the minute.
         terminal: function of a View that returns the terminal cost; None: zero.
         rate: whether `terms` uses view.input_before.
         feedforward: whether `terms` uses view.feedforward.

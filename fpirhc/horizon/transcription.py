@@ -29,6 +29,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, known_on_reference, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
+from fpirhc.plant.motion import outside_of
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.stiffness import spurious_growth
 from fpirhc.symbolic.latest import Latest
@@ -305,6 +306,7 @@ def _view(
         parameters=Named(plant.parameter.elements, data["parameters"], "parameter"),
         time=data["time"],
         output=_outputs(plant, s[:nx], data["parameters"]),
+        outside=outside_of(plant, data["parameters"]),
     )
 
 

@@ -204,6 +204,12 @@ def outside_names(motion: Motion) -> tuple[str, ...]:
     return tuple(name for name, one in motion.parameters.items() if one.outside)
 
 
+def outside_of(motion: Motion, parameters: Expression) -> Named:
+    """Return the signals from outside among the symbols of all parameters, by name."""
+    names, every = outside_names(motion), list(motion.parameters)
+    return Named(names, ca.vertcat(*(parameters[every.index(name)] for name in names)), "signal from outside")
+
+
 def controlled_places(motion: Motion) -> list[int]:
     """Return the places of the controlled quantities among all outputs, or without any among all coordinates."""
     names = list(followed_units(motion))

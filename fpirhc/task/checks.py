@@ -19,7 +19,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
 from fpirhc.plant.maps import over
-from fpirhc.plant.motion import followed_units
+from fpirhc.plant.motion import followed_units, outside_of
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.positions import StepDifference
 from fpirhc.sensing.sensing import Sensing
@@ -161,7 +161,7 @@ def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mista
 
 def _view_of_symbols(plant: Plant) -> View:
     state, command, parameter = plant.state, plant.input, plant.parameter
-    x = Named(state.elements, ca.SX.sym("x", state.size), "state")
+    x, p = Named(state.elements, ca.SX.sym("x", state.size), "state"), ca.SX.sym("p", parameter.size)
     elements, what = plant.output.elements, plant.output.name
 
     def inputs(name: str) -> Named:
@@ -173,7 +173,8 @@ def _view_of_symbols(plant: Plant) -> View:
         inputs("u"),
         inputs("before"),
         inputs("feedforward"),
-        Named(parameter.elements, ca.SX.sym("p", parameter.size), "parameter"),
+        Named(parameter.elements, p, "parameter"),
         ca.SX.sym("t"),
         Named(elements, ca.SX.sym("y", len(elements)), what),
+        outside_of(plant, p),
     )

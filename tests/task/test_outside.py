@@ -344,3 +344,39 @@ def test_a_review_says_for_which_weather_it_holds():
         [answer] = [a for a in answers if a.question == question]
         assert answer.verdict == verdict
         assert ("274 to 285 in the run" if verdict == "unknown" else "283 to 283 in the run") in answer.evidence
+
+
+def priced(cost: Any) -> fp.Problem:
+    """The room with a price of heat, which is known ahead: ten times as high from 10 h to 14 h."""
+    plant = room(fp.outside(276.5, "K"))
+    plant = replace(plant, parameters={**plant.parameters, "price": fp.outside(0.2, "EUR/kWh")})
+    steps = fp.Samples([0.0, 10.0, 14.0], [0.2, 2.0, 0.2])
+    return task(plant, {"ambient": fp.Known(fp.Samples([0.0], [280.0])), "price": fp.Known(steps)}, cost=cost)
+
+
+def test_a_cost_sees_signals_from_outside():
+    """`view.outside.price` is that of the stage: heat is bought before it rises, and little while it is high."""
+
+    def economic(view):
+        return {"comfort": (view.state.air - 293.0) ** 2, "heat": 0.05 * view.outside.price * view.input.heat**2}
+
+    def flat(view):
+        return {"comfort": (view.state.air - 293.0) ** 2, "heat": 0.05 * 0.2 * view.input.heat**2}
+
+    controller = fp.RecedingHorizon(fp.FixedPoint(iterations=20, tolerance=1e-3))
+    bought = {}
+    for terms in (economic, flat):
+        problem = priced(fp.CustomCost(terms))
+        run = fp.simulate(problem, controller, seed=0, compiled=False)
+        time, heat = run["time"].ravel(), run["command.heat"].ravel()
+        bought[terms.__name__] = [heat[(time >= a) & (time < b)].mean() for a, b in ((7.0, 10.0), (10.0, 14.0))]
+    assert bought["economic"][0] > 1.05 * bought["flat"][0]
+    assert bought["economic"][1] < 0.9 * bought["flat"][1]
+
+
+def test_a_cost_asks_for_signals_by_name():
+    """Parameters of the model that are no signals are not among them."""
+    with pytest.raises(InvalidProblem, match=r"signal from outside 'prize' is unknown\. Did you mean 'price'\?"):
+        priced(fp.CustomCost(lambda view: {"heat": view.outside.prize * view.input.heat**2}))
+    with pytest.raises(InvalidProblem, match="signal from outside 'loss' is unknown"):
+        priced(fp.CustomCost(lambda view: {"heat": view.outside.loss * view.input.heat**2}))
