@@ -10,66 +10,18 @@ stages of 2 ms; then the time of a cycle of RHC+FPI that plans, and its ratio.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
-import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.adapters.mujoco import mujoco_body
 from fpirhc.studies.comparison.timing import measure_cycle, stepper_to_time
 
-PERIOD = 2e-3
-JOINTS = ("shoulder", "elbow")
-BODY = """<mujoco><option timestep="0.0005" integrator="implicitfast" gravity="0 0 -9.81"/>
-<default><joint armature="0.03" damping="0.2" frictionloss="0.4"/>
-<geom type="capsule" size="0.03" contype="0" conaffinity="0"/></default>
-<worldbody><body><joint name="shoulder" axis="0 -1 0"/><geom fromto="0 0 0 0.5 0 0" mass="2.0"/>
-<body pos="0.5 0 0"><joint name="elbow" axis="0 -1 0"/><geom fromto="0 0 0 0.4 0 0" mass="1.2"/>
-<geom type="sphere" pos="0.4 0 0" size="0.05" mass="1.0"/></body></body></worldbody>
-<actuator><motor name="M1" joint="shoulder" ctrlrange="-80 80"/>
-<motor name="M2" joint="elbow" ctrlrange="-40 40"/></actuator></mujoco>"""
-
-
-def rods(q: Any, v: Any, u: Any, p: Any) -> dict[str, ca.SX]:
-    """Two uniform rods without friction and without tool."""
-    l1, l2, g = 0.5, 0.4, 9.81
-    a, b, c = p.m1 * l1**2 / 3 + p.m2 * l1**2 + p.m2 * l2**2 / 3, p.m2 * l1 * l2 / 2, p.m2 * l2**2 / 3
-    bent, leaned = q.elbow, q.shoulder + q.elbow
-    inertia = ca.vertcat(
-        ca.horzcat(a + 2 * b * ca.cos(bent), c + b * ca.cos(bent)), ca.horzcat(c + b * ca.cos(bent), c)
-    )
-    turning = b * ca.sin(bent) * ca.vertcat(-(2 * v.shoulder * v.elbow + v.elbow**2), v.shoulder**2)
-    weight = ca.vertcat(
-        (p.m1 / 2 + p.m2) * g * l1 * ca.cos(q.shoulder) + p.m2 * g * l2 / 2 * ca.cos(leaned),
-        p.m2 * g * l2 / 2 * ca.cos(leaned),
-    )
-    acceleration = ca.solve(inertia, ca.vertcat(u.M1, u.M2) - turning - weight)
-    return {"shoulder": acceleration[0], "elbow": acceleration[1]}
+PERIOD, JOINTS = 2e-3, ("shoulder", "elbow")
 
 
 def problem(horizon: fp.Horizon) -> fp.Problem:
-    """Both joints swing."""
-    plant = fp.Plant(
-        dict.fromkeys(JOINTS, "rad"),
-        {"M1": "N m", "M2": "N m"},
-        {"m1": fp.Parameter(2.0, 2.0, "kg"), "m2": fp.Parameter(1.2, 1.2, "kg")},
-        rods,
-    )
-    return fp.Problem(
-        plant=plant,
-        reality=mujoco_body(BODY, plant, period=PERIOD),
-        reference=fp.Trajectory(lambda t: {"shoulder": 0.8 * (1 - ca.cos(2 * t)), "elbow": -0.5 * (1 - ca.cos(3 * t))}),
-        start=dict.fromkeys(JOINTS, 0.0),
-        period=PERIOD,
-        duration=3.0,
-        measure_from=1.0,
-        limits=fp.Limits(inputs={"M1": (-80.0, 80.0), "M2": (-40.0, 40.0)}),
-        horizon=horizon,
-        cost=fp.Quadratic(
-            states={"shoulder": 1e3, "elbow": 1e3, "shoulder'": 1.0, "elbow'": 1.0}, deviation={"M1": 1e-3, "M2": 1e-3}
-        ),
-    )
+    """The shipped arm with another horizon, for three seconds."""
+    return replace(fp.load_problem("mujoco_arm").problem, horizon=horizon, duration=3.0)
 
 
 def growing(stages: int, factor: float) -> fp.Horizon:
