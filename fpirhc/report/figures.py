@@ -1,4 +1,4 @@
-"""Figures of plans and scenarios, and the report's panels: pairs without | with adaptivity, contraction, Lyapunov function."""
+"""Figures (matplotlib) of plans and comparisons, and the pairs without | with adaptivity of the method's papers."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from fpirhc.simulation.drawing import (
     literal,
     new_figure,
     quantity_label,
+    row_of_axes,
     thinned,
     time_label,
 )
-from fpirhc.simulation.panels import Panel, Panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
     from fpirhc.task.problem import Problem
 
-    Axis: TypeAlias = Axes | Panel
-    Draw: TypeAlias = Callable[[Axis, Run, Sequence[str]], None]
+    Draw: TypeAlias = Callable[[Axes, Run, Sequence[str]], None]
 
 _GROUPS = 6  # of scenarios with similar mismatch, whose medians are joined by a line
 _WIDE = 16.5  # inches, of a picture as wide as the page
@@ -88,7 +87,7 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
     return figure
 
 
-def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Panels]:
+def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Drawing]:
     """Return the pictures of the method's papers as pairs, without adaptivity on the left and with it on the right.
 
     Both sides have the same axes, and a picture has one unit: quantities of several units are several pictures.
@@ -117,9 +116,9 @@ def _pictures(run: Run) -> list[tuple[str, Draw, str, list[str]]]:
     ]
 
 
-def _pair(draw: Draw, label: str, names: Sequence[str], entries: tuple[Entry, Entry]) -> Panels:
-    figure = Panels(11, 3.6, 2)
-    for axis, entry in zip(figure.axes, entries, strict=True):
+def _pair(draw: Draw, label: str, names: Sequence[str], entries: tuple[Entry, Entry]) -> Drawing:
+    figure, axes = row_of_axes(11, 3.6, 2)
+    for axis, entry in zip(axes, entries, strict=True):
         draw(axis, entry.run, names)
         if draw is not _draw_phase:
             draw_bands(axis, entry.run)
@@ -128,11 +127,11 @@ def _pair(draw: Draw, label: str, names: Sequence[str], entries: tuple[Entry, En
             axis.set_ylabel(label)
         axis.set_title(literal(entry.name), fontsize=10)
         draw_legend(axis)
-    _share_axes(figure.axes)
+    _share_axes(axes)
     return figure
 
 
-def _share_axes(axes: Sequence[Panel]) -> None:
+def _share_axes(axes: Sequence[Axes]) -> None:
     """Give both sides the range that shows all of both."""
     x, y = np.array([axis.get_xlim() for axis in axes]), np.array([axis.get_ylim() for axis in axes])
     for axis in axes:
@@ -140,13 +139,12 @@ def _share_axes(axes: Sequence[Panel]) -> None:
         axis.set_ylim(y.min(), y.max())
 
 
-def lyapunov_figure(comparison: Comparison) -> Panels | None:
+def lyapunov_figure(comparison: Comparison) -> Drawing | None:
     """V = |S|^2 / 2 over time and its ultimate bound, for controllers with an exponential tracking law."""
     views = [(e, e.lyapunov) for e in comparison.entries if e.lyapunov is not None]
     if not views:
         return None
-    figure = Panels(_WIDE, 4.0)
-    [axis] = figure.axes
+    figure, [axis] = row_of_axes(_WIDE, 4.0, 1)
     for k, (entry, view) in enumerate(views):
         color, values = PALETTE[k % len(PALETTE)], np.maximum(view.function, 1e-20)
         times = entry.run.period * np.arange(values.size)
@@ -183,7 +181,7 @@ def _is_second_order(run: Run) -> bool:
     return all(unit.endswith("s^2") for unit in run.layout["desired"].entry_units)
 
 
-def _draw_trajectory(axis: Axis, run: Run, names: Sequence[str]) -> None:
+def _draw_trajectory(axis: Axes, run: Run, names: Sequence[str]) -> None:
     for k, name in enumerate(names):
         draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", f"{name} realised", PALETTE[k % len(PALETTE)])
         draw_line(axis, run, f"reference.{name}", f"{name} nominal", _REFERENCES[k % len(_REFERENCES)], "--")
@@ -196,7 +194,7 @@ def _phase_names(run: Run) -> list[str]:
     ]
 
 
-def _draw_phase(axis: Axis, run: Run, names: Sequence[str]) -> None:
+def _draw_phase(axis: Axes, run: Run, names: Sequence[str]) -> None:
     motion = shown_motion(run.layout)
     for k, name in enumerate(names):
         nominal = _REFERENCES[k % len(_REFERENCES)]
@@ -208,29 +206,28 @@ def _draw_phase(axis: Axis, run: Run, names: Sequence[str]) -> None:
     axis.grid(visible=True, alpha=0.25)
 
 
-def _draw_error(axis: Axis, run: Run, names: Sequence[str]) -> None:
+def _draw_error(axis: Axes, run: Run, names: Sequence[str]) -> None:
     for k, name in enumerate(names):
         draw_line(axis, run, f"error.{name}", name, PALETTE[k % len(PALETTE)])
 
 
-def _draw_command(axis: Axis, run: Run, names: Sequence[str]) -> None:
+def _draw_command(axis: Axes, run: Run, names: Sequence[str]) -> None:
     for k, name in enumerate(names):
         draw_line(axis, run, f"command.{name}", name, PALETTE[k % len(PALETTE)])
 
 
-def _draw_responses(axis: Axis, run: Run, names: Sequence[str]) -> None:
+def _draw_responses(axis: Axes, run: Run, names: Sequence[str]) -> None:
     draw_responses(axis, run, names[0])
 
 
-def contraction_figure(comparison: Comparison) -> Panels | None:
+def contraction_figure(comparison: Comparison) -> Drawing | None:
     """Return a panel for every gain by its own name and scale, and one with the response errors; None where nothing contracts."""
     entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
     if not entries:
         return None
     colours = {e.name: PALETTE[k % len(PALETTE)] for k, e in enumerate(entries)}
     groups = _by_gain(entries)
-    figure = Panels(_WIDE, 4.0, len(groups) + 1)
-    *panels, last = figure.axes
+    figure, [*panels, last] = row_of_axes(_WIDE, 4.0, len(groups) + 1)
     for axis, ((name, scale), same) in zip(panels, groups.items(), strict=True):
         _draw_factor(axis, name, scale, same, colours)
     for entry in entries:
@@ -264,7 +261,7 @@ def _own_gain(report: ContractionReport) -> tuple[str, float]:
     return (report.gain_name, float(f"{own / effective:.9g}")) if effective else ("effective gain", 1.0)
 
 
-def _draw_factor(axis: Panel, name: str, scale: float, entries: Sequence[Entry], colours: dict[str, str]) -> None:
+def _draw_factor(axis: Axes, name: str, scale: float, entries: Sequence[Entry], colours: dict[str, str]) -> None:
     first = _of(entries[0])
     limit = max(first.report.linear_limit, key=abs) or 1.0
     gains = np.linspace(0, _BEYOND * limit, 300)
@@ -295,6 +292,8 @@ def _draw_factor(axis: Panel, name: str, scale: float, entries: Sequence[Entry],
         if sector and abs(sector) < 0.999 * abs(limit):
             axis.axvline(scale * sector, color=colour, lw=0.8, ls=":", label="sector limit")
     axis.set_ylim(0, 1.6)
+    axis.locator_params(axis="x", nbins=7)
+    axis.ticklabel_format(axis="x", scilimits=(-3, 4))
     axis.set_xlabel(literal(name))
     axis.set_ylabel("contraction factor max|1 - a lambda|")
     axis.set_title("Predicted factor; o predicted, x measured", fontsize=10)

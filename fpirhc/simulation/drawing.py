@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,16 +15,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fpirhc.simulation.panels import Panel
     from fpirhc.simulation.picture import Drawing
-
-    Axis: TypeAlias = Axes | Panel
 
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
 BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale
 _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00", "realised": "#d55e00"}
 _POINTS = 2000  # drawn per line
+_LEFT, _RIGHT, _BOTTOM, _TOP = 0.95, 0.15, 0.6, 0.35  # margins of a row of axes, inches
 _TALL = 20  # largest over usual size from which the range of a panel is cut, so that one spike does not hide the rest
 
 
@@ -36,6 +34,21 @@ def new_figure(width: float, height: float, title: str = "") -> Drawing:
     if title:
         figure.suptitle(literal(title), fontsize=11)
     return figure
+
+
+def row_of_axes(width: float, height: float, count: int) -> tuple[Drawing, list[Axes]]:
+    """Return a figure of this size in inches and its axes side by side.
+
+    Its margins are fixed: to fit them to labels, matplotlib would lay out every label twice, which takes half of a picture's time.
+    """
+    from fpirhc.simulation.picture import Drawing
+
+    figure = Drawing(figsize=(width, height))
+    each = (width - _RIGHT) / count  # inches of one panel with its margin
+    axes = figure.subplots(1, count, squeeze=False)[0]
+    places = {"left": _LEFT / width, "right": 1 - _RIGHT / width, "bottom": _BOTTOM / height, "top": 1 - _TOP / height}
+    figure.subplots_adjust(**places, wspace=_LEFT / (each - _LEFT))
+    return figure, list(axes)
 
 
 def literal(text: str) -> str:
@@ -62,7 +75,7 @@ def by_unit(run: Log, signal: str, names: Sequence[str]) -> dict[str, list[str]]
     return groups
 
 
-def draw_bands(axis: Axis, run: Log) -> None:
+def draw_bands(axis: Axes, run: Log) -> None:
     """Draw time slots as shaded bands, named in the legend."""
     named: set[int] = set()
     for start, end, slot in run.spans():
@@ -78,7 +91,7 @@ def draw_bands(axis: Axis, run: Log) -> None:
         named.add(slot)
 
 
-def draw_changes(axis: Axis, run: Log) -> None:
+def draw_changes(axis: Axes, run: Log) -> None:
     """Draw the times at which live settings changed as vertical lines, named in the legend."""
     for k, (time, _) in enumerate(run.in_force[1:]):
         axis.axvline(time, color="#777777", lw=0.8, ls=":", label=None if k else "change of settings")
@@ -89,7 +102,7 @@ def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
     return values[:: max(1, values.shape[0] // points)]
 
 
-def draw_line(axis: Axis, run: Log, column: str, label: str, color: str, style: str = "-") -> None:
+def draw_line(axis: Axes, run: Log, column: str, label: str, color: str, style: str = "-") -> None:
     """Draw one column of a run over time; its unit stands in the legend."""
     axis.plot(
         thinned(run.time),
@@ -102,13 +115,13 @@ def draw_line(axis: Axis, run: Log, column: str, label: str, color: str, style: 
     axis.grid(visible=True, alpha=0.25)
 
 
-def draw_legend(axis: Axis) -> None:
+def draw_legend(axis: Axes) -> None:
     """Add a legend where something has a label."""
     if axis.get_legend_handles_labels()[0]:
         axis.legend(fontsize=7, loc="best", framealpha=0.8)
 
 
-def draw_responses(axis: Axis, run: Log, name: str) -> None:
+def draw_responses(axis: Axes, run: Log, name: str) -> None:
     """Draw the nominal, desired, deformed and realised response of one coordinate; a spike does not hide the rest."""
     for signal, color in _RESPONSES.items():
         style = ":" if signal == "realised" else "-"
@@ -139,13 +152,13 @@ def run_figure(run: Log) -> Figure:
     return figure
 
 
-def _draw_errors(axis: Axis, run: Log, names: Sequence[str]) -> str:
+def _draw_errors(axis: Axes, run: Log, names: Sequence[str]) -> str:
     for k, name in enumerate(names):
         draw_line(axis, run, f"error.{name}", name, PALETTE[k % len(PALETTE)])
     return f"error of {quantity_label(run, 'error', names)}"
 
 
-def _draw_motion(axis: Axis, run: Log, names: Sequence[str]) -> str:
+def _draw_motion(axis: Axes, run: Log, names: Sequence[str]) -> str:
     for k, name in enumerate(names):
         color = PALETTE[k % len(PALETTE)]
         draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", name, color)
@@ -155,12 +168,12 @@ def _draw_motion(axis: Axis, run: Log, names: Sequence[str]) -> str:
     return quantity_label(run, shown_motion(run.layout), names)
 
 
-def _draw_commands(axis: Axis, run: Log, names: Sequence[str]) -> str:
+def _draw_commands(axis: Axes, run: Log, names: Sequence[str]) -> str:
     for k, name in enumerate(names):
         draw_line(axis, run, f"command.{name}", name, PALETTE[k % len(PALETTE)])
     return quantity_label(run, "command", names)
 
 
-def _draw_first_response(axis: Axis, run: Log, names: Sequence[str]) -> str:
+def _draw_first_response(axis: Axes, run: Log, names: Sequence[str]) -> str:
     draw_responses(axis, run, names[0])
     return f"responses of {quantity_label(run, 'desired', names)}"

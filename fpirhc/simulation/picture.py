@@ -1,4 +1,4 @@
-"""A figure that notebooks show with any back end; it opens no window. Nothing else imports matplotlib (half a second)."""
+"""A figure that notebooks show with any back end; it opens no window. Nothing else imports matplotlib when it is imported."""
 
 from __future__ import annotations
 

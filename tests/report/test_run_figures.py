@@ -9,6 +9,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from plants import chain
 
 import fpirhc as fp
@@ -16,7 +17,6 @@ from fpirhc.controllers.contract import name_in_task
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.figures import contraction_figure, pair_figures
 from fpirhc.report.html import asset, headline_pair
-from fpirhc.simulation.panels import Panel
 from fpirhc.studies.comparison.compare import compare
 
 
@@ -67,7 +67,7 @@ def test_a_plant_of_order_one_has_no_phase_picture(order):
     assert pair is not None
     figures = pair_figures(*pair)
     assert ("Phase trajectories" in figures) == (order == 2)
-    assert all(axis.marks for figure in figures.values() for axis in figure.axes)
+    assert all(axis.lines for figure in figures.values() for axis in figure.axes)
     if order == 2:
         axis = figures["Phase trajectories"].axes[0]
         assert (axis.get_xlabel(), axis.get_ylabel()) == ("y [mg/l]", "y' [mg/l/s]")
@@ -138,10 +138,10 @@ def test_a_reference_has_a_colour_of_its_own(reacted):
     """Where what follows lies on it, both are seen: the reference is drawn later, dashed, and in another colour."""
     figures = pair_figures(reacted["plain"], reacted["affine"])
     for name in ("Trajectory tracking [K]", "Trajectory tracking [mol/l]"):
-        motion, reference = figures[name].axes[0].marks
-        assert "nominal" in str(reference.label)
-        assert reference.colour != motion.colour
-        assert (motion.style, reference.style) == ("-", "--")
+        motion, reference = figures[name].axes[0].lines
+        assert "nominal" in str(reference.get_label())
+        assert reference.get_color() != motion.get_color()
+        assert (motion.get_linestyle(), reference.get_linestyle()) == ("-", "--")
 
 
 def test_both_sides_of_a_pair_have_the_same_axes(reacted):
@@ -152,14 +152,14 @@ def test_both_sides_of_a_pair_have_the_same_axes(reacted):
         assert left.get_xlim() == right.get_xlim(), name
     left, right = pair_figures(reacted["plain"], reacted["affine"])["Tracking error [K]"].axes
     low, high = left.get_ylim()
-    drawn = np.concatenate([line.y for axis in (left, right) for line in axis.marks])
+    drawn = np.concatenate([line.get_ydata() for axis in (left, right) for line in axis.lines])
     assert low < drawn.min() < drawn.max() < high
 
 
-def marked(axes: list[Panel]) -> dict[str | None, tuple[float, float]]:
+def marked(axes: list[Axes]) -> dict[str, tuple[float, float]]:
     """Single points by their label."""
-    points = [mark for axis in axes for mark in axis.marks if mark.shape in "ox"]
-    return {m.label: (float(m.x[0]), float(m.y[0])) for m in points if m.x is not None and m.y is not None}
+    lines = [(str(line.get_label()), np.asarray(line.get_xydata())) for axis in axes for line in axis.lines]
+    return {label: (float(points[0, 0]), float(points[0, 1])) for label, points in lines if len(points) == 1}
 
 
 def test_the_contraction_is_drawn_against_the_gain_that_the_user_sets(reacted):
@@ -173,10 +173,11 @@ def test_the_contraction_is_drawn_against_the_gain_that_the_user_sets(reacted):
     assert points["affine, predicted"] == pytest.approx((-1.0, abs(1 - 0.5 * 1.5)))
     assert points["gentle, predicted"] == pytest.approx((-0.5, abs(1 - 0.25 * 1.5)))
     assert points["rotation, predicted"][0] == pytest.approx(0.4)
-    rings = [mark for axis in panels for mark in axis.marks if mark.shape == "o"]
-    crosses = [mark for axis in panels for mark in axis.marks if mark.shape == "x"]
-    assert min(mark.above for mark in crosses) > max(mark.above for mark in rings)
-    [limit] = [mark.x for mark in panels[0].marks if mark.label == "linear limit"]
+    rings = [line for axis in panels for line in axis.lines if line.get_marker() == "o"]
+    crosses = [line for axis in panels for line in axis.lines if line.get_marker() == "x"]
+    assert {str(line.get_markerfacecolor()) for line in rings} == {"none"}
+    assert min(line.get_zorder() for line in crosses) > max(line.get_zorder() for line in rings)
+    [limit] = [np.asarray(line.get_xydata())[0, 0] for line in panels[0].lines if line.get_label() == "linear limit"]
     assert limit == pytest.approx(-2 / (0.5 * 1.5))
 
 

@@ -18,7 +18,6 @@ from fpirhc.report.figures import pair_figures, plan_figure
 from fpirhc.report.html import headline_pair, render, render_scenarios
 from fpirhc.report.series import chart_data
 from fpirhc.report.terminal import show
-from fpirhc.simulation.panels import Panels
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.open_loop import solve_first
@@ -83,9 +82,9 @@ def test_report_and_terminal_have_it(case, capsys, tmp_path):
     assert not SECONDS.search(shown)
 
 
-def labels(figure: Figure | Panels) -> list[str]:
+def labels(figure: Figure) -> list[str]:
     """Every text of a figure's axes."""
-    legends = [text for axis in figure.axes for text in axis.get_legend_handles_labels()[1]]
+    legends = [text.get_text() for axis in figure.axes if (legend := axis.get_legend()) for text in legend.get_texts()]
     return legends + [text for axis in figure.axes for text in (axis.get_xlabel(), axis.get_ylabel(), axis.get_title())]
 
 
@@ -94,13 +93,12 @@ def test_figures_have_it(case):
     task, comparison = case
     pair = headline_pair(comparison)
     assert pair is not None
-    figures: list[Figure | Panels] = [*pair_figures(*pair).values(), pair[1].run.plot()]
+    figures = [*pair_figures(*pair).values(), pair[1].run.plot()]
     solved = solve_first(task, ["fixed-point"], 1e-6)
     figures.append(plan_figure(task.problem, solved))
     for wanted in task.pictures:
-        own = Figure()
-        figures.append(own)
-        wanted.draw(own, {e.name: e.run for e in comparison.entries})
+        figures.append(Figure())
+        wanted.draw(figures[-1], {e.name: e.run for e in comparison.entries})
     texts = [text for figure in figures for text in labels(figure)]
     assert f"time [{UNIT}]" in texts
     assert not [text for text in texts if SECONDS.search(text)]
