@@ -182,7 +182,7 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, monitor: 
     gated = [block] if jumps is None else jumps.around(block)
     judged = clock_status_block(problem, _GATED, _STATUS)
     blocks = [own, clock_block(problem), *gated, judged, watched, _count_block()]
-    return compose("controller", gate.reads, blocks, outputs=("command",))
+    return compose("machine", gate.reads, blocks, outputs=("command",))
 
 
 def fingerprint(problem: Problem, controller: Controller, memory: Layout) -> float:

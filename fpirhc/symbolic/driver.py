@@ -138,31 +138,34 @@ def _renamed(leaf: ca.Function, name: str) -> ca.Function:
 
 @dataclass(frozen=True)
 class _Body:
-    """One generated function: its text, the name of the Function, its callees, and where its own values begin, None if nowhere."""
+    """One generated function: its text, its name, its callees, and where its own values begin and end, None if unknown."""
 
     name: str
     text: str
     callees: tuple[str, ...]
     begin: int | None
+    end: int | None
     plain: bool  # only calls use the begin of w
 
 
-def with_less_work(source: str, sizes: Mapping[str, int]) -> str:
+def with_less_work(source: str, sizes: Mapping[str, int], functions: Mapping[str, ca.Function]) -> str:
     """Return a program with the same results and a shorter work vector.
 
     CasADi gives every Function of a program one work vector w: its callees get w from its begin, and its own values stand behind
     what the largest callee needs. A driver keeps its numbers on the stack and leaves w alone. So its callers' own values can move
-    down, and the program needs less. A Function is changed only where its text shows that nothing but calls uses the begin of w.
+    down, and the program needs less. It also keeps room for values that its C only points to: a Function ends behind the last
+    value that its text has. A Function is changed only where its text shows that nothing but calls uses the begin of w.
 
     Args:
         source: generated C, in which calls of drivers stand in place of bodies.
-        sizes: of the work vectors of all Functions, by name, as CasADi made them.
+        sizes: of the work vectors of all Functions, by name, as CasADi made them; of Functions with the same name the largest.
+        functions: by name, without those that share a name.
     """
     exported = _EXPORTED.search(source)
     if exported is None:
         return source
     sizes = {**sizes, exported[1]: int(exported[2])}
-    bodies = {m[2]: _body(m[1] or "", m[3]) for m in _BODY.finditer(source)}
+    bodies = {m[2]: _body(m[1] or "", m[3], functions.get(m[1] or "")) for m in _BODY.finditer(source)}
     needs = dict[str, int | None]()
     for key in bodies:
         _need(key, bodies, sizes, needs)
@@ -173,11 +176,43 @@ def with_less_work(source: str, sizes: Mapping[str, int]) -> str:
     return _SIZE.sub(lambda m: f"{m[1]}{needs[top[0]]}", source)
 
 
-def _body(name: str, text: str) -> _Body:
+def _body(name: str, text: str, function: ca.Function | None) -> _Body:
     own = [int(m[2]) for m in _OWN.finditer(text)]
     callees = tuple(m[1] for m in _CALLED.finditer(text))
     plain = not _USE.search(_CALLED.sub("", _OWN.sub("", text)))
-    return _Body(name, text, callees, min(own) if own else None, plain)
+    return _Body(name, text, callees, min(own) if own else None, _end(text, function), plain)
+
+
+def _end(text: str, function: ca.Function | None) -> int | None:
+    """Where the last own value of a function ends, None where it is not known.
+
+    The value w12 is place 12 of the Function's work. The lengths of all places must explain where every value begins.
+    """
+    if function is None or not function.is_a("MXFunction"):
+        return None
+    begins = {int(m[1][1:]): int(m[2]) for m in _OWN.finditer(text)}
+    places = sorted(begins, key=begins.__getitem__)
+    lengths = _lengths(function)
+    if not places or any(lengths.get(place) is None for place in places):
+        return None
+    ends = [begins[place] + int(lengths[place] or 0) for place in places]
+    return ends[-1] if all(end == begins[k] for end, k in zip(ends, places[1:], strict=False)) else None
+
+
+def _lengths(function: ca.Function) -> dict[int, int | None]:
+    """Length of every place of a Function's work; None where its uses disagree."""
+    lengths = dict[int, int | None]()
+    for k in range(function.n_instructions()):
+        if function.instruction_id(k) == ca.OP_OUTPUT:  # its number is that of a result
+            continue
+        places, made = list(function.instruction_output(k)), function.instruction_MX(k)
+        for j, place in enumerate(places):
+            if made.is_call():  # a call itself has no length
+                length = int(made.which_function().nnz_out(j))
+            else:
+                length = int(made.nnz() if len(places) == 1 else made.get_output(j).nnz())
+            lengths[place] = length if lengths.get(place, length) == length else None
+    return lengths
 
 
 def _need(key: str, bodies: Mapping[str, _Body], sizes: Mapping[str, int], needs: dict[str, int | None]) -> int | None:
@@ -193,7 +228,7 @@ def _need(key: str, bodies: Mapping[str, _Body], sizes: Mapping[str, int], needs
         elif body.begin is None:
             needs[key] = below
         else:
-            size = sizes.get(body.name)
+            size = body.end if body.end is not None else sizes.get(body.name)
             needs[key] = None if size is None else size - max(body.begin - below, 0)
     return needs[key]
 

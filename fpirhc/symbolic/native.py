@@ -128,9 +128,10 @@ def generate(function: ca.Function) -> tuple[str, ...]:
     _check_self_contained(source)
     source, drivers = substitute(of_type(source))
     if drivers:
-        # Of Functions with the same name the largest counts.
         ordered = sorted(wrapped.find_functions(), key=lambda f: f.sz_w())
-        source = with_less_work(source, {f.name(): int(f.sz_w()) for f in ordered})
+        called = [f.name() for f in ordered]
+        alone = {f.name(): f for f in (*ordered, wrapped) if called.count(f.name()) <= 1}
+        source = with_less_work(source, {f.name(): int(f.sz_w()) for f in ordered}, alone)
     return source, *drivers
 
 
