@@ -364,22 +364,6 @@ def test_bad_first_answer_is_an_error():
         run(replace(problem, reality=fp.ExternalPlant(body, MEASURES)))
 
 
-def test_mistakes_are_named():
-    """Quantities and units are compared with what the model and its sensing need, before a run."""
-    body = Wrapped(task())
-    with pytest.raises(InvalidProblem, match=r"does not measure y'' .* Sensing\(estimator=...\)"):
-        task(reality=fp.ExternalPlant(body, {"y": "m", "y'": "m/s"}))
-    with pytest.raises(InvalidProblem, match="measures y in mm, the model has it in m"):
-        task(reality=fp.ExternalPlant(body, {**MEASURES, "y": "mm"}))
-    with pytest.raises(InvalidProblem, match="'z' is unknown"):
-        task(reality=fp.ExternalPlant(body, {**MEASURES, "z": "m"}))
-    with pytest.raises(InvalidProblem, match="disturbances"):
-        task(reality=fp.ExternalPlant(body, MEASURES), disturbances={"y": fp.Step(0.0, 1.0)})
-    no_body: Any = object()
-    with pytest.raises(InvalidValue, match="no method reset"):
-        fp.ExternalPlant(no_body, MEASURES)
-
-
 def test_nothing_is_drawn_and_no_model_is_exact():
     """Parameters of an object outside are nobody's to set."""
     problem = outside(task())
@@ -448,23 +432,67 @@ def test_a_made_body_is_new_in_every_run_and_has_its_seed():
     assert not np.array_equal(first["plant_state"], weaker["plant_state"])
 
 
-def test_wrong_ways_to_make_a_body_are_named():
-    """What, where and how it is mended."""
-    body, law = Wrapped(task()), CONTROLLERS["computed torque"]
-    number: Any = lambda parameters, seed: parameters["c"]  # noqa: E731
-    nobody: Any = lambda parameters, seed: object()  # noqa: E731
-    wrongs: list[dict[str, Any]] = [{}, {"body": body, "make": lambda parameters, seed: body}]
-    for wrong in wrongs:
-        with pytest.raises(InvalidValue, match="expected either a body or make=lambda parameters, seed: body"):
-            fp.ExternalPlant(measures=MEASURES, **wrong)
-    with pytest.raises(InvalidValue, match="a body that stands cannot take parameters"):
-        fp.ExternalPlant(body, MEASURES, parameters=GAIN)
-    with pytest.raises(InvalidProblem, match=r"reset of the body that make returns raised .*'c'"):
-        run(task(reality=fp.ExternalPlant(make=number, measures=MEASURES)), law)
-    with pytest.raises(InvalidProblem, match="its body object has no method reset"):
-        run(task(reality=fp.ExternalPlant(make=nobody, measures=MEASURES)), law)
-    with pytest.raises(InvalidProblem, match="outside its bounds"):
-        made(task()).with_exact(np.array([20.0]))
+def loose(body: Any = None, **settings: Any) -> Any:
+    """An external plant from whatever is given."""
+    return fp.ExternalPlant(
+        body if "make" in settings else body or Wrapped(task()), **{"measures": MEASURES} | settings
+    )
+
+
+class Stepless:
+    """Half a body."""
+
+    reset = Wrapped.reset
+
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "no body": (lambda: fp.ExternalPlant(measures=MEASURES), "either a body or make=lambda parameters, seed: body"),
+    "two bodies": (lambda: loose(Wrapped(task()), make=lambda _p, _s: None), "either a body or make=lambda parameters"),
+    "half a body": (lambda: loose(Stepless()), "its body Stepless has no method step(...); it needs reset and step"),
+    "a body that is none": (lambda: loose(object()), "its body object has no method reset"),
+    "measures as a list": (lambda: loose(measures=["y"]), "measures: expected {name: a text}, got ['y']"),
+    "nothing measured": (lambda: task(reality=loose(measures={})), "it does not measure y (m), which the sensing"),
+    "not all": (lambda: task(reality=loose(measures={"y": "m", "y'": "m/s"})), "y'' (m/s^2), which the sensing"),
+    "a name": (lambda: task(reality=loose(measures={**MEASURES, "yy": "m"})), "'yy' is unknown. Did you mean 'y'?"),
+    "a unit": (
+        lambda: task(reality=loose(measures={**MEASURES, "y": "mm"})),
+        "measures y in mm, the model has it in m",
+    ),
+    "no deadline": (lambda: loose(deadline=0.0), "deadline: expected a finite number above 0 or None, got 0.0"),
+    "a word": (
+        lambda: loose(deadline="fast"),
+        "deadline: expected a finite number above 0 or None, got the text 'fast'",
+    ),
+    "a reset": (lambda: loose(reset_deadline=-1.0), "reset_deadline: expected a finite number above 0, got -1.0"),
+    "half a hold": (lambda: loose(holds=1.5), "holds: expected a whole number of at least 0, got 1.5"),
+    "an option": (lambda: loose(dead_times={}), "no field 'dead_times'. Did you mean 'dead_time'?"),
+    "a dead time": (lambda: loose(dead_time=0.002), "dead_time: expected {name: a number}, got 0.002; give it a name"),
+    "a negative one": (
+        lambda: task(reality=loose(dead_time={"u": -0.1})),
+        "dead_time: 'u' must be a number of at least 0",
+    ),
+    "an input": (lambda: task(reality=loose(dead_time={"v": 0.1})), "dead_time: input 'v' is unknown. Valid: u."),
+    "parameters alone": (lambda: loose(parameters=GAIN), "a body that stands cannot take parameters; write make="),
+    "a number": (lambda: loose(make=Wrapped, parameters={"b": 1.0}), "parameters['b']: expected a Parameter, got 1.0"),
+    "one argument": (lambda: loose(make=lambda _: None), "make: expected a function of 2 arguments or None"),
+    "made of nothing": (
+        lambda: run(task(reality=loose(make=lambda _p, _s: None))),
+        "its body NoneType has no method reset",
+    ),
+    "a name in make": (lambda: run(task(reality=loose(make=lambda p, _: p["c"]))), "make returns raised KeyError: 'c'"),
+    "out of bounds": (lambda: made(task()).with_exact(np.array([20.0])), "outside its bounds"),
+    "a disturbance": (lambda: outside(task(disturbances={"y": fp.Step(0.0, 1.0)})), "disturbances"),
+    "no object": (lambda: task(reality=Wrapped(task())), "reality: expected a Reality or an ExternalPlant"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_use_says_what_was_expected(name):
+    """What stands there, what was expected, and where it is mended."""
+    use, words = WRONG[name]
+    with pytest.raises(fp.FpirhcError) as caught:
+        use()
+    assert words in " ".join(str(caught.value).split())
 
 
 def test_contraction_is_identified_where_the_response_is_measured():
