@@ -267,7 +267,7 @@ def deform_block(
         largest: response of every controlled coordinate that the limits of the inputs allow; empty: any.
     """
     memory = deformation.memory(plant.controlled_names)
-    request_before = "_deformed_last" if deformation.mirror is None else "_modelled"
+    request_before = _REQUEST if deformation.mirror is None else "_modelled"
     responses = [plant.response_signal(name) for name in (request_before, "realised", "desired")]
     reads = (*responses, scalar("warm_up"))
 
@@ -279,8 +279,8 @@ def deform_block(
         learns = valid if sane is None else ca.logic_and(valid, sane)
         next_values = {f"{m}_next": ca.if_else(learns, next_memory[m], remembered[m]) for m in memory.names}
         shown = {name: next_values[f"{source}_next"] for name, source in deformation.shown().items()}
-        if sane is not None and deformation.mirror is None:
-            deformed = ca.if_else(sane, deformed, s._deformed_last)
+        if sane is not None and request_before == _REQUEST:
+            deformed = ca.if_else(sane, deformed, getattr(s, _REQUEST))
             learns = valid
         next_request = ca.if_else(learns, deformed, s.desired)
         return {"_deformed_unclipped": next_request, "_deformation": next_request - s.desired, **shown, **next_values}
@@ -405,7 +405,7 @@ def with_held_deformation(
         answered: number of cycles after which a response answers the last request; infinite where something is late.
     """
     block = replace(block, waits=_waiting(plant, deformation, block))
-    repeats = math.isfinite(answered) and deformation.adapts and deformation.mirror is None and not block.memory.names
+    repeats = math.isfinite(answered) and deformation.adapts and _REQUEST in block.reads and not block.memory.names
     lossy = _repeated(plant, deformation, block, answered) if repeats else block
     if settles:
         return replace(block, bridged=lambda: _settling(plant, deformation, lossy))
@@ -453,7 +453,7 @@ def _waiting(plant: Plant, deformation: Deformation, block: Block) -> Block | No
         return {f"{m}_next": v for m, v in (before | deformation.held(getattr(s, _REQUEST), before)).items()}
 
     symbols = {m.name: ca.SX.sym(m.name, m.size) for m in block.memory.signals}
-    changed = deformation.held(ca.SX.sym("r", request.size), symbols) if deformation.mirror is None else {}
+    changed = deformation.held(ca.SX.sym("r", request.size), symbols)
     return Block("deform_waits", Layout((request,)), Layout(), step, block.memory) if changed else None
 
 
@@ -465,7 +465,7 @@ def _settling(plant: Plant, deformation: Deformation, block: Block) -> Block:
         values = {name: expression(value) for name, value in block.step(s).items()}
         settling = s.settling > 0.5
         before = {m: getattr(s, m) for m in names}
-        stays = before | (deformation.held(getattr(s, _REQUEST), before) if deformation.mirror is None else {})
+        stays = before | deformation.held(getattr(s, block.reads.names[0]), before)
         held = {f"{m}_next": v for m, v in stays.items()}
         held |= {"_deformed_unclipped": s.desired + getattr(s, _HELD), "_deformation": getattr(s, _HELD)}
         values |= {name: ca.if_else(settling, value, values[name]) for name, value in held.items()}

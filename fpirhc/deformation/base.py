@@ -280,3 +280,9 @@ def require_numbers(owner: str, values: Mapping[str, float]) -> None:
 
 def _is_number(value: object) -> bool:
     return finite_number(value)
+
+
+def of_last_pair(deformation: Deformation) -> bool:
+    """Whether a request follows from the last request and its response alone: no model, pairing or filter of its own."""
+    iteration = deformation.iteration
+    return deformation.mirror is None and iteration.pairing is None and not iteration.error_pole

@@ -107,6 +107,10 @@ class ModelReferenced(Wrapper):
         """The pole p in use."""
         return chosen_pole(self.map.effective_gain(), self._delays, self.uncertainty, self.pole)
 
+    def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:  # noqa: ARG002
+        """Nothing: the request before is the model's response, which goes on beside it."""
+        return {}
+
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The deformations on their way, newest first, and the map's own memory."""
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)

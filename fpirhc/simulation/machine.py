@@ -21,6 +21,7 @@ from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.response_jumps import response_jumps
 from fpirhc.controllers.sensing_chain import compose_seeing, given_states, raw_signal
 from fpirhc.controllers.step_outcome import was_skipped
+from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported
 from fpirhc.plant.chain import measured_signals
@@ -95,11 +96,8 @@ def watch_block(problem: Problem, controller: Controller, status: str, *, longes
 def _iterates(problem: Problem, controller: Controller) -> bool:
     """Whether the map compares the last request with its response, undelayed."""
     deformation = controller.deformation
-    plain = (
-        deformation.mirror is None and deformation.iteration.pairing is None and not deformation.iteration.error_pole
-    )
     direct = not problem.answers_late and controller.response(problem) is None and controller.deforms == "response"
-    return deformation.adapts and plain and direct and deformation.effective_gain() != 0
+    return deformation.adapts and of_last_pair(deformation) and direct and deformation.effective_gain() != 0
 
 
 def _fit_memory(plant: Plant) -> tuple[Signal, ...]:
