@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,12 +11,14 @@ import pytest
 from hand_made_runs import CYCLES, SOLVE
 
 from fpirhc.simulation.metrics import Metrics, known_metrics
+from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
 from fpirhc.studies.comparison.caveats import Yardstick
 from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.timing import CycleTime, Price
 from fpirhc.studies.comparison.verdict import findings
+from fpirhc.studies.tuning.objective import Objective
 from fpirhc.symbolic.layout import Layout, Signal
 
 STOP = "signal 'x' is not finite"
@@ -35,7 +38,7 @@ def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, erro
     settings = {"step_limit": None, **changes.get("settings", {})}
     made = Run("case", name, 0, 0.1, Layout(tuple(signals)), log, changes.get("stop"), False, settings)
     numbers = {"rms_error": errors or {"y": 1.0}, **changes.get("measured", {})}
-    metrics = Metrics(numbers, {}, {m.name: m for m in known_metrics()})
+    metrics = Metrics(numbers, {}, {m.name: m for m in (*known_metrics(), *changes.get("metrics", ()))})
     factor = changes.get("factor")
     growing = changes.get("growing", float((factor or 0.0) >= 1))
     report = SimpleNamespace(
@@ -89,6 +92,55 @@ def test_where_nobody_finishes_every_end_is_told():
     assert said(entry("a", stop="x is not finite"), entry("b", stop="the plan is not finite"))[0] == (
         "No controller finished its run: a: x is not finite; b: the plan is not finite."
     )
+
+
+@pytest.mark.parametrize(
+    ("better", "before", "after", "outcome", "said_of_it"),
+    [
+        (
+            "smaller",
+            4.0,
+            2.0,
+            Outcome.BETTER,
+            "FPI improves loss (2 N after 4 N without adaptation; smaller is better).",
+        ),
+        ("larger", 4.0, 2.0, Outcome.WORSE, "FPI worsens loss (2 N after 4 N without adaptation; larger is better)."),
+        (
+            "larger",
+            -4.0,
+            -2.0,
+            Outcome.BETTER,
+            "FPI improves loss (-2 N after -4 N without adaptation; larger is better).",
+        ),
+        (
+            "smaller",
+            4.0,
+            4.0,
+            Outcome.NO_DIFFERENCE,
+            "FPI does not clearly change loss (4 N after 4 N without adaptation; smaller is better).",
+        ),
+        ("smaller", math.nan, 2.0, Outcome.BETTER, "By loss FPI and RHC cannot be set side by side: RHC has none."),
+        ("smaller", 4.0, math.nan, Outcome.WORSE, "By loss FPI and RHC cannot be set side by side: FPI has none."),
+        (
+            "larger",
+            math.nan,
+            math.nan,
+            Outcome.NOT_COMPARABLE,
+            "By loss FPI and RHC cannot be set side by side: RHC and FPI has none.",
+        ),
+    ],
+)
+def test_the_figure_that_a_problem_is_judged_by(better, before, after, outcome, said_of_it):
+    """Two numbers, which of them is better by its own direction, and who has none; the errors follow in a sentence of their own."""
+    loss = Metric("loss", lambda problem, run: 0.0, better=better, unit="N")
+    rows = [
+        entry(name, pair, measured={"loss": {"": value}}, metrics=[loss])
+        for name, pair, value in (("RHC", None, before), ("FPI", "RHC", after))
+    ]
+    figure = Objective(loss, unit="N")
+    one, other, *_ = findings(rows, {}, None, None, figure=figure)
+    assert (one.outcome, one.text) == (outcome, said_of_it)
+    assert other.text.startswith("FPI makes no clear difference: it changes the rms error of y")
 
 
 def test_several_coordinates():
