@@ -38,17 +38,17 @@ def commonroad_body(
         NotSupported: commonroad-vehicle-models is not installed.
         InvalidProblem: a name that the car or the model does not have, or a period that is no whole number of ms.
     """
-    units, mistakes, given = quantities(model), Mistakes("commonroad_body"), names or {}
+    units, mistakes, counterpart = quantities(model), Mistakes("commonroad_body"), names or {}
     mistakes.unknown("kind", [kind], ("st", "std"))
     own = dict.fromkeys(base_and_order(q)[0] for q in units)
-    mistakes.unknown("names: name of the model", given, [*own, *model.inputs])
-    seen = counterparts(mistakes, "coordinate", own, {n: v for n, v in given.items() if n in own}, _COORDINATES)
-    sent = {n: v for n, v in given.items() if n in model.inputs}
+    mistakes.unknown("names: name of the model", counterpart, [*own, *model.inputs])
+    shown = counterparts(mistakes, "coordinate", own, {n: v for n, v in counterpart.items() if n in own}, _COORDINATES)
+    sent = {n: v for n, v in counterpart.items() if n in model.inputs}
     inputs = counterparts(mistakes, "input", model.inputs, sent, ("steer", "acceleration"))
     mistakes.raise_if_any()
     count = steps_per_cycle("commonroad_body", period, _STEP)
     body = _Car(kind, speed, vehicle, count, tuple(inputs.values()))
-    body.read = [(order, _COORDINATES.index(seen[name])) for name, order in map(base_and_order, units)]
+    body.read = [(order, _COORDINATES.index(shown[name])) for name, order in map(base_and_order, units)]
     return ExternalPlant(body, measures=units)
 
 

@@ -161,7 +161,7 @@ def _newton_euler(
 
 def _in_order(root: ElementTree.Element, mistakes: Mistakes) -> list[_Joint]:
     """The joints, each after that of its parent."""
-    found = {}
+    joints = {}
     for one in root.iter("joint"):
         parent, child = one.find("parent"), one.find("child")
         if parent is None or child is None:  # such as a joint of a transmission
@@ -172,11 +172,11 @@ def _in_order(root: ElementTree.Element, mistakes: Mistakes) -> list[_Joint]:
         along = np.array([1.0, 0.0, 0.0]) if axis is None else _triple(axis.get("xyz", "1 0 0"))
         size = float(np.linalg.norm(along)) or 1.0
         ends = parent.get("link", ""), child.get("link", "")
-        found[ends[1]] = _Joint(name, kind, *ends, *_frame(one), along / size, _number(one, "dynamics", "damping"))
+        joints[ends[1]] = _Joint(name, kind, *ends, *_frame(one), along / size, _number(one, "dynamics", "damping"))
     ordered: list[_Joint] = []
-    reached = {j.parent for j in found.values()} - set(found)
-    while len(ordered) < len(found):
-        new = [j for j in found.values() if j.parent in reached and j.child not in reached]
+    reached = {j.parent for j in joints.values()} - set(joints)
+    while len(ordered) < len(joints):
+        new = [j for j in joints.values() if j.parent in reached and j.child not in reached]
         if not new:
             raise InvalidProblem("arm: links go round in a circle; expected a tree")
         ordered, reached = [*ordered, *new], reached | {j.child for j in new}
@@ -202,8 +202,8 @@ def _tensor(element: ElementTree.Element) -> np.ndarray:
 
 
 def _number(element: ElementTree.Element, name: str, attribute: str) -> float:
-    found = element.find(name)
-    return float(found.get(attribute, "0")) if found is not None else 0.0
+    child = element.find(name)
+    return float(child.get(attribute, "0")) if child is not None else 0.0
 
 
 def _triple(text: str) -> np.ndarray:

@@ -55,8 +55,8 @@ def portable(text: str, visible: str) -> str:
     for prologue in (_PREFIXES, _PREFIXED, _VISIBILITY):
         text = prologue.sub("", text)
     parts = list(_parts(_EXPORTED.sub("", text), visible))
-    kept = _reached(parts)
-    body = "".join(_static(part) for part in parts if not part.name or part.name in kept)
+    needed = _reached(parts)
+    body = "".join(_static(part) for part in parts if not part.name or part.name in needed)
     return re.sub(r"\n{3,}", "\n\n", body).lstrip("\n")
 
 
@@ -65,13 +65,13 @@ def _reached(parts: list[_Part]) -> set[str]:
     words = dict[str, set[str]]()
     for part in parts:
         words[part.name] = words.get(part.name, set()) | part.words
-    kept, waiting = set[str](), [one for part in parts if part.visible or not part.name for one in part.words]
+    needed, waiting = set[str](), [one for part in parts if part.visible or not part.name for one in part.words]
     while waiting:
         name = waiting.pop()
-        if name in words and name not in kept:
-            kept.add(name)
+        if name in words and name not in needed:
+            needed.add(name)
             waiting.extend(words[name])
-    return kept
+    return needed
 
 
 def _parts(text: str, visible: str) -> Iterator[_Part]:

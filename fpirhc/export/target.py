@@ -38,8 +38,8 @@ class Target:
 @cache
 def targets() -> dict[str, Target]:
     """Return all targets by name."""
-    found = [import_module(f"{package.__name__}.{m.name}").TARGET for m in iter_modules(package.__path__)]
-    return {target.name: target for target in sorted(found, key=lambda one: one.name)}
+    members = [import_module(f"{package.__name__}.{m.name}").TARGET for m in iter_modules(package.__path__)]
+    return {target.name: target for target in sorted(members, key=lambda one: one.name)}
 
 
 def target_called(name: str) -> Target:

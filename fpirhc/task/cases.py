@@ -114,17 +114,15 @@ class Cases(Checked):
         Raises:
             InvalidName: a pattern without a case.
         """
-        known = {name: (name, self.group(name)) for name in self.names}
-        wanted: set[str] = set()
+        texts = {name: (name, self.group(name)) for name in self.names}
+        matching: set[str] = set()
         for pattern in patterns:
-            found = {
-                n for n, texts in known.items() if pattern == EVERY or any(fnmatchcase(t, pattern) for t in texts if t)
-            }
-            if not found:
+            new = {n for n, own in texts.items() if pattern == EVERY or any(fnmatchcase(t, pattern) for t in own if t)}
+            if not new:
                 valid = dict.fromkeys((EVERY, *filter(None, map(self.group, self.names)), *self.names))
                 raise InvalidName(f"no case matches '{pattern}'.{nearest(pattern, valid)}")
-            wanted |= found
-        return tuple(name for name in self.names if name in wanted)
+            matching |= new
+        return tuple(name for name in self.names if name in matching)
 
     def problem(self, name: str, problem: Problem) -> Problem:
         """Return the problem in a case.
@@ -147,9 +145,9 @@ class Cases(Checked):
 
     def exactly(self, name: str, built: Problem) -> Problem:
         """Return what `build` returned, with the exact parameters of a case."""
-        given = {name: one.exact for name, one in built.moved.parameters.items()}
-        exact = {**given, **_exact_of(self.changes[name], given)}
-        if exact == given:
+        before = {name: one.exact for name, one in built.moved.parameters.items()}
+        exact = {**before, **_exact_of(self.changes[name], before)}
+        if exact == before:
             return built
         try:
             return built.with_exact(np.array(list(exact.values())))

@@ -246,6 +246,10 @@ class ExternalPlant(Checked):
 
 
 def _check_body(body: object) -> None:
+    if isinstance(body, type):
+        raise InvalidValue(
+            f"ExternalPlant: its body is the class {body.__name__}; write {body.__name__}() for an object of it"
+        )
     for name in ("reset", "step"):
         if not callable(getattr(body, name, None)):
             raise InvalidValue(

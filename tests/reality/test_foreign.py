@@ -449,6 +449,10 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no body": (lambda: fp.ExternalPlant(measures=MEASURES), "either a body or make=lambda parameters, seed: body"),
     "two bodies": (lambda: loose(Wrapped(task()), make=lambda _p, _s: None), "either a body or make=lambda parameters"),
     "half a body": (lambda: loose(Stepless()), "its body Stepless has no method step(...); it needs reset and step"),
+    "a body that is a class": (
+        lambda: loose(Stepless),
+        "its body is the class Stepless; write Stepless() for an object of it",
+    ),
     "a body that is none": (lambda: loose(object()), "its body object has no method reset"),
     "measures as a list": (lambda: loose(measures=["y"]), "measures: expected {name: a text}, got ['y']"),
     "nothing measured": (lambda: task(reality=loose(measures={})), "it does not measure y (m), which the sensing"),
