@@ -222,20 +222,28 @@ def test_a_model_that_does_not_settle_needs_a_stated_lag():
 
 
 def test_a_review_has_the_linear_loop_of_a_cascade():
-    """Its slowest mode is the largest root of the sampled loop by hand; questions about gains of responses are not covered."""
+    """Its slowest mode is the largest root of the sampled loop by hand, and so is its limit, which a right model sets first."""
     problem, gain = linear(0.6), 0.3
     answers = {
         a.question: a
         for a in fp.review(problem, {"c": fp.Cascade(STATIC, affine(gain))}, mismatch=0.0, seed=1).controllers["c"]
     }
     decay = np.exp(-4.0 / 5.0)
-    # States: output, shift in force, shift of the last cycle.
-    shift = np.array([-gain, gain, 1 - gain])
-    loop = np.array([[decay, 0, 0], [0, decay, 0], [0, 0, 0]]) + np.outer([(1 - decay) * 0.6, 1 - decay, 1], shift)
+
+    def radius(slope: float, effective: float) -> float:
+        """States: output, shift in force, shift of the last cycle."""
+        shift = np.array([-effective, effective, 1 - effective])
+        own = np.array([[decay, 0, 0], [0, decay, 0], [0, 0, 0]])
+        return float(np.abs(np.linalg.eigvals(own + np.outer([(1 - decay) * slope, 1 - decay, 1], shift))).max())
+
     verdict = answers["Does the deformation converge?"]
     assert verdict.verdict == "yes"
-    assert verdict.numbers["radius"] == pytest.approx(np.abs(np.linalg.eigvals(loop)).max(), rel=1e-4)
-    assert "not covered" in answers["Is the map's gain admissible?"].evidence
+    assert verdict.numbers["radius"] == pytest.approx(radius(0.6, gain), rel=1e-4)
+    admissible = answers["Is the map's gain admissible?"]
+    assert admissible.verdict == "yes"
+    limit = abs(admissible.numbers["limit"] / admissible.numbers["gain"]) * gain
+    assert radius(1.0, 0.999 * limit) < 1 < radius(1.0, 1.001 * limit)
+    assert radius(0.6, 1.001 * limit) < 1
     assert "Do the eigenvalues of the response Jacobian have one sign?" not in answers
 
 
