@@ -42,9 +42,10 @@ TANK = fp.Plant(
 
 @pytest.fixture(scope="module")
 def unit(tmp_path_factory):
+    # The builder imports the file by its name, and a module called tank may be there already.
     folder = tmp_path_factory.mktemp("fmu")
-    (folder / "tank.py").write_text(CODE)
-    return builder.FmuBuilder.build_FMU(folder / "tank.py", dest=folder)
+    (folder / "tank_unit.py").write_text(CODE)
+    return builder.FmuBuilder.build_FMU(folder / "tank_unit.py", dest=folder)
 
 
 def problem(reality: fp.ExternalPlant | None) -> fp.Problem:
