@@ -22,7 +22,6 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
-from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem
 
 Array = npt.NDArray[Any]
@@ -204,28 +203,21 @@ def _measured_once(trial: Trial, bad: float, entry: int | None, what: str) -> No
     """Replay a run with one bad value in one cycle: of an entry of the state, or (None) of the whole response."""
     run, lower, upper = trial.run, *trial.problem.limits.input_bounds(trial.problem.plant)
     # A stepper's gate keeps bad samples away; the controller itself must survive them too, inside of another one.
-    composite = compose_controller(trial.problem, trial.controller)
-    bare, model = Evaluator(composite.function), trial.controller.plant_model(trial.problem)
-    parameters = model.parameters(trial.problem.plant)
-
-    def step(*arguments: npt.ArrayLike) -> tuple[Array, Array, float]:
-        *measured, before = arguments
-        after, shown, command = bare(before, *measured, parameters)
-        return command, after, float(shown[composite.trace.slice("status")][0])
-
-    memory, status = composite.memory.start(), 0.0
+    memory, status = trial.replay.memory, 0.0
     for cycle in range(min(2 * _STEPS + 1, run.cycles)):
-        time, state, realised = float(run.time[cycle]), run["state"][cycle].copy(), run["realised"][cycle]
+        state, realised = run["state"][cycle].copy(), run["realised"][cycle]
         matters = False
         if cycle == _STEPS and entry is None:
             realised = np.full_like(realised, bad)
         elif cycle == _STEPS and entry is not None:
             state[entry] += 0.1
-            matters = not np.array_equal(step(time, state, realised, memory)[0], run["command"][cycle])
+            moved = trial.replay.cycle(cycle, memory, state=state, realised=realised)
+            matters = not np.array_equal(moved["command"], run["command"][cycle])
             state[entry] = bad
-        command, memory, status = step(time, state, realised, memory)
-        fine = bool(np.isfinite(command).all() and (command >= lower).all() and (command <= upper).all())
-        hold(fine, f"{what}: the command of cycle {cycle} is {command}")
+        said = trial.replay.cycle(cycle, memory, state=state, realised=realised)
+        memory, command, status = said.memory, said["command"], float(said["status"][0])
+        if not (np.isfinite(command).all() and (command >= lower).all() and (command <= upper).all()):
+            hold(False, f"{what}: the command of cycle {cycle} is {command}")
         hold(not matters or status != Status.OK, f"{what}: the status of that cycle is OK")
     hold(status != Status.NON_FINITE, f"{what}: {_STEPS} good measurements later the status is still NON_FINITE")
 

@@ -85,6 +85,11 @@ class Trial:
         return self.simulated(self.problem)
 
     @cached_property
+    def replay(self) -> Replay:
+        """The controller, given the motion of `run`."""
+        return Replay(self.problem, self.controller, self.run)
+
+    @cached_property
     def exact(self) -> Problem:
         """The problem with an exact model, ideal sensors and no disturbance."""
         plant = self.problem.plant
@@ -155,11 +160,21 @@ class Replay:
 
     def cycles(self) -> Iterator[Cycle]:
         """Yield the cycles of the run, each from the memory of the one before."""
-        memory = self._composite.memory.start()
+        memory = self.memory
         for k in range(self.run.cycles):
             cycle = self.cycle(k, memory)
             memory = cycle.memory
             yield cycle
+
+    @property
+    def memory(self) -> Array:
+        """Before the first cycle."""
+        return self._composite.memory.start()
+
+    @cached_property
+    def commands(self) -> Array:
+        """The commands of all cycles, a row each."""
+        return np.array([cycle["command"] for cycle in self.cycles()])
 
     def cycle(self, k: int, memory: Array, **instead: Array) -> Cycle:
         """The cycle k of the run from a memory, with other values of what is read where they are given by name."""
