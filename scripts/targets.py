@@ -1,10 +1,11 @@
-"""Write docs/targets.md: what exported controllers need and how they answer, measured here with the compiler that is found."""
+"""Write docs/targets.md: what exported controllers need and how they answer, by the compilers and FMPy that are here."""
 
 from __future__ import annotations
 
 import hashlib
 import re
 import subprocess
+import sys
 import tempfile
 import warnings
 from dataclasses import replace
@@ -14,6 +15,7 @@ import fpirhc as fp
 from fpirhc.export.target import device_of, target_called, write
 from fpirhc.symbolic.native import find_compiler
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "targets.md"
 CASES = (
     ("two_mass", "CTC+FPI (eq 6)", {}),
@@ -22,6 +24,7 @@ CASES = (
     ("anaesthesia", "RHC+FPI", {}),
     ("fishery", "RHC+FPI", {}),
 )
+UNITS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"))
 CYCLES = 2000
 
 
@@ -59,6 +62,22 @@ def row(problem: str, title: str, states: dict[str, tuple[float, float]]) -> lis
             f"{memory}", f"{work}", sums, digest]  # fmt: skip
 
 
+def unit_row(problem: str, title: str, target: str) -> list[str]:
+    """One line of the table of units: what FMPy finds, and how far a loop with the plant is from the run."""
+    from fmi_master import apart_from_a_run
+    from fmpy.validation import validate_fmu
+
+    task = fp.load_problem(problem)
+    device = device_of(task.problem, task.controllers[title], title, name="c", cycles=1)
+    with tempfile.TemporaryDirectory() as name:
+        write(device, target_called(target), Path(name))
+        path = Path(name) / "c.fmu"
+        found, size = len(validate_fmu(str(path))), path.stat().st_size
+        through = apart_from_a_run(device.problem, device.controller, path, CYCLES)
+        late = apart_from_a_run(device.problem, device.controller, path, CYCLES, late=True)
+    return [f"{problem}, {title}", target, f"{size / 1000:.0f}", f"{found}", f"{through[1]:.1g}", f"{late[1]:.3g}"]
+
+
 def _said(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
@@ -68,11 +87,22 @@ def main() -> None:
     warnings.simplefilter("ignore", fp.HarmfulAdaptation)
     text = PAGE.read_text(encoding="utf-8")
     head = ["controller", "code, kB", "struct, kB", "stack, kB", "memory", "work", "cycles that differ", "answers"]
-    rows = [head, ["---"] * len(head), *(row(*case) for case in CASES)]
-    table = "\n".join("| " + " | ".join(one) + " |" for one in rows)
-    PAGE.write_text(
-        re.sub(r"(<!-- table -->\n).*(\n<!-- end -->)", rf"\1{table}\2", text, flags=re.DOTALL), encoding="utf-8"
-    )
+    text = _filled(text, "table", head, [row(*case) for case in CASES])
+    head = [
+        "controller",
+        "target",
+        "archive, kB",
+        "problems by FMPy",
+        "command, inputs pass through",
+        "one period late",
+    ]
+    rows = [unit_row(problem, title, target) for problem, title in UNITS for target in ("fmu", "fmu2")]
+    PAGE.write_text(_filled(text, "units", head, rows), encoding="utf-8")
+
+
+def _filled(text: str, place: str, head: list[str], rows: list[list[str]]) -> str:
+    table = "\n".join("| " + " | ".join(one) + " |" for one in [head, ["---"] * len(head), *rows])
+    return re.sub(rf"(<!-- {place} -->\n).*?(\n<!-- end -->)", rf"\1{table}\2", text, flags=re.DOTALL)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,12 @@ from fpirhc.cli.verb import ExitCode, Verb
 def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
     parser.add_argument("controller", metavar="CONTROLLER", help="name of a controller in the problem file")
-    parser.add_argument("--to", metavar="TARGET", default="c", help="c: C99 for every compiler (default: c)")
+    parser.add_argument(
+        "--to",
+        metavar="TARGET",
+        default="c",
+        help="c: C99 for every compiler (default); fmu, fmu2: unit for other simulators",
+    )
     parser.add_argument("--out", metavar="FOLDER", required=True, help="folder for the files, new or empty")
     text = "prefix of everything in C (default: made of the names of problem and controller)"
     parser.add_argument("--name", metavar="NAME", help=text)
@@ -44,7 +49,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
 VERB = Verb(
     name="export",
-    summary="write a controller for a device: C without Python, bit by bit the same",
+    summary="write a controller for a device or another simulator: without Python, bit by bit the same",
     add=_add,
     run=_run,
     codes={ExitCode.NOT_WRITABLE: "the folder is not empty, or cannot be written"},
@@ -55,6 +60,7 @@ VERB = Verb(
             'fpirhc export two_mass "CTC+FPI (eq 6)" --out device --live deformation.gain limits.inputs.Q1',
             "and arm_set, which refuses numbers outside their bounds",
         ),
+        ('fpirhc export two_mass "RHC+FPI" --to fmu --out device', "an FMI 3.0 unit for co-simulation"),
     ),
     notes="""
 Where there is a compiler, recorded cycles with faults are compared bit by bit:

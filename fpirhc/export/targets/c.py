@@ -34,26 +34,30 @@ _TYPES = """#ifndef casadi_real
 """
 
 
-def _files(device: Device) -> Mapping[str, str | bytes]:
-    name, bodies = device.name, device.sources
-    names = [f"{name}_step{k or ''}.c" for k in range(len(bodies))]
+def sources(device: Device) -> dict[str, str]:
+    """Return the header and the C files of a controller by name."""
+    name = device.name
     before = f"/* {device.title}. Made by fpirhc from its symbolic step. */\n"
+    steps = {f"{name}_step{k or ''}.c": before + body for k, body in enumerate(device.sources)}
+    return {f"{name}.h": _header(device), f"{name}.c": _controller(device), **steps}
+
+
+def _files(device: Device) -> Mapping[str, str | bytes]:
+    own = sources(device)
     return {
-        f"{name}.h": _header(device),
-        f"{name}.c": _controller(device),
-        **{own: before + body for own, body in zip(names, bodies, strict=True)},
+        **own,
         "layout.json": json.dumps(_layout(device), indent=1),
         "samples.bin": recorded(device),
-        "main.c": _filled(device, "main.c"),
-        "CMakeLists.txt": _filled(device, "CMakeLists.txt", sources=" ".join([f"{name}.c", *names])),
+        "main.c": filled(device, "main.c"),
+        "CMakeLists.txt": filled(device, "CMakeLists.txt", sources=" ".join(n for n in own if n.endswith(".c"))),
     }
 
 
 TARGET = Target("c", "C99 without heap, files and globals: header, controller, layout, replay, CMake file", _files)
 
 
-def _filled(device: Device, template: str, **more: str) -> str:
-    """A template with its words between @ filled in."""
+def filled(device: Device, template: str, **more: str) -> str:
+    """Return a template of this folder with its words between @ filled in."""
     text = resources.files("fpirhc.export.targets").joinpath(template).read_text(encoding="utf-8")
     words = {"name": device.name, "NAME": device.name.upper(), "title": device.title, **more}
     return re.sub(r"@(\w+)@", lambda m: words[m[1]], text)
@@ -63,7 +67,7 @@ def _header(device: Device) -> str:
     name, upper, stepper = device.name, device.name.upper(), device.stepper
     memory, trace, sizes = stepper.memory, stepper.signals, device.sizes
     command = Layout((trace["command"],))
-    structs = {"inputs": device.inputs, **_data(device), "memory": memory, "command": command, "trace": trace}
+    structs = {"inputs": device.inputs, **data_of(device), "memory": memory, "command": command, "trace": trace}
     counts = {
         "INPUTS": device.inputs.size,
         "COMMANDS": command.size,
@@ -71,7 +75,7 @@ def _header(device: Device) -> str:
         "TRACE": trace.size,
         "STATUSES": len(Status),
     }
-    own = [f"  {name}_{part} {part};" for part in ("memory", *_data(device), "trace")]
+    own = [f"  {name}_{part} {part};" for part in ("memory", *data_of(device), "trace")]
     lines = [
         f"/* {device.title}. Made by fpirhc; names and units are those of layout.json.",
         "",
@@ -130,8 +134,8 @@ def _set_declaration(device: Device) -> list[str]:
     ]
 
 
-def _data(device: Device) -> dict[str, Layout]:
-    """The structs of what stays until somebody changes it, by name; none is empty."""
+def data_of(device: Device) -> dict[str, Layout]:
+    """Return the structs of what stays until somebody changes it, by name; none is empty."""
     parts = {s.name: Layout((s,)) for s in device.data.signals if s.size and (s.elements or s.units)}
     return parts if not device.settings.size else {**parts, "settings": device.settings}
 
@@ -168,7 +172,7 @@ def _controller(device: Device) -> str:
     memory, trace = stepper.memory, stepper.signals
     lower, upper = device.problem.limits.input_bounds(device.problem.plant)
     tables = {"START": stepper.start(), "LEAST": lower, "MOST": upper}
-    for part, layout in _data(device).items():
+    for part, layout in data_of(device).items():
         tables[part.upper()] = layout.start()
     texts = [_table(key, values) for key, values in tables.items()]
     texts += [
@@ -177,7 +181,7 @@ def _controller(device: Device) -> str:
         f"#define MISSED {device.most_missed}L",
     ]
     missing = next(k for k, s in enumerate(device.inputs.signals) if s.name != "time")
-    return _filled(
+    return filled(
         device,
         "controller.c",
         tables=of_type("\n".join(texts)),
@@ -190,14 +194,14 @@ def _controller(device: Device) -> str:
         command=str(trace.slice("command").start),
         first=str(device.inputs.slice(device.inputs.names[missing]).start),
         bind="\n".join(_bound(device)),
-        init="\n".join(f"  memcpy(&c->{part}, {part.upper()}, sizeof {part.upper()});" for part in _data(device)),
+        init="\n".join(f"  memcpy(&c->{part}, {part.upper()}, sizeof {part.upper()});" for part in data_of(device)),
         set=_setter(device),
     )
 
 
 def _bound(device: Device) -> list[str]:
     """Lines that tell the Function where its arguments are, in its order."""
-    lines, data = ["  c->arg[0] = (const casadi_real*)&c->memory;"], _data(device)
+    lines, data = ["  c->arg[0] = (const casadi_real*)&c->memory;"], data_of(device)
     for k, signal in enumerate(device.stepper.reads.signals, start=1):
         if signal.name in device.inputs:
             place = f"(const casadi_real*)in + {device.inputs.slice(signal.name).start}"
@@ -260,7 +264,7 @@ def _table(name: str, values: np.ndarray) -> str:
 
 def _layout(device: Device) -> dict[str, object]:
     stepper = device.stepper
-    layouts = {"inputs": device.inputs, **_data(device), "memory": stepper.memory, "trace": stepper.signals}
+    layouts = {"inputs": device.inputs, **data_of(device), "memory": stepper.memory, "trace": stepper.signals}
     return {
         "name": device.name,
         "of": device.title,

@@ -1,0 +1,72 @@
+"""Shared libraries of C files: for this machine by its compiler, and for others where ziglang is installed."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from fpirhc.errors import CompileError
+from fpirhc.symbolic.native import find_compiler
+
+# No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.
+_FLAGS = ("-std=c99", "-O2", "-s", "-shared", "-ffp-contract=off", "-fvisibility=hidden")
+_MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
+_SYSTEMS = {"linux": "linux", "darwin": "darwin", "win32": "windows"}
+ENDINGS = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}
+PLATFORMS = {  # and the names that zig has for them
+    "x86_64-linux": "x86_64-linux-gnu.2.17",
+    "aarch64-linux": "aarch64-linux-gnu.2.17",
+    "x86_64-windows": "x86_64-windows-gnu",
+    "x86_64-darwin": "x86_64-macos",
+    "aarch64-darwin": "aarch64-macos",
+}
+
+
+def shared_libraries(files: Mapping[str, str]) -> dict[str, bytes]:
+    """Return a shared library by platform, "x86_64-linux" and so on; nothing where there is no compiler.
+
+    Args:
+        files: C files and headers by name.
+
+    Raises:
+        CompileError: a compiler refuses them, with its message.
+    """
+    return {place: _built(files, command, place) for place, command in _compilers().items()}
+
+
+def _compilers() -> dict[str, list[str]]:
+    """The command of the compiler for each platform."""
+    commands = {}
+    if find_spec("ziglang") is not None:
+        # The plainest processor of each kind, for a library that goes to other machines.
+        for place, target in PLATFORMS.items():
+            commands[place] = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-mcpu=baseline"]
+    own = find_compiler()
+    if own is not None:
+        commands[_here()] = [own]
+    return commands
+
+
+def _here() -> str:
+    machine = platform.machine().lower()
+    return f"{_MACHINES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
+
+
+def _built(files: Mapping[str, str], command: Sequence[str], place: str) -> bytes:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in files.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        library, sources = folder / "library", [str(folder / file) for file in files if file.endswith(".c")]
+        elsewhere = () if place.endswith("windows") else ("-fPIC", "-lm")
+        done = subprocess.run(
+            [*command, *_FLAGS, *sources, *elsewhere, "-o", str(library)], capture_output=True, text=True, check=False
+        )
+        if done.returncode != 0:
+            raise CompileError(f"no library for {place}: {done.stderr.strip()[-2000:]}")
+        return library.read_bytes()
