@@ -68,6 +68,7 @@ WITH_MEMBERS = {
     "Problem",
     "LyapunovView",
     "Review",
+    "figures",
 }
 
 
@@ -102,7 +103,7 @@ def page() -> str:
 def _entry(name: str, member: object) -> list[str]:
     """What the page has of a public name: a class, a function, or a module with all of its own."""
     if isinstance(member, ModuleType):
-        return [f".. automodule:: {member.__name__}", "   :members:"]
+        return [f".. automodule:: {member.__name__}", *(["   :members:"] if name in WITH_MEMBERS else [])]
     kind = "autoclass" if isinstance(member, type) else "autofunction"
     return [f".. {kind}:: fpirhc.{name}", *(["   :members:"] if name in WITH_MEMBERS else [])]
 

@@ -1,20 +1,13 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .baselines.check import accept, check_baseline
+from .controllers import rivals
 from .controllers.computed_torque import ComputedTorque
 from .controllers.feedforward_only import FeedforwardOnly
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
 from .controllers.receding_horizon import RecedingHorizon
 from .controllers.replanning import FromMeasurement, FromMeasurementTracked, FromPlan
-from .controllers.rivals.acceleration_feedback import AccelerationFeedback
-from .controllers.rivals.adaptive_inverse_dynamics import AdaptiveInverseDynamics
-from .controllers.rivals.backstepping_mrac import BacksteppingMRAC
-from .controllers.rivals.force_mrac import ForceMRAC
-from .controllers.rivals.lyapunov_mrac import LyapunovMRAC
 from .controllers.rivals.pid import PID
-from .controllers.rivals.resolved_rate import ResolvedAccelerationRate
-from .controllers.rivals.sliding_mode import SlidingMode
-from .controllers.rivals.slotine_li import SlotineLi
 from .controllers.slots.chosen_schedules import ByError, ByLookAhead
 from .controllers.slots.schedules import FixedSchedule, Periodic
 from .controllers.slots.slot import Slot
@@ -116,13 +109,10 @@ from .tracking.linear_law import Exponential, ShiftPolynomial
 __all__ = [
     "PID",
     "RFPT",
-    "AccelerationFeedback",
-    "AdaptiveInverseDynamics",
     "Affine",
     "Algebraic",
     "Anderson",
     "Answer",
-    "BacksteppingMRAC",
     "Believed",
     "BeyondLimit",
     "ByDesired",
@@ -152,7 +142,6 @@ __all__ = [
     "Filtered",
     "FixedPoint",
     "FixedSchedule",
-    "ForceMRAC",
     "Formula",
     "FpirhcError",
     "Fractional",
@@ -178,7 +167,6 @@ __all__ = [
     "LogNormal",
     "LogSpan",
     "LowPassDifference",
-    "LyapunovMRAC",
     "LyapunovRule",
     "Measured",
     "Metric",
@@ -213,7 +201,6 @@ __all__ = [
     "RecedingHorizon",
     "RecursiveLeastSquares",
     "ReducedGradient",
-    "ResolvedAccelerationRate",
     "Rotation",
     "Run",
     "RunMonitor",
@@ -228,9 +215,7 @@ __all__ = [
     "ShiftPolynomial",
     "Sigmoid",
     "Sine",
-    "SlidingMode",
     "Slot",
-    "SlotineLi",
     "Slotted",
     "Span",
     "Spread",
@@ -264,6 +249,7 @@ __all__ = [
     "predict_response",
     "probe",
     "review",
+    "rivals",
     "signed_power",
     "simulate",
     "simulator",

@@ -128,7 +128,8 @@ def public_member(name: str) -> Any:
     """The member `FooBar` of the module `foo_bar`, or of a module of another distribution; None if there is none."""
     own = [package for kind in FAMILIES.values() for package in kind.packages]
     for package in own:
-        member = _in_module_of_its_name(importlib.import_module(package), name)
+        root = importlib.import_module(package)
+        member = _in_module_of_its_name(root, name) or _in_package(root, name)
         if member is not None:
             return member
     for point in entry_points(group=GROUP):
@@ -136,6 +137,15 @@ def public_member(name: str) -> Any:
         member = getattr(root, name, None) or _in_module_of_its_name(root, name)
         if member is not None:
             return member
+    return None
+
+
+def _in_package(root: ModuleType, name: str) -> Any:
+    """The value that a package below another one has in its list of public names; None if there is none."""
+    for info in pkgutil.iter_modules(getattr(root, "__path__", ()), f"{root.__name__}."):
+        package = importlib.import_module(info.name) if info.ispkg else None
+        if name in getattr(package, "__all__", ()):
+            return getattr(package, name)
     return None
 
 

@@ -146,9 +146,9 @@ damping = {"q1": 30.0, "q2": 15.0}  # N m s
 controllers = {
     "CT": fp.ComputedTorque(tracking),
     "CT+FPI": fp.ComputedTorque(tracking, sigmoid),
-    "AID": fp.AdaptiveInverseDynamics(tracking, adaptation, bounds),
-    "AID+FPI": fp.AdaptiveInverseDynamics(tracking, projection, bounds, deformation=sigmoid),
-    "Slotine-Li": fp.SlotineLi(6.0, damping, adaptation, bounds),
-    "Slotine-Li+FPI": fp.SlotineLi(6.0, damping, projection, bounds, deformation=sigmoid),
+    "AID": fp.rivals.AdaptiveInverseDynamics(tracking, adaptation, bounds),
+    "AID+FPI": fp.rivals.AdaptiveInverseDynamics(tracking, projection, bounds, deformation=sigmoid),
+    "Slotine-Li": fp.rivals.SlotineLi(6.0, damping, adaptation, bounds),
+    "Slotine-Li+FPI": fp.rivals.SlotineLi(6.0, damping, projection, bounds, deformation=sigmoid),
 }
 headline = ("CT", "CT+FPI")

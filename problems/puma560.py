@@ -180,8 +180,8 @@ damping = {"q1": 40.0, "q2": 40.0, "q3": 15.0, "q4": 2.0, "q5": 2.0, "q6": 2.0} 
 controllers = {
     "CT": fp.ComputedTorque(tracking),
     "CT+FPI": fp.ComputedTorque(tracking, sigmoid),
-    "AID": fp.AdaptiveInverseDynamics(tracking, adaptation, bounds),
-    "AID+FPI": fp.AdaptiveInverseDynamics(tracking, projection, bounds, deformation=sigmoid),
-    "Slotine-Li": fp.SlotineLi(10.0, damping, adaptation, bounds),
+    "AID": fp.rivals.AdaptiveInverseDynamics(tracking, adaptation, bounds),
+    "AID+FPI": fp.rivals.AdaptiveInverseDynamics(tracking, projection, bounds, deformation=sigmoid),
+    "Slotine-Li": fp.rivals.SlotineLi(10.0, damping, adaptation, bounds),
 }
 headline = ("CT", "CT+FPI")

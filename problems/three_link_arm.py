@@ -134,8 +134,8 @@ controllers = {
     "CT": fp.ComputedTorque(tracking),
     "CT+FPI": fp.ComputedTorque(tracking, sigmoid),
     "CT+FPI, half gain": fp.ComputedTorque(tracking, sigmoid.with_effective_gain(sigmoid.effective_gain() / 2)),
-    "AID": fp.AdaptiveInverseDynamics(tracking, slow, bounds),
-    "AID+FPI": fp.AdaptiveInverseDynamics(tracking, slow, bounds, deformation=sigmoid),
-    "Slotine-Li": fp.SlotineLi(8.0, damping, adaptation, bounds),
+    "AID": fp.rivals.AdaptiveInverseDynamics(tracking, slow, bounds),
+    "AID+FPI": fp.rivals.AdaptiveInverseDynamics(tracking, slow, bounds, deformation=sigmoid),
+    "Slotine-Li": fp.rivals.SlotineLi(8.0, damping, adaptation, bounds),
 }
 headline = ("CT", "CT+FPI")

@@ -503,3 +503,20 @@ def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformatio
     closing, delays = closing_blocks(problem, deformation)
     update = bounded(problem, tracking).update(plant, problem.period)
     return [*desired_blocks(problem, tracking), *closing, update], [*delays, *tracking.delays(plant)]
+
+
+def law_blocks(problem: Problem, tracking: Tracking, *law: Block) -> tuple[list[Block], list[Delay]]:
+    """Return the blocks reference, tracking, those of a law without a deformation, limit, judge, running and tracking update.
+
+    The law reads 'desired' and writes 'command_unclipped' and '_deformed_unclipped'; see `commanding_blocks`.
+    """
+    plant = problem.plant
+    closing, delays = commanding_blocks(problem)
+    update = bounded(problem, tracking).update(plant, problem.period)
+    return [*desired_blocks(problem, tracking), *law, *closing, update], [*delays, *tracking.delays(plant)]
+
+
+def input_gain(plant: Plant) -> ca.Function:
+    """Return the Function (state, input, parameters) -> derivative of the controlled response with respect to the inputs."""
+    x, u, p = plant.symbols()
+    return ca.Function("fpirhc_input_gain", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])

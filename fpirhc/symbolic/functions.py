@@ -54,6 +54,11 @@ def exp(x: float) -> float:
     return x.called(math.exp, ca.exp) if isinstance(x, LiveNumber) else math.exp(x)
 
 
+def cos(x: float) -> float:
+    """Return cos of a number, live or not."""
+    return x.called(math.cos, ca.cos) if isinstance(x, LiveNumber) else math.cos(x)
+
+
 def signed(size: float, sign: float) -> float:
     """Return the size of a number, live or not, with the sign of another one."""
     if isinstance(sign, LiveNumber):

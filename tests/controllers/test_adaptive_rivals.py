@@ -39,11 +39,11 @@ TRACKING = fp.Exponential(rate=4.0)
 SIGMOID = fp.Sigmoid(gain=-1.0, scale=50.0)
 ADAPTATION = fp.LyapunovRule({"m": 1e2, "b": 1e3, "k": 1e4, "c": 1e4})
 GENTLE = fp.LyapunovRule({"m": 1.0, "b": 10.0, "k": 100.0, "c": 100.0})
-AID = fp.AdaptiveInverseDynamics(TRACKING, ADAPTATION, BOX)
-NLMS = fp.AdaptiveInverseDynamics(TRACKING, fp.Projection(gain=0.02), BOX)
-SLOTINE_LI = fp.SlotineLi(4.0, {"q": 8.0}, GENTLE, dict.fromkeys(BOX, FREE))
+AID = fp.rivals.AdaptiveInverseDynamics(TRACKING, ADAPTATION, BOX)
+NLMS = fp.rivals.AdaptiveInverseDynamics(TRACKING, fp.Projection(gain=0.02), BOX)
+SLOTINE_LI = fp.rivals.SlotineLi(4.0, {"q": 8.0}, GENTLE, dict.fromkeys(BOX, FREE))
 NLMS_FPI = replace(NLMS, deformation=SIGMOID)
-SLOTINE_LI_FPI = fp.SlotineLi(4.0, {"q": 8.0}, fp.Projection(gain=0.02), BOX, deformation=SIGMOID)
+SLOTINE_LI_FPI = fp.rivals.SlotineLi(4.0, {"q": 8.0}, fp.Projection(gain=0.02), BOX, deformation=SIGMOID)
 
 
 def rich(t):
@@ -172,7 +172,7 @@ def book(believed):
 
 
 BOOK_RULE = fp.LyapunovRule({"a1": 0.03, "a2": 0.05, "a3": 0.1, "a4": 0.3})
-BOOK = fp.SlotineLi(20.0, {"q1": 100.0, "q2": 100.0}, BOOK_RULE, dict.fromkeys(BOOK_RULE.gains, FREE))
+BOOK = fp.rivals.SlotineLi(20.0, {"q1": 100.0, "q2": 100.0}, BOOK_RULE, dict.fromkeys(BOOK_RULE.gains, FREE))
 NOTHING = (0.02, 0.01, 0.0, 0.0)
 
 
@@ -319,7 +319,7 @@ def test_combinations_are_learned_like_parameters():
         period=2e-3,
         duration=6.0,
     )
-    learning = fp.AdaptiveInverseDynamics(
+    learning = fp.rivals.AdaptiveInverseDynamics(
         fp.Exponential(rate=6.0), fp.Projection(gain=0.05), {"inertia": (0.1, 1.0), "weight": (0.1, 2.0)}, combinations
     )
     run = fp.simulate(problem, learning, seed=0, compiled=False)
@@ -430,7 +430,7 @@ REFUSED = {
     ),
     "order other than 2": (
         fp.Problem(chain(1), fp.Trajectory(lambda t: {"y": t}), {"y": 0}, period=1e-3, duration=1.0),
-        fp.SlotineLi(1.0, {"y": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),
+        fp.rivals.SlotineLi(1.0, {"y": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),
         NotSupported,
         "'y' of order 1",
     ),
@@ -442,13 +442,13 @@ REFUSED = {
     ),
     "inputs that work along the other coordinate": (
         fp.Problem(crossed(), fp.Trajectory(lambda t: {"x": t, "y": t}), {"x": 0, "y": 0}, period=1e-3, duration=1.0),
-        fp.SlotineLi(1.0, {"x": 1.0, "y": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),
+        fp.rivals.SlotineLi(1.0, {"x": 1.0, "y": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),
         NotSupported,
         "not symmetric",
     ),
     "inertia that depends on velocity": (
         fp.Problem(relativistic(), fp.Trajectory(lambda t: {"x": t}), {"x": 0}, period=1e-3, duration=1.0),
-        fp.SlotineLi(1.0, {"x": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),
+        fp.rivals.SlotineLi(1.0, {"x": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),
         NotSupported,
         "not independent of q'",
     ),
@@ -475,7 +475,7 @@ def test_what_does_not_fit_is_refused_before_the_run(why):
         (lambda: fp.Projection(2.0), "between 0 and 2"),
         (lambda: fp.Projection(0.5, dead_zone=-1.0), "at least 0"),
         (lambda: fp.LyapunovRule({"m": 0.0}), "positive"),
-        (lambda: fp.SlotineLi(0.0, {"q": 1.0}, GENTLE, BOX), "'rate'"),
+        (lambda: fp.rivals.SlotineLi(0.0, {"q": 1.0}, GENTLE, BOX), "'rate'"),
     ],
 )
 def test_settings_out_of_range_are_refused(build, reason):

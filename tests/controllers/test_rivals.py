@@ -22,12 +22,12 @@ TRACK = fp.Exponential(rate=RATE)
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=10.0)
 RIVALS = (
     fp.PID({"angle": 80.0}, {"angle": 160.0}, {"angle": 12.0}),
-    fp.ResolvedAccelerationRate(RATE),
-    fp.AccelerationFeedback(TRACK, gain=4.0, time_constant=0.02),
-    fp.SlidingMode(rate=RATE, gain=50.0, width=1.0),
-    fp.ForceMRAC(TRACK, SIGMOID, {"m": 2.0}),
-    fp.BacksteppingMRAC(RATE, (RATE, RATE), SIGMOID),
-    fp.LyapunovMRAC(RATE, adaptation=1.0),
+    fp.rivals.ResolvedAccelerationRate(RATE),
+    fp.rivals.AccelerationFeedback(TRACK, gain=4.0, time_constant=0.02),
+    fp.rivals.SlidingMode(rate=RATE, gain=50.0, width=1.0),
+    fp.rivals.ForceMRAC(TRACK, SIGMOID, {"m": 2.0}),
+    fp.rivals.BacksteppingMRAC(RATE, (RATE, RATE), SIGMOID),
+    fp.rivals.LyapunovMRAC(RATE, adaptation=1.0),
 )
 by_name = pytest.mark.parametrize("rival", RIVALS, ids=lambda r: type(r).__name__)
 
@@ -99,7 +99,7 @@ def test_pid_serves_other_relative_orders(order, derivative):
 
 def test_sliding_mode_holds_the_residual_at_the_computed_distance():
     """|S| = w atanh(residual / K) and e = S / rate, to three digits."""
-    law = fp.SlidingMode(rate=RATE, gain=20.0, width=0.5)
+    law = fp.rivals.SlidingMode(rate=RATE, gain=20.0, width=0.5)
     run = simulate(resting(chain(2), disturbances={"y": fp.Step(at=0.0, size=-8.0)}, period=1e-3), law)
     expected = 0.5 * np.arctanh(8.0 / 20.0)
     assert run["surface.y"][-1] == pytest.approx(expected, rel=1e-3)
@@ -109,7 +109,7 @@ def test_sliding_mode_holds_the_residual_at_the_computed_distance():
 @pytest.mark.parametrize("product", [0.5, 1.0, 1.9])
 def test_sliding_mode_multiplies_a_small_surface_by_one_minus_gain_period_over_width(product):
     """For relative order one S is the error, and the factor is exact."""
-    law = fp.SlidingMode(rate=RATE, gain=product * 100.0, width=1.0)
+    law = fp.rivals.SlidingMode(rate=RATE, gain=product * 100.0, width=1.0)
     surface = simulate(resting(chain(1), 1e-4, duration=0.1), law)["surface.y"]
     np.testing.assert_allclose(surface[1:5], (1 - product) * surface[:4], atol=1e-11)
 
@@ -120,7 +120,7 @@ def test_sliding_mode_multiplies_a_small_surface_by_one_minus_gain_period_over_w
 def test_acceleration_rate_contracts_as_predicted():
     """On the double integrator (e, e', e'') follows the sampled matrix of (d/dt + rate)^3 e = 0."""
     period = 1e-2
-    run = simulate(resting(chain(2), period=period), fp.ResolvedAccelerationRate(RATE))
+    run = simulate(resting(chain(2), period=period), fp.rivals.ResolvedAccelerationRate(RATE))
     third = np.eye(3)[2] - period * np.array([RATE**3, 3 * RATE**2, 3 * RATE])  # acceleration of the coming period
     matrix = np.array([[1, period, 0], [0, 1, 0], [0, 0, 0]]) + np.outer([period**2 / 2, period, 1], third)
     states = np.column_stack([run["state"], run["realised"]])[1:]
@@ -132,7 +132,7 @@ def test_acceleration_rate_contracts_as_predicted():
 @pytest.mark.parametrize(("gain", "decays"), [(0.06, False), (0.2, True), (3.0, True)])
 def test_acceleration_rate_needs_a_ninth_of_the_model_gain(gain, decays):
     """Stability limit J > 1/9 for relative order two."""
-    run = simulate(resting(linear(gain, 1.0), duration=12.0), fp.ResolvedAccelerationRate(RATE))
+    run = simulate(resting(linear(gain, 1.0), duration=12.0), fp.rivals.ResolvedAccelerationRate(RATE))
     late = np.abs(run["error.y"][-200:]).max()
     assert late < 0.02 if decays else late > 1.0
 
@@ -140,7 +140,7 @@ def test_acceleration_rate_needs_a_ninth_of_the_model_gain(gain, decays):
 def test_acceleration_rate_forgets_a_constant_residual():
     """Only the model's changes count."""
     load = {"y": fp.Step(at=0.0, size=-8.0)}
-    run = simulate(resting(chain(2), disturbances=load, duration=5.0), fp.ResolvedAccelerationRate(RATE))
+    run = simulate(resting(chain(2), disturbances=load, duration=5.0), fp.rivals.ResolvedAccelerationRate(RATE))
     assert abs(run["error.y"][-1]) < 1e-6
 
 
@@ -150,7 +150,7 @@ def test_acceleration_rate_forgets_a_constant_residual():
 @pytest.mark.parametrize(("gain", "time_constant"), [(0.5, 0.0), (4.0, 0.05)])
 def test_acceleration_feedback_divides_the_residual(gain, time_constant):
     """A constant residual w leaves the response error w / (1 + kappa)."""
-    law = fp.AccelerationFeedback(fp.Exponential(RATE, integral=False), gain, time_constant)
+    law = fp.rivals.AccelerationFeedback(fp.Exponential(RATE, integral=False), gain, time_constant)
     run = simulate(resting(chain(2), disturbances={"y": fp.Step(at=0.0, size=-8.0)}), law)
     assert run["realised.y"][-1] - run["desired.y"][-1] == pytest.approx(-8.0 / (1 + gain), rel=1e-3)
 
@@ -160,7 +160,7 @@ def test_acceleration_feedback_has_the_computed_limit(time_constant):
     """Stable at 0.9, unstable at 1.1 of (1 + p) / (1 - p)."""
     sizes = []
     for share in (0.9, 1.1):
-        law = fp.AccelerationFeedback(fp.Exponential(0.1, integral=False), 1.0, time_constant)
+        law = fp.rivals.AccelerationFeedback(fp.Exponential(0.1, integral=False), 1.0, time_constant)
         law = replace(law, gain=share * law.largest_gain(1e-2))
         load = {"y": fp.Pulse(at=0.5, duration=0.1, size=1.0)}
         run = simulate(resting(chain(2), 0.0, disturbances=load, period=1e-2), law)
@@ -190,7 +190,7 @@ def test_force_mrac_believes_in_the_reference_model():
     problem = fp.Problem(plant, moving, {"q": 0.0}, 1e-3, 10.0, measure_from=3.0)
     collected = []
     for deformation in (fp.Identity(), SIGMOID):
-        run = simulate(problem, fp.ForceMRAC(fp.Exponential(3.7), deformation))
+        run = simulate(problem, fp.rivals.ForceMRAC(fp.Exponential(3.7), deformation))
         late = slice(3000, run.cycles)
         desired, before = run["force_desired"][late], run["force_desired"][2999:-1]
         errors = (run["error"][late], run["force_recalculated"][late] - before, run["command"][late] - desired)
@@ -204,9 +204,9 @@ def test_force_mrac_believes_in_the_reference_model():
 def test_force_mrac_is_computed_torque_with_a_deformed_command():
     """Without a deformation they are one; with it the automatic scale, in units of the input, serves as well."""
     problem = swing()
-    plain = [simulate(problem, c) for c in (fp.ForceMRAC(TRACK, fp.Identity()), fp.ComputedTorque(TRACK))]
+    plain = [simulate(problem, c) for c in (fp.rivals.ForceMRAC(TRACK, fp.Identity()), fp.ComputedTorque(TRACK))]
     np.testing.assert_allclose(plain[0]["command"], plain[1]["command"], atol=1e-9)
-    scaled = [simulate(problem, fp.ForceMRAC(TRACK, s)) for s in (SIGMOID, fp.Sigmoid(gain=-0.5))]
+    scaled = [simulate(problem, fp.rivals.ForceMRAC(TRACK, s)) for s in (SIGMOID, fp.Sigmoid(gain=-0.5))]
     late = [rms(r["error"][2000:]) for r in (*scaled, plain[0])]
     assert late[1] == pytest.approx(late[0], rel=0.02)
     assert 20 * late[0] < late[2]
@@ -217,7 +217,7 @@ def test_nested_errors_decay_as_prescribed(rates):
     """After a push V = sum z^2 / 2 falls, at the rate -sum k z^2, for relative orders one to three."""
     push = {"y": fp.Pulse(at=0.1, duration=0.2, size=5.0)}
     problem = resting(chain(len(rates)), disturbances=push, period=1e-3, duration=1.5)
-    nested = simulate(problem, fp.BacksteppingMRAC(2.0, rates, fp.Identity()))["nested"][310:]
+    nested = simulate(problem, fp.rivals.BacksteppingMRAC(2.0, rates, fp.Identity()))["nested"][310:]
     function = 0.5 * np.sum(nested**2, axis=1)
     assert function[0] > 1e-3
     assert np.all(np.diff(function) < 0)
@@ -229,7 +229,7 @@ def test_backstepping_follows_its_model_with_the_iteration():
     """The deformation realises the highest derivative: the deviation from the reference model falls at least 20 times."""
     deviations = []
     for deformation in (fp.Identity(), SIGMOID):
-        run = simulate(swing(), fp.BacksteppingMRAC(3.0, (RATE, RATE), deformation))
+        run = simulate(swing(), fp.rivals.BacksteppingMRAC(3.0, (RATE, RATE), deformation))
         deviations.append(rms(run["model.angle"] - run["state.angle"]))
     assert 20 * deviations[1] < deviations[0]
 
@@ -245,7 +245,7 @@ def adapted(period, gain, duration=20.0):
     )
     moving = fp.Trajectory(lambda t: {"y": ca.sin(t) + 0.5 * ca.sin(2.7 * t)})
     problem = fp.Problem(plant, moving, {"y": 0.5}, period, duration)
-    law = fp.LyapunovMRAC(4.0, adaptation=10.0)
+    law = fp.rivals.LyapunovMRAC(4.0, adaptation=10.0)
     run = simulate(problem, law)
     before = np.vstack([run["gains"][:1], run["gains"][:-1]])[1:]  # of the state at the cycle's start
     matched = np.array([3.0, 0.5, 1.0, -1.0]) / gain
@@ -271,7 +271,7 @@ def test_lyapunov_function_falls_and_the_error_goes_to_zero(gain):
 @pytest.mark.parametrize(("share", "grows"), [(0.8, False), (1.25, True)])
 def test_adaptation_has_the_computed_limit(share, grows):
     """At rest only the bias is adapted, |phi| = 1: stable below gamma |B| period / 2 = rate."""
-    law = fp.LyapunovMRAC(RATE, adaptation=share * 2 * RATE / 1e-2)
+    law = fp.rivals.LyapunovMRAC(RATE, adaptation=share * 2 * RATE / 1e-2)
     load = {"y": fp.Pulse(at=0.1, duration=0.1, size=1e-6)}
     speeds = np.abs(simulate(resting(chain(2), 0.0, disturbances=load), law)["state.y'"])
     assert (speeds[200:].max() > speeds[:60].max()) == grows
@@ -282,7 +282,7 @@ def test_leakage_binds_the_gains_to_the_model():
     problem = swing(disturbances={"torque": fp.Sine(amplitude=2.0, frequency=1.5)}, duration=6.0)
     shifted = []
     for leakage in (0.0, 5.0):
-        gains = simulate(problem, fp.LyapunovMRAC(RATE, adaptation=20.0, leakage=leakage))["gains"]
+        gains = simulate(problem, fp.rivals.LyapunovMRAC(RATE, adaptation=20.0, leakage=leakage))["gains"]
         shifted.append(np.abs(gains - gains[0]).max())
     assert shifted[1] < 0.7 * shifted[0]
 
@@ -297,7 +297,7 @@ def test_lyapunov_mrac_on_a_coupled_plant():
     )
     moving = fp.Trajectory(lambda t: {"a": ca.sin(t), "b": ca.cos(1.7 * t)})
     problem = fp.Problem(plant, moving, {"a": 0.0, "b": 1.0}, 4e-3, 40.0)
-    run = simulate(problem, fp.LyapunovMRAC(4.0, adaptation=10.0))
+    run = simulate(problem, fp.rivals.LyapunovMRAC(4.0, adaptation=10.0))
     deviation = np.abs(run["model"] - run["state"])[:, :2].max(axis=1)
     assert deviation[-500:].max() < 0.1 * deviation.max()
 
@@ -308,8 +308,8 @@ VIEWED = (
     fp.ComputedTorque(TRACK),
     fp.ComputedTorque(fp.Exponential(RATE, integral=False)),
     fp.ComputedTorque(TRACK, SIGMOID),
-    fp.ForceMRAC(TRACK, SIGMOID),
-    fp.AccelerationFeedback(TRACK, 4.0, 0.02),
+    fp.rivals.ForceMRAC(TRACK, SIGMOID),
+    fp.rivals.AccelerationFeedback(TRACK, 4.0, 0.02),
     fp.ExactModel(fp.ComputedTorque(TRACK)),
 )
 
@@ -355,16 +355,20 @@ def cart_pole():
 
 
 MISFITS = {
-    "not fully actuated": (cart_pole, fp.LyapunovMRAC(RATE, 1.0), "'angle' has no input of its own"),
+    "not fully actuated": (cart_pole, fp.rivals.LyapunovMRAC(RATE, 1.0), "'angle' has no input of its own"),
     "coordinate not controlled": (cart_pole, fp.PID({"angle": 1.0}), "controlled coordinate 'angle' is unknown"),
     "unknown coordinate": (swing, fp.PID({"angle": 1.0}, {"angel": 1.0}), "Did you mean 'angle'"),
     "no gain": (swing, fp.PID({}), "'angle' has no gain"),
     "wrong sign": (swing, fp.PID({"angle": -1.0}), "does not bring it back"),
     "too many gains": (swing, fp.PID({"angle": 1.0}, {}, {"angle": (1.0, 1.0)}), "at most 1 gains of e'"),
-    "wrong order": (swing, fp.BacksteppingMRAC(RATE, (1.0, 1.0, 1.0), SIGMOID), "relative order 2, but rates has 3"),
-    "unknown parameter": (swing, fp.ForceMRAC(TRACK, SIGMOID, {"mass": 1.0}), "parameter 'mass' is unknown"),
-    "no number": (swing, fp.ForceMRAC(TRACK, SIGMOID, {"m": float("inf")}), "'m' must be a finite number"),
-    "chattering": (swing, fp.SlidingMode(RATE, 500.0, 0.2), "chatters with any model"),
+    "wrong order": (
+        swing,
+        fp.rivals.BacksteppingMRAC(RATE, (1.0, 1.0, 1.0), SIGMOID),
+        "relative order 2, but rates has 3",
+    ),
+    "unknown parameter": (swing, fp.rivals.ForceMRAC(TRACK, SIGMOID, {"mass": 1.0}), "parameter 'mass' is unknown"),
+    "no number": (swing, fp.rivals.ForceMRAC(TRACK, SIGMOID, {"m": float("inf")}), "'m' must be a finite number"),
+    "chattering": (swing, fp.rivals.SlidingMode(RATE, 500.0, 0.2), "chatters with any model"),
 }
 
 
@@ -379,7 +383,7 @@ def test_what_does_not_fit_is_refused_before_a_run(case):
 def test_what_does_not_fit_is_skipped_in_a_comparison():
     """The others run, and the report's table has a row with the reason."""
     problem = swing(duration=0.2, measure_from=0.0)
-    controllers = {"CTC": VIEWED[0], "odd": fp.BacksteppingMRAC(RATE, (1.0,), SIGMOID)}
+    controllers = {"CTC": VIEWED[0], "odd": fp.rivals.BacksteppingMRAC(RATE, (1.0,), SIGMOID)}
     comparison = compare(Task("case", Path("case.py"), "title", "", problem, controllers), seed=0, compiled=False)
     assert [e.name for e in comparison.entries] == ["CTC"]
     assert "not run: BacksteppingMRAC" in render(comparison)
@@ -388,13 +392,13 @@ def test_what_does_not_fit_is_skipped_in_a_comparison():
 @pytest.mark.parametrize(
     "build",
     [
-        lambda: fp.SlidingMode(RATE, -1.0, 1.0),
-        lambda: fp.ResolvedAccelerationRate(0.0),
-        lambda: fp.AccelerationFeedback(TRACK, float("nan")),
-        lambda: fp.AccelerationFeedback(TRACK, 1.0, -1.0),
-        lambda: fp.BacksteppingMRAC(RATE, (1.0, -1.0), SIGMOID),
-        lambda: fp.LyapunovMRAC(RATE, 0.0),
-        lambda: fp.LyapunovMRAC(RATE, 1.0, leakage=-1.0),
+        lambda: fp.rivals.SlidingMode(RATE, -1.0, 1.0),
+        lambda: fp.rivals.ResolvedAccelerationRate(0.0),
+        lambda: fp.rivals.AccelerationFeedback(TRACK, float("nan")),
+        lambda: fp.rivals.AccelerationFeedback(TRACK, 1.0, -1.0),
+        lambda: fp.rivals.BacksteppingMRAC(RATE, (1.0, -1.0), SIGMOID),
+        lambda: fp.rivals.LyapunovMRAC(RATE, 0.0),
+        lambda: fp.rivals.LyapunovMRAC(RATE, 1.0, leakage=-1.0),
     ],
 )
 def test_settings_are_checked(build):

@@ -279,7 +279,7 @@ def test_slots_begin_where_the_last_command_was_realised():
 def test_force_mrac_compares_commands():
     """Where commands are deformed the last command is the model's own answer: an exact reference model changes nothing."""
     module = fp.load_problem("mrac_pendulum")
-    name = next(n for n, c in module.controllers.items() if isinstance(c, fp.ForceMRAC))
+    name = next(n for n, c in module.controllers.items() if isinstance(c, fp.rivals.ForceMRAC))
     controller: Any = module.controllers[name]
     problem = short(with_exact_model(module.problem), 1000)
     own: Any = replace(controller, model={}, deformation=fp.ModelReferenced(fp.Affine(gain=-1.0)))
@@ -309,7 +309,7 @@ def test_forms_that_cannot_be_used(deformation, sentence):
 
 def test_controllers_that_cannot_use_it():
     """ForceMRAC behind a dead time has nothing to mirror it with; a slot cannot keep commands of another slot."""
-    controller = fp.ForceMRAC(LAW, fp.ModelReferenced(affine(0.5)))
+    controller = fp.rivals.ForceMRAC(LAW, fp.ModelReferenced(affine(0.5)))
     with pytest.raises(
         NotSupported, match="ForceMRAC cannot use a model-referenced deformation here: it compares the last command"
     ):

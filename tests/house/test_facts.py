@@ -362,7 +362,7 @@ def test_a_pair_is_found_through_wrappers():
     assert without_deformation(adaptive) == plain
     assert without_deformation(plain) is plain
     with pytest.raises(NotSupported, match="no deformation that can be replaced"):
-        Named(fp.AccelerationFeedback(TRACK, gain=1.0)).with_deformation(fp.Affine(-0.5))
+        Named(fp.rivals.AccelerationFeedback(TRACK, gain=1.0)).with_deformation(fp.Affine(-0.5))
 
 
 def test_a_wrapper_that_hides_its_inner_controller_says_what_to_do():

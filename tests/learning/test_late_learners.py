@@ -155,7 +155,7 @@ def test_a_rule_of_inverse_dynamics_learns_behind_dead_time():
     )
     problem = spring(plant=plant, dead_time=fp.DeadTime(inputs={"u": 0.03}), duration=10.0)
     bounds = {"k": (0.0, 10.0), "m": (0.2, 5.0)}
-    result = run(problem, fp.SlotineLi(2.0, {"y": 4.0}, fp.Projection(gain=0.1), bounds))
+    result = run(problem, fp.rivals.SlotineLi(2.0, {"y": 4.0}, fp.Projection(gain=0.1), bounds))
     assert result.stop is None
     np.testing.assert_allclose(result["estimate"][-1], [3.0, 1.0], atol=1e-3)
 

@@ -233,10 +233,10 @@ def test_scenarios_draw_parameters_of_a_map(tmp_path: Path) -> None:
 GROWTH = {"growth": fp.Uncertain(0.1, 2.0, 0.3)}
 RIVALS = {  # controller, largest error of the last ten of 40 cycles
     "PID": (fp.PID(proportional={"stock": -5.0}, integral={"stock": -5.0}), 2e-3),
-    "acceleration feedback": (fp.AccelerationFeedback(LAW, gain=0.5), 1.6e-4),
-    "force MRAC": (fp.ForceMRAC(LAW, fp.Affine(gain=-1.0), {}), 4e-4),
-    "backstepping": (fp.BacksteppingMRAC(3.0, [5.0], fp.ModelReferenced(fp.Affine(gain=-1.0))), 5e-5),
-    "sliding mode": (fp.SlidingMode(rate=1.0, gain=2.0, width=0.5), 2e-2),
+    "acceleration feedback": (fp.rivals.AccelerationFeedback(LAW, gain=0.5), 1.6e-4),
+    "force MRAC": (fp.rivals.ForceMRAC(LAW, fp.Affine(gain=-1.0), {}), 4e-4),
+    "backstepping": (fp.rivals.BacksteppingMRAC(3.0, [5.0], fp.ModelReferenced(fp.Affine(gain=-1.0))), 5e-5),
+    "sliding mode": (fp.rivals.SlidingMode(rate=1.0, gain=2.0, width=0.5), 2e-2),
 }
 
 
@@ -251,7 +251,8 @@ def test_rivals_follow_the_reference_of_a_map(name: str) -> None:
 def test_the_reference_model_of_a_map_has_its_pole_in_the_cycle() -> None:
     """The deviation from the reference is (1 - rate T)^k of the first one."""
     run = simulated(
-        replace(stock(), horizon=None, cost=None), fp.BacksteppingMRAC(3.0, [5.0], fp.ModelReferenced(fp.Affine(-1.0)))
+        replace(stock(), horizon=None, cost=None),
+        fp.rivals.BacksteppingMRAC(3.0, [5.0], fp.ModelReferenced(fp.Affine(-1.0))),
     )
     deviation = (run["reference"] - run["model"])[:, 0]
     assert deviation == pytest.approx(deviation[0] * 0.7 ** np.arange(40), rel=1e-9)
@@ -290,15 +291,15 @@ def test_the_residual_of_a_map_corrects_its_prediction() -> None:
 
 REFUSED = {
     "poles": (
-        lambda: fp.BacksteppingMRAC(3.0, [25.0], fp.Identity()),
+        lambda: fp.rivals.BacksteppingMRAC(3.0, [25.0], fp.Identity()),
         r"BacksteppingMRAC\(.*\): in the map's cycles of 0.1 s a mode of the error has the pole z = -1.5",
     ),
     "Lyapunov": (
-        lambda: fp.LyapunovMRAC(rate=2.0, adaptation=1.0),
+        lambda: fp.rivals.LyapunovMRAC(rate=2.0, adaptation=1.0),
         "LyapunovMRAC proves that errors vanish by a derivative with respect to time, and a map has differences",
     ),
     "rate": (
-        lambda: fp.ResolvedAccelerationRate(rate=2.0),
+        lambda: fp.rivals.ResolvedAccelerationRate(rate=2.0),
         "ResolvedAccelerationRate prescribes a derivative with respect to time, and a map has differences",
     ),
     "measured response": (

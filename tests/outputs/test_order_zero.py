@@ -275,7 +275,7 @@ def test_the_integral_of_order_zero_removes_a_constant_error() -> None:
 
 LAWLESS = fp.Exponential(rate=1.0, integral=False)
 ZERO_RIVALS = {
-    "force MRAC": (fp.ForceMRAC(LAWLESS, affine(0.4), {}), 2.0),
+    "force MRAC": (fp.rivals.ForceMRAC(LAWLESS, affine(0.4), {}), 2.0),
     "sigmoid": (fp.ComputedTorque(LAWLESS, fp.Sigmoid(gain=-0.5)), 20.0),
     "fractional": (fp.ComputedTorque(fp.Fractional(rate=1.0, order=0.8, memory=5.0)), 20.0),
     "PID": (fp.PID(proportional={"power": 0.02}, integral={"power": 0.2}), 10.0),
@@ -291,12 +291,12 @@ def test_rivals_control_an_output_of_order_zero(name: str) -> None:
 
 REFUSED: dict[str, tuple[Callable[[], Controller], dict[str, Any], str]] = {
     "surface": (
-        lambda: fp.SlidingMode(rate=1.0, gain=1.0, width=1.0),
+        lambda: fp.rivals.SlidingMode(rate=1.0, gain=1.0, width=1.0),
         {},
         r"the command moves 'power' at once \(order 0\), so there is no surface to slide on",
     ),
     "Lyapunov": (
-        lambda: fp.LyapunovMRAC(rate=1.0, adaptation=1.0),
+        lambda: fp.rivals.LyapunovMRAC(rate=1.0, adaptation=1.0),
         {},
         "LyapunovMRAC proves that errors vanish by a derivative .* power is of order 0",
     ),

@@ -15,12 +15,12 @@ from fpirhc.errors import InvalidProblem, NotSupported
 
 ON_DEPTH: dict[str, tuple[Controller, float]] = {
     "PID": (fp.PID({"depth": -2.0}, {"depth": -0.6}, {"depth": -2.0}), 1.0),
-    "sliding": (fp.SlidingMode(rate=1.0, gain=2.0, width=0.5), 0.3),
-    "rate": (fp.ResolvedAccelerationRate(rate=1.0), 0.1),
-    "feedback": (fp.AccelerationFeedback(fp.Exponential(rate=1.0), gain=2.0, time_constant=0.2), 0.1),
-    "backstepping": (fp.BacksteppingMRAC(1.0, (1.0, 1.0), fp.Affine(-1.5)), 0.1),
-    "force": (fp.ForceMRAC(fp.Exponential(rate=1.0), fp.Affine(-0.5)), 0.02),
-    "Lyapunov": (fp.LyapunovMRAC(rate=1.0, adaptation=0.1), 0.03),
+    "sliding": (fp.rivals.SlidingMode(rate=1.0, gain=2.0, width=0.5), 0.3),
+    "rate": (fp.rivals.ResolvedAccelerationRate(rate=1.0), 0.1),
+    "feedback": (fp.rivals.AccelerationFeedback(fp.Exponential(rate=1.0), gain=2.0, time_constant=0.2), 0.1),
+    "backstepping": (fp.rivals.BacksteppingMRAC(1.0, (1.0, 1.0), fp.Affine(-1.5)), 0.1),
+    "force": (fp.rivals.ForceMRAC(fp.Exponential(rate=1.0), fp.Affine(-0.5)), 0.02),
+    "Lyapunov": (fp.rivals.LyapunovMRAC(rate=1.0, adaptation=0.1), 0.03),
 }
 
 
@@ -37,7 +37,7 @@ def test_a_rival_follows_an_output_of_a_wrong_curve(name: str) -> None:
 def test_an_increment_by_hand_on_the_hand_of_an_arm() -> None:
     """The first request after a step of the model: its response to the last command plus the change, less its own drift."""
     problem = replace(circle(arm()), duration=0.1, measure_from=0.0)
-    run = simulated(problem, fp.ResolvedAccelerationRate(rate=6.0))
+    run = simulated(problem, fp.rivals.ResolvedAccelerationRate(rate=6.0))
     plant, k, p, size = problem.plant, 20, [1.4], 1e-6
     respond, x, u = plant.equations.controlled_response, run["state"][k], run["command"][k - 1]
     moved = plant.equations.rate(x, u, p).full().ravel()
@@ -68,4 +68,4 @@ def test_gains_are_named_by_outputs() -> None:
     with pytest.raises(InvalidProblem, match="controlled coordinate 'deep' is unknown"):
         simulated(sedated(hill(5.5)), fp.PID({"deep": -1.0}))
     with pytest.raises(InvalidProblem, match="has relative order 2, but rates has 1"):
-        simulated(sedated(hill(5.5)), fp.BacksteppingMRAC(1.0, (1.0,), fp.Affine(-1.0)))
+        simulated(sedated(hill(5.5)), fp.rivals.BacksteppingMRAC(1.0, (1.0,), fp.Affine(-1.0)))

@@ -45,7 +45,7 @@ LOOPS: dict[str, tuple[Controller, fp.Problem]] = {
     **{
         name: (controller, replace(TWO_MASS.problem, **changes))
         for name, controller, changes in (
-            ("rate", fp.ResolvedAccelerationRate(rate=6.0), {}),  # the measured responses move the states of a wrong model
+            ("rate", fp.rivals.ResolvedAccelerationRate(rate=6.0), {}),  # the measured responses move the states of a wrong model
             ("disturbed", TWO_MASS.controllers["RHC+FPI"], PUSHED),
             ("late", TWO_MASS.controllers["RHC+FPI"], LATE),
             ("paired", fp.Predicted(fp.ComputedTorque(TRACK, fp.Paired(MAP, cycles=5)), inputs=3e-3, measurement=2e-3), LATE),

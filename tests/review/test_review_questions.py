@@ -136,7 +136,7 @@ def test_a_learning_controller_has_the_loop_of_its_first_model():
     """Its poles are those of inverse dynamics with that model, and decide nothing, because it learns another one."""
     task = fp.load_problem("planar_arm")
     learning = task.controllers["AID"]
-    assert isinstance(learning, fp.AdaptiveInverseDynamics)
+    assert isinstance(learning, fp.rivals.AdaptiveInverseDynamics)
     plain = fp.ComputedTorque(learning.tracking)
     one, other = (answer(task.problem, c, "margin") for c in (learning, plain))
     assert one.numbers["radius"] == pytest.approx(other.numbers["radius"], rel=1e-4)

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, bounded, commanding_blocks, desired_blocks, invert_block
+from fpirhc.controllers.base import Controller, invert_block, law_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
@@ -78,16 +78,7 @@ class AccelerationFeedback(Controller):
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, feedback, invert, limit, judge, running, tracking update."""
-        plant = problem.plant
-        closing, delays = commanding_blocks(problem)
-        blocks = [
-            *desired_blocks(problem, self.tracking),
-            self._feedback_block(problem),
-            invert_block(plant),
-            *closing,
-            bounded(problem, self.tracking).update(plant, problem.period),
-        ]
-        return blocks, [*delays, *self.tracking.delays(plant)]
+        return law_blocks(problem, self.tracking, self._feedback_block(problem), invert_block(problem.plant))
 
     def _feedback_block(self, problem: Problem) -> Block:
         """Block (desired, realised) -> request; before the first response the request is the desired response."""

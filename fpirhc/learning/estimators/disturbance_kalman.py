@@ -15,9 +15,14 @@ estimated without error, whatever the tuning, if [A - I, B; C, D] has full colum
 state and on what is measured), which needs at least as many measured quantities as disturbances. Otherwise `check` refuses the
 filter.
 
+With `frequencies` the disturbance is a constant and sines, w = w_0 + sum c_k, where (c_k, s_k) turns by the angle omega_k T in
+every cycle. A sine of that frequency then leaves no error either, however fast it is: the internal model principle. The estimate
+serves in every cycle, and over the horizon of a plan the disturbance is held.
+
 References:
     G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal 49(2), 2003.
     M. Morari and U. Maeder, Nonlinear offset-free model predictive control, Automatica 48(9), 2012.
+    U. Maeder and M. Morari, Offset-free reference tracking with model predictive control, Automatica 46(9), 2010 (sines).
 """
 
 from __future__ import annotations
@@ -29,8 +34,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue, Mistakes, NotSupported
-from fpirhc.fields.kinds import Deviation
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
+from fpirhc.fields.kinds import Deviation, finite_number
 from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import Differences, response_age
@@ -50,6 +55,27 @@ _SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as un
 
 
 @dataclass(frozen=True, eq=False)
+class Modes:
+    """The parts of one disturbance and how they move by themselves in a control cycle.
+
+    Args:
+        names: what is added to the disturbance's name, one per part.
+        moves: matrix of the parts from one cycle to the next, shape (parts, parts).
+        adds: what the parts add up to, shape (1, parts).
+    """
+
+    names: tuple[str, ...]
+    moves: np.ndarray
+    adds: np.ndarray
+
+    def of(self, count: int) -> tuple[ca.DM, ca.DM]:
+        """Return both matrices for that many disturbances, without their zeros."""
+        blocks = (np.kron(np.eye(count), one) for one in (self.moves, self.adds))
+        moves, adds = (ca.sparsify(ca.DM(one)) for one in blocks)
+        return moves, adds
+
+
+@dataclass(frozen=True, eq=False)
 class DisturbanceKalman(ParameterEstimator):
     """Estimate constant or slowly drifting disturbances of responses.
 
@@ -64,16 +90,20 @@ class DisturbanceKalman(ParameterEstimator):
             its unit. A response shows its disturbance at once, and a deformation has it; an estimator that is late cannot serve the
             filter.
         noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.
+        frequencies: of sines in every disturbance, rad per unit of time; each drifts as the constant does.
 
     Raises:
-        InvalidValue: no disturbance or no measured state.
+        InvalidValue: no disturbance or no measured state; a frequency that is not positive.
     """
 
     drift: Mapping[str, Deviation]
     measured: Mapping[str, Deviation]
     noise: Mapping[str, Deviation] = field(default_factory=dict)
+    frequencies: Sequence[float] = field(default=(), metadata={"setting": "where given", "structure": True})
 
     def __post_init__(self) -> None:
+        if not all(finite_number(w) and w > 0 for w in self.frequencies):
+            raise InvalidValue(f"DisturbanceKalman(frequencies={self.frequencies!r}): expected positive numbers, rad/s")
         for name, values in (("drift", self.drift), ("measured", self.measured)):
             if not values:
                 raise InvalidValue(f"DisturbanceKalman({name}={{}}): name at least one")
@@ -85,6 +115,25 @@ class DisturbanceKalman(ParameterEstimator):
     def learned(self) -> tuple[str, ...]:
         """The disturbances."""
         return tuple(_disturbance_name(c) for c in self.drift)
+
+    def modes(self, problem: Problem) -> Modes:
+        """How every disturbance moves by itself: a constant, and a turning pair for every sine.
+
+        Raises:
+            InvalidProblem: a sine that the control cycle samples less than twice per turn.
+        """
+        angles = problem.period * np.array(self.frequencies)
+        if angles.size and angles.max() >= np.pi:
+            raise InvalidProblem(
+                f"DisturbanceKalman(frequencies={self.frequencies!r}): cycles of {problem.period:g} {problem.time_unit} sample the "
+                f"fastest sine less than twice per turn; stay below {np.pi / problem.period:.4g} rad/{problem.time_unit}"
+            )
+        moves = np.eye(1 + 2 * len(angles))
+        for k, angle in enumerate(angles):
+            turned = slice(1 + 2 * k, 3 + 2 * k)
+            moves[turned, turned] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        names = ("", *(f"_{part}{k}" for k in range(1, len(angles) + 1) for part in ("cos", "sin")))
+        return Modes(names, moves, np.array([[1.0, *[1.0, 0.0] * len(angles)]]))
 
     @property
     def acts_at_once(self) -> bool:
@@ -132,10 +181,11 @@ class DisturbanceKalman(ParameterEstimator):
         import scipy.linalg
 
         a, noise_input, c = self._matrices(problem)
-        model, size = problem.plant, len(self.drift)
+        model, modes = problem.plant, self.modes(problem)
+        size = len(self.drift) * len(modes.names)
         used = self._used(problem, a, c)
         noise = np.array([self.noise.get(n, 0.0) for n in model.names])
-        walk = problem.period * np.array(list(self.drift.values())) ** 2
+        walk = problem.period * np.repeat(list(self.drift.values()), len(modes.names)) ** 2
         q = scipy.linalg.block_diag((noise_input * noise**2) @ noise_input.T, np.diag(walk))
         deviation = np.array(list(self.measured.values()))
         gain = np.zeros((model.state.size + size, len(self.measured)))
@@ -160,13 +210,13 @@ class DisturbanceKalman(ParameterEstimator):
         return np.asarray(gain)
 
     def memory(self, problem: Problem) -> Layout:
-        """The estimated state and disturbances."""
-        model = problem.plant
-        units = [model.parameters[n].unit for n in self.learned()]
+        """The estimated state, and the modes of the disturbances."""
+        model, modes = problem.plant, self.modes(problem).names
+        units = [model.parameters[n].unit for n in self.learned() for _ in modes]
         return Layout(
             (
                 Signal("observed_state", model.state.elements, model.state.units),
-                Signal("observed_disturbance", self.learned(), tuple(units)),
+                Signal("observed_disturbance", tuple(n + m for n in self.learned() for m in modes), tuple(units)),
             )
         )
 
@@ -182,35 +232,41 @@ class DisturbanceKalman(ParameterEstimator):
         fixed = ca.DM(self.gain(problem)) if self.following(problem) is None else None
         shown = self._shown_function(model)
         places = [model.parameter.elements.index(n) for n in self.learned()]
+        moves, adds = self.modes(problem).of(len(places))
+
+        def disturbed_by(disturbance: Expression, seen: Seen) -> Expression:
+            parameters = seen.parameters + 0
+            parameters[places] += adds @ disturbance
+            return parameters
 
         def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
-            parameters = seen.parameters + 0
-            parameters[places] += memory["observed_disturbance"]
-            predicted = advance(memory["observed_state"], seen.command, parameters, no_forcing)
-            measured = self._measured(model, seen)
-            innovation = measured - shown(predicted, seen.command, parameters)
+            before = memory["observed_disturbance"]
+            predicted = advance(memory["observed_state"], seen.command, disturbed_by(before, seen), no_forcing)
+            moved = moves @ before
+            innovation = self._measured(model, seen) - shown(predicted, seen.command, disturbed_by(moved, seen))
             gain = _gain(fixed, seen, len(self.measured))
             on_state, on_disturbance = gain[: model.state.size, :], gain[model.state.size :, :]
             running = seen.valid > 0.5
             state = ca.if_else(running, predicted + on_state @ innovation, seen.state)
-            disturbance = ca.if_else(running, memory["observed_disturbance"] + on_disturbance @ innovation, 0)
-            return disturbance, {"observed_state": state, "observed_disturbance": disturbance}
+            disturbance = ca.if_else(running, moved + on_disturbance @ innovation, 0)
+            return adds @ disturbance, {"observed_state": state, "observed_disturbance": disturbance}
 
         return correct
 
     def waiting(self, problem: Problem) -> Wait:
-        """Prediction by the model alone; the disturbances stay."""
+        """Prediction by the model alone; the disturbances move by themselves."""
         model = problem.plant
         advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
         places = [model.parameter.elements.index(n) for n in self.learned()]
+        moves, adds = self.modes(problem).of(len(places))
 
         def wait(
             command: Expression, parameters: Expression, memory: Mapping[str, Expression]
         ) -> dict[str, Expression]:
             disturbed_parameters = parameters + 0
-            disturbed_parameters[places] += memory["observed_disturbance"]
+            disturbed_parameters[places] += adds @ memory["observed_disturbance"]
             later = advance(memory["observed_state"], command, disturbed_parameters, no_forcing)
-            return {**memory, "observed_state": later}
+            return {"observed_state": later, "observed_disturbance": moves @ memory["observed_disturbance"]}
 
         return wait
 
@@ -250,12 +306,13 @@ class DisturbanceKalman(ParameterEstimator):
         a, b = (np.asarray(m.full()) for m in function(*_operating_point(problem), np.zeros(len(model.names))))
         effects = dict(zip(model.names, b.T, strict=True))  # that of an output is on what is measured alone
         disturbance_input = np.column_stack([effects.get(n, np.zeros(len(a))) for n in self.drift])
-        size = len(self.drift)
-        augmented = np.block([[a, disturbance_input], [np.zeros((size, a.shape[1])), np.eye(size)]])
+        moves, adds = (np.asarray(m.full()) for m in self.modes(problem).of(len(self.drift)))
+        lower = np.hstack([np.zeros((len(moves), len(a))), moves])
+        augmented = np.vstack([np.hstack([a, disturbance_input @ adds]), lower])
         shown = self._shown_function(model)(x, u, p)
         places = [model.parameter.elements.index(n) for n in self.learned()]
         slopes = ca.Function(
-            "fpirhc_seen", [x, u, p], [ca.horzcat(ca.jacobian(shown, x), ca.jacobian(shown, p)[:, places])]
+            "fpirhc_seen", [x, u, p], [ca.horzcat(ca.jacobian(shown, x), ca.jacobian(shown, p)[:, places] @ adds)]
         )
         return augmented, b, np.asarray(slopes(*_operating_point(problem)).full())
 
@@ -329,7 +386,11 @@ def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
     return state, needed, plant.approximate
 
 
-EXAMPLES = (DisturbanceKalman({"a": 1.0, "b": 1.0}, dict.fromkeys(("a", "b", "a'", "b'"), 1e-3)),)
+_NOISE = dict.fromkeys(("a", "b", "a'", "b'"), 1e-3)
+EXAMPLES = (
+    DisturbanceKalman({"a": 1.0, "b": 1.0}, _NOISE),
+    DisturbanceKalman({"a": 1.0, "b": 1.0}, _NOISE, frequencies=(2.0, 4.0)),
+)
 
 
 _Map = Callable[..., Mapping[str, Expression]]

@@ -1,0 +1,200 @@
+"""Active disturbance rejection control: a linear extended state observer of the output, and feedback of what it estimates.
+
+The output is believed to be an integrator chain of its relative order n with the model's input gain b_0 and one more state, the
+total disturbance z_{n+1}, which takes the place of the rest of the model:
+
+    z_i' = z_{i+1},  z_n' = z_{n+1} + b_0 u,  z_{n+1}' = 0,      corrected by y - z_1,      all observer poles at -w_o,
+    u = b_0^-1 (q^(n),N + k_1 (q^N - z_1) + ... + k_n (q^(n-1),N - z_n) - z_{n+1}),      all modes of the errors at -w_c.
+
+In cycles of T the chain is exact for held commands, the correction is that of the newest sample, and the poles are exp(-w_o T) in
+z. It measures the outputs alone, and is told of clipped commands. Usual is w_o = 3 to 10 w_c.
+
+As w_o goes to infinity the observer is deadbeat, and for n = 1 z_2 is the last difference of y less b_0 u: the fixed-point
+iteration of unit gain on the response by differences, command by command. A slower one is a filter of order n + 1 on positions.
+
+References:
+    J. Han, From PID to active disturbance rejection control, IEEE Trans. Industrial Electronics 56(3), 2009.
+    Z. Gao, Scaling and bandwidth-parameterization based controller tuning, American Control Conference 2003.
+    R. Miklosovic, A. Radke, Z. Gao, Discrete implementation and generalization of the extended state observer, American Control
+    Conference 2006.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import (
+    Controller,
+    command_before,
+    commanding_blocks,
+    input_gain,
+    like,
+    reference_block,
+    rename,
+)
+from fpirhc.controllers.rivals.reference_model import decay_gains
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import NotSupported
+from fpirhc.fields.kinds import Positive
+from fpirhc.members import Example
+from fpirhc.plant.maps import step_of
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, is_finite, total
+from fpirhc.symbolic.functions import exp, power
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.error import check_modes, error_chains, own_errors
+
+
+@dataclass(frozen=True)
+class ADRC(Controller):
+    """Linear active disturbance rejection control of every controlled coordinate.
+
+    Args:
+        bandwidth: w_c of the controller, 1/s.
+        observer: w_o of the extended state observer, 1/s.
+    """
+
+    bandwidth: Positive
+    observer: Positive
+
+    @property
+    def deformation(self) -> Deformation:
+        """Identity(): no request is iterated."""
+        return Identity()
+
+    def check(self, problem: Problem) -> None:
+        """Raise for an output of order 0.
+
+        Raises:
+            NotSupported: no chain of integrators.
+            InvalidValue: an error that does not decay in the steps of a map.
+        """
+        for name, order in problem.plant.response_orders.items():
+            if not order:
+                raise NotSupported(
+                    f"ADRC observes a chain of integrators, and the command moves '{name}' at once (order 0); "
+                    "use DisturbanceObserver"
+                )
+            check_modes(self, problem.plant, decay_gains(self.bandwidth, order))
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Return the blocks reference, observer, limit, judge, running, prediction."""
+        plant = problem.plant
+        closing, delays = commanding_blocks(problem)
+        response = plant.response_signal("_reference_response")
+        blocks = [
+            reference_block(problem),
+            rename("nominal", response, plant.response_signal("nominal")),
+            self._observer_block(problem),
+            *closing,
+            _prediction_block(problem),
+        ]
+        return blocks, [*delays, Delay(_states(plant, "_predicted"), "_predicted_later")]
+
+    def corrections(self, plant: Plant, order: int, period: float) -> list[float]:
+        """Return l_1 ... l_{n+1} of z += l (y - z_1), for a coordinate of that relative order; all poles at exp(-w_o T)."""
+        return list(_corrections(plant, order, period, exp(-self.observer * period)))
+
+    def _observer_block(self, problem: Problem) -> Block:
+        """Block (outputs, prediction, reference) -> (command, extended state)."""
+        plant, orders = problem.plant, list(problem.plant.response_orders.values())
+        gain, response = input_gain(plant), plant.equations.controlled_response
+
+        def step(s: Signals) -> dict[str, Expression]:
+            seen, target = getattr(s, plant.output.name), error_chains(plant, s.reference)
+            states, feedback = [], []
+            for k, (y, predicted) in enumerate(zip(own_errors(plant, seen), _split(s._predicted, orders), strict=True)):
+                begun = s.warm_up > 0.5
+                # The observer begins at the first sample, with the derivatives of the reference and no disturbance.
+                before = [ca.if_else(begun, z, r) for z, r in zip(predicted, [y, *target[k][1:], 0 * y], strict=True)]
+                shares = self.corrections(plant, orders[k], problem.period)
+                z = [x + share * (y - before[0]) for x, share in zip(before, shares, strict=True)]
+                errors = zip(decay_gains(self.bandwidth, orders[k]), target[k], z[:-1], strict=True)
+                feedback.append(total(g * (r - x) for g, r, x in errors))
+                states += z
+            disturbance = ca.vertcat(*(z[-1] for z in _split(ca.vertcat(*states), orders)))
+            desired = s.nominal + ca.vertcat(*feedback)
+            command = ca.solve(gain(s.state, s._command_before, s.parameters), desired - disturbance)
+            return {
+                "extended_state": ca.vertcat(*states),
+                "desired": desired,
+                "command_unclipped": command,
+                "_deformed_unclipped": response(s.state, command, s.parameters),
+            }
+
+        measured = dict.fromkeys((plant.state, plant.output))
+        known = (like(plant.output, "reference"), plant.response_signal("nominal"), plant.parameter)
+        reads = Layout((*measured, *known, command_before(problem), scalar("warm_up"), _states(plant, "_predicted")))
+        responses = map(plant.response_signal, ("desired", "_deformed_unclipped"))
+        writes = Layout((_states(plant, "extended_state"), *responses, like(plant.input, "command_unclipped")))
+        return Block("observer", reads, writes, step)
+
+
+def _prediction_block(problem: Problem) -> Block:
+    """Block (extended state, command) -> the extended state before the next sample; without a sample it goes on."""
+    plant, gain, orders = problem.plant, input_gain(problem.plant), list(problem.plant.response_orders.values())
+    acting, predicted = plant.response_signal("acting"), _states(plant, "_predicted")
+
+    def later(states: Expression, effect: Expression) -> Expression:
+        moved = []
+        for chain, own in zip(_split(states, orders), ca.vertsplit(effect), strict=True):
+            step = step_of(plant, np.eye(len(chain), k=1), problem.period)
+            step_of_effect = [*step[:-1, -1], 0.0]  # a held input acts as the disturbance does, and does not change it
+            moved.append(ca.DM(step) @ ca.vertcat(*chain) + ca.DM(step_of_effect) * own)
+        return ca.vertcat(*moved)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        effect = gain(s.state, s.command, s.parameters) @ s.command
+        states = later(s.extended_state, effect)
+        usable = is_finite(ca.vertcat(states, effect))
+        return {
+            "_predicted_later": ca.if_else(usable, states, s._predicted),
+            "acting_next": ca.if_else(usable, effect, s.acting),
+        }
+
+    def wait(s: Signals) -> dict[str, Expression]:
+        return {"_predicted_next": later(s._predicted, s.acting), "acting_next": s.acting}
+
+    reads = Layout((plant.state, plant.input, plant.parameter, _states(plant, "extended_state"), predicted))
+    waits = Block("prediction_waits", Layout(), Layout(), wait, Layout((predicted, acting)))
+    writes = Layout((_states(plant, "_predicted_later"),))
+    return Block("prediction", reads, writes, step, Layout((acting,)), waits=waits)
+
+
+def _corrections(plant: Plant, order: int, period: float, pole: float) -> Iterator[float]:
+    """The correction of the newest sample that places all poles of (1 - l c) Phi, whose polynomial is affine in l."""
+    size = order + 1
+    chain = step_of(plant, np.eye(size, k=1), period)
+    free = np.poly(chain)[1:]
+    effect = np.column_stack([np.poly(chain - np.outer(one, chain[0]))[1:] - free for one in np.eye(size)])
+    wanted = [math.comb(size, k) * power(-pole, k) - float(free[k - 1]) for k in range(1, size + 1)]
+    for row in np.linalg.inv(effect):
+        yield sum(float(share) * value for share, value in zip(row, wanted, strict=True))
+
+
+def _states(plant: Plant, name: str) -> Signal:
+    """Signal of z_1 ... z_{n+1} of every controlled coordinate, one after another."""
+    orders = plant.response_orders.items()
+    units = dict(zip(plant.output.elements, plant.output.entry_units, strict=True))
+    responses = dict(zip(plant.controlled_names, plant.response_signal("_").entry_units, strict=True))
+    elements = [(c + "'" * k, units.get(c + "'" * k, responses[c])) for c, order in orders for k in range(order + 1)]
+    return vector(name, tuple(e for e, _ in elements), tuple(u for _, u in elements))
+
+
+def _split(states: Expression, orders: list[int]) -> list[list[Expression]]:
+    """The extended states of every controlled coordinate."""
+    entries = iter(ca.vertsplit(states))
+    return [[next(entries) for _ in range(order + 1)] for order in orders]
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="ADRC", changes={"duration": 3.0, "measure_from": 0.0}, left=0.15),
+)

@@ -1,0 +1,88 @@
+"""A disturbance observer around the model's inverse: what the model's input differs by is taken off the next command.
+
+With the measured response f_k to the last command u_{k-1}, and the low-pass Q = g / (s + g) with its pole p = exp(-g T) in z,
+
+    d_k = p d_{k-1} + (1 - p) (f^^-1(x_k, f_k) - u_{k-1}),        u_k = f^^-1(x_k, q^Des_k) - d_k.
+
+d is the disturbance at the input that explains the response. Where the model's input gain is constant, this is the fixed-point
+iteration of the effective gain 1 - p in its model-referenced form: command by command. So its loop is stable for
+(1 - p) lambda < 2 with the plant's gain lambda times the model's. Where the gain changes with the state, the observer remembers a
+force, and the iteration a response.
+
+References:
+    K. Ohnishi, A new servo method in mechatronics, Trans. Japan Society of Electrical Engineers 107-D, 1987.
+    W.-H. Chen, J. Yang, L. Guo, S. Li, Disturbance-observer-based control and related methods: an overview, IEEE Trans. Industrial
+    Electronics 63(2), 2016.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, command_before, law_blocks, like
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.fields.kinds import Positive
+from fpirhc.members import Example
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.functions import exp
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+
+@dataclass(frozen=True)
+class DisturbanceObserver(Controller):
+    """Inverse dynamics less the observed disturbance at the input.
+
+    Args:
+        tracking: the law that gives the desired response.
+        bandwidth: g of the low-pass Q, 1/s.
+    """
+
+    tracking: Tracking
+    bandwidth: Positive
+
+    @property
+    def deformation(self) -> Deformation:
+        """Identity(): no request is iterated."""
+        return Identity()
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Return the blocks reference, tracking, observer, limit, judge, running, tracking update."""
+        return law_blocks(problem, self.tracking, self._observer_block(problem))
+
+    def _observer_block(self, problem: Problem) -> Block:
+        """Block (state, last command, realised, desired) -> (command, disturbance at the input)."""
+        plant, warm_up_cycles, pole = problem.plant, problem.warm_up_cycles, exp(-self.bandwidth * problem.period)
+        response, inverse = plant.equations.controlled_response, plant.equations.inverse
+        disturbance = like(plant.input, "input_disturbance")
+
+        def step(s: Signals) -> dict[str, Expression]:
+            needed = inverse(s.state, s.realised, s.parameters)
+            observed = pole * s.disturbance_before + (1 - pole) * (needed - s._command_before)
+            running = s.warm_up > warm_up_cycles - 0.5
+            used = ca.if_else(running, observed, 0)
+            command = inverse(s.state, s.desired, s.parameters) - used
+            return {
+                "command_unclipped": command,
+                "_deformed_unclipped": response(s.state, command, s.parameters),
+                "input_disturbance": used,
+                # A measurement that is not finite must not stay in the filter.
+                "disturbance_before_next": ca.if_else(is_finite(used), used, s.disturbance_before),
+            }
+
+        signals = (command_before(problem), plant.response_signal("realised"), plant.response_signal("desired"))
+        reads = Layout((plant.state, *signals, plant.parameter, scalar("warm_up")))
+        request = plant.response_signal("_deformed_unclipped")
+        writes = Layout((like(plant.input, "command_unclipped"), request, disturbance))
+        memory = Layout((like(plant.input, "disturbance_before"),))
+        return Block("observer", reads, writes, step, memory, opaque=plant.equations.inverse_opaque)
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="disturbance observer", changes={"duration": 3.0, "measure_from": 0.0}),
+)

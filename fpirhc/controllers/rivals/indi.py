@@ -1,0 +1,111 @@
+"""Incremental nonlinear dynamic inversion: the command moves by what the model's input gain asks for.
+
+With the measured response f_k to the last command u_{k-1}, both through the same low-pass H, so that both are equally late,
+
+    u_k = H u_{k-1} + G^-1 (q^Des_k - H f_k),      G = df^/du at the state of now,
+    H = w^2 / (s^2 + 2 zeta w s + w^2), with the poles of s in z.
+
+The model gives G alone. Without the filter, for a response affine in the inputs, this is the fixed-point iteration of unit gain in
+its model-referenced form, ModelReferenced(Affine(gain=-2)): command by command. So it is stable for a plant gain below twice the
+model's, and the filter slows it.
+
+References:
+    S. Sieberling, Q. P. Chu, J. A. Mulder, Robust flight control using incremental nonlinear dynamic inversion and angular
+    acceleration prediction, J. Guidance, Control, and Dynamics 33(6), 2010.
+    E. J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon, Adaptive incremental nonlinear dynamic inversion for attitude control of micro
+    air vehicles, J. Guidance, Control, and Dynamics 39(3), 2016 (the filter of both: w = 50 rad/s, zeta = 0.55).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, command_before, input_gain, law_blocks, like
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.fields.kinds import Accuracy, Positive
+from fpirhc.members import Example
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.functions import cos, exp, sqrt
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+
+@dataclass(frozen=True)
+class INDI(Controller):
+    """Increments of the command by the model's input gain.
+
+    Args:
+        tracking: the law that gives the desired response.
+        frequency: w of the low-pass on command and response, rad/s; None: no filter.
+        damping: zeta of the low-pass, below one.
+    """
+
+    tracking: Tracking
+    frequency: Positive | None = None
+    damping: Accuracy = 0.55
+
+    @property
+    def deformation(self) -> Deformation:
+        """Identity(): no request is iterated."""
+        return Identity()
+
+    def filter(self, period: float) -> tuple[float, float]:
+        """Return (c_1, c_2) of H for cycles of that period: y_k = (1 - c_1 - c_2) x_k + c_1 y_{k-1} + c_2 y_{k-2}."""
+        if self.frequency is None:
+            return 0.0, 0.0
+        decay = exp(-self.damping * self.frequency * period)
+        return 2 * decay * cos(self.frequency * period * sqrt(1 - self.damping * self.damping)), -decay * decay
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Return the blocks reference, tracking, increment, limit, judge, running, tracking update."""
+        return law_blocks(problem, self.tracking, self._increment_block(problem))
+
+    def _increment_block(self, problem: Problem) -> Block:
+        """Block (state, last command, realised, desired) -> command; before the first response it is the model's inverse."""
+        plant, warm_up_cycles, coefficients = problem.plant, problem.warm_up_cycles, self.filter(problem.period)
+        gain, response, inverse = input_gain(plant), plant.equations.controlled_response, plant.equations.inverse
+        both = (("filtered_command", plant.input), ("filtered_response", plant.response_signal("_")))
+        pairs = [like(signal, name + late) for name, signal in both for late in ("", "_before")]
+        memory = Layout((*pairs, scalar("filter_begun"))) if self.frequency is not None else Layout()
+
+        def filtered(s: Signals) -> tuple[dict[str, Expression], dict[str, Expression]]:
+            """Command and response behind the filter, which begins settled, and what it remembers."""
+            now = {"filtered_command": s._command_before, "filtered_response": s.realised}
+            if not memory.names:
+                return now, {}
+            values, begun = {}, s.filter_begun > 0.5
+            for name, x in now.items():
+                last, before = getattr(s, name), getattr(s, f"{name}_before")
+                first, second = coefficients
+                values[name] = ca.if_else(begun, (1 - first - second) * x + first * last + second * before, x)
+            usable = ca.logic_and(is_finite(ca.vertcat(*values.values())), s.warm_up > warm_up_cycles - 0.5)
+            after = {f"{name}_next": ca.if_else(usable, value, getattr(s, name)) for name, value in values.items()}
+            for name, value in values.items():
+                last, before = getattr(s, name), getattr(s, f"{name}_before")
+                after[f"{name}_before_next"] = ca.if_else(usable, ca.if_else(begun, last, value), before)
+            return values, {**after, "filter_begun_next": ca.if_else(usable, 1, s.filter_begun)}
+
+        def step(s: Signals) -> dict[str, Expression]:
+            values, after = filtered(s)
+            before, realised = values["filtered_command"], values["filtered_response"]
+            moved = before + ca.solve(gain(s.state, before, s.parameters), s.desired - realised)
+            running = s.warm_up > warm_up_cycles - 0.5
+            command = ca.if_else(running, moved, inverse(s.state, s.desired, s.parameters))
+            request = response(s.state, command, s.parameters)
+            return {"command_unclipped": command, "_deformed_unclipped": request, **after}
+
+        signals = (command_before(problem), plant.response_signal("realised"), plant.response_signal("desired"))
+        reads = Layout((plant.state, *signals, plant.parameter, scalar("warm_up")))
+        writes = Layout((like(plant.input, "command_unclipped"), plant.response_signal("_deformed_unclipped")))
+        return Block("increment", reads, writes, step, memory, opaque=plant.equations.inverse_opaque)
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="INDI", changes={"duration": 3.0, "measure_from": 0.0}),
+    Example(problem="mrac_pendulum", controller="INDI, filtered", changes={"duration": 3.0, "measure_from": 0.0}),
+)

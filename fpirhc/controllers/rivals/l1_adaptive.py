@@ -1,0 +1,133 @@
+"""L1 adaptive control with the piecewise-constant law: a predictor of the highest measured derivative, and a low-pass.
+
+With v = q^(n-1) measured, the predictor v^, a_s > 0, the model's response f^ to the command that acts, and cycles of T,
+
+    v^' = f^(x, u) + sigma - a_s (v^ - v),      sigma_k = -a_s e^(-a_s T) / (1 - e^(-a_s T)) (v^_k - v_k),
+    eta = w_c / (s + w_c) sigma,                u = f^^-1(x, q^Des - eta).
+
+The response is not measured. In the cycle the predictor's error moves by the model's response less the mean one, so that one cycle
+later sigma is e^(-a_s T) times the mean response error of the model: it is the fixed-point iteration on the difference of the
+velocities, of the effective gain 1 - exp(-w_c T) as a_s goes to 0, and for a larger a_s some of a constant residual stays.
+
+References:
+    N. Hovakimyan, C. Cao, L1 Adaptive Control Theory: Guaranteed Robustness with Fast Adaptation, SIAM 2010, ch. 3.3.
+    Z. Wu, S. Cheng, K. A. Ackerman, A. Gahlawat, A. Lakshmanan, P. Zhao, N. Hovakimyan, L1 adaptive augmentation for geometric
+    tracking control of quadrotors, IEEE ICRA 2022 (the predictor above, with the model's own response).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, invert_block, law_blocks
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import NotSupported
+from fpirhc.fields.kinds import Positive
+from fpirhc.members import Example
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.functions import exp, left_in_mean
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.error import error_chains
+
+
+@dataclass(frozen=True)
+class L1Adaptive(Controller):
+    """Inverse dynamics less the low-passed estimate of a fast predictor.
+
+    Args:
+        tracking: the law that gives the desired response.
+        bandwidth: w_c of the low-pass on the estimate, rad/s.
+        predictor: a_s, 1/s; a_s T well below one leaves little of a constant residual.
+    """
+
+    tracking: Tracking
+    bandwidth: Positive
+    predictor: Positive = 1.0
+
+    @property
+    def deformation(self) -> Deformation:
+        """Identity(): no request is iterated."""
+        return Identity()
+
+    def check(self, problem: Problem) -> None:
+        """Raise for an output of order 0.
+
+        Raises:
+            NotSupported: no derivative below the response can be predicted.
+        """
+        instant = [name for name, order in problem.plant.response_orders.items() if not order]
+        if instant:
+            raise NotSupported(
+                f"L1Adaptive predicts a derivative below the response, and the command moves '{instant[0]}' at once (order 0); "
+                "use DisturbanceObserver"
+            )
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Return the blocks reference, tracking, predictor, invert, limit, judge, running, tracking update, expected."""
+        plant = problem.plant
+        blocks, delays = law_blocks(problem, self.tracking, self._predictor_block(problem), invert_block(plant))
+        expected = plant.response_signal("_expected")
+        return [*blocks, _expected_block(plant)], [*delays, Delay(expected, "_expected_now")]
+
+    def _predictor_block(self, problem: Problem) -> Block:
+        """Block (state or outputs, desired, response that the model expected of the last command) -> request."""
+        plant, period = problem.plant, problem.period
+        left, pole = exp(-self.predictor * period), exp(-self.bandwidth * period)
+        moves = period * left_in_mean(period, 1 / self.predictor)  # (1 - left) / a_s
+        gain = left / moves
+        names = ("predictor_error", "predictor_input", "measured_before", "disturbance_before")
+        memory = Layout((*map(plant.response_signal, names), scalar("predictor_begun")))
+
+        def step(s: Signals) -> dict[str, Expression]:
+            chains = error_chains(plant, getattr(s, plant.output.name))
+            measured = ca.vertcat(*(chain[-1] for chain in chains))
+            velocity = (measured - s.measured_before) / period
+            begun = s.predictor_begun > 0.5
+            error = left * s.predictor_error + moves * (s._expected + s.predictor_input - velocity)
+            error = ca.if_else(begun, error, 0)
+            estimate = -gain * error
+            disturbance = pole * s.disturbance_before - ((1 - pole) * gain) * error
+            usable = is_finite(ca.vertcat(error, disturbance, measured))
+            after = {
+                "predictor_error": error,
+                "predictor_input": estimate,
+                "measured_before": measured,
+                "disturbance_before": disturbance,
+            }
+            remembered = {f"{n}_next": ca.if_else(usable, value, getattr(s, n)) for n, value in after.items()}
+            return {
+                "_deformed_unclipped": s.desired - disturbance,
+                "response_disturbance": disturbance,
+                **remembered,
+                "predictor_begun_next": ca.if_else(usable, 1, 0),
+            }
+
+        def wait(s: Signals) -> dict[str, Expression]:
+            """The predictor begins anew with the next sample; the estimate stays."""
+            return {**{f"{n}_next": getattr(s, n) for n in names}, "predictor_begun_next": ca.SX(0)}
+
+        reads = Layout((plant.output, plant.response_signal("desired"), plant.response_signal("_expected")))
+        writes = Layout((plant.response_signal("_deformed_unclipped"), plant.response_signal("response_disturbance")))
+        waits = Block("predictor_waits", Layout(), Layout(), wait, memory)
+        return Block("predictor", reads, writes, step, memory, waits=waits)
+
+
+def _expected_block(plant: Plant) -> Block:
+    """Block (state, command) -> the response that the model expects of it."""
+    response = plant.equations.controlled_response
+
+    def step(s: Signals) -> dict[str, Expression]:
+        return {"_expected_now": response(s.state, s.command, s.parameters)}
+
+    reads = Layout((plant.state, plant.input, plant.parameter))
+    return Block("expected", reads, Layout((plant.response_signal("_expected_now"),)), step)
+
+
+EXAMPLES = (Example(problem="mrac_pendulum", controller="L1 adaptive", changes={"duration": 3.0, "measure_from": 0.0}),)

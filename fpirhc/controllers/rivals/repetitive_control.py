@@ -1,0 +1,123 @@
+"""Repetitive control: what made the response wrong one period ago is taken off the request of now.
+
+For a task of a period of N cycles, with the response error h_j = f_j - q^Des_{j-1} of the request of cycle j - 1,
+
+    delta_k = Q [delta_{k-N} - gamma h_{k-N+1}],        r_k = q^Des_k + delta_k,        u_k = f^^-1(x_k, r_k),
+
+Q the mean of a sample and its neighbours, (b, 1 - 2 b, b), centred because a period ago both neighbours are known. With the plant's
+gain lambda times the model's, an error of frequency w shrinks per period by Q(w) |1 - gamma lambda|; what repeats is learned
+whatever it is, and nothing else is. For N = 1 and b = 0 it would be the fixed-point iteration on the deformation, Increment: a
+repetition is N such iterations, each of which has its turn once per period.
+
+References:
+    S. Hara, Y. Yamamoto, T. Omata, M. Nakano, Repetitive control system: a new type servo system for periodic exogenous signals,
+    IEEE Trans. Automatic Control 33(7), 1988.
+    M. Tomizuka, T.-C. Tsao, K.-K. Chew, Analysis and synthesis of discrete-time repetitive controllers, ASME J. Dyn. Syst. 111(3),
+    1989.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, invert_block, law_blocks
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import InvalidProblem, InvalidValue
+from fpirhc.fields.kinds import Duration, Positive
+from fpirhc.members import Example
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+MOST = 20_000  # cycles of a period: each is one number per coordinate in the controller's memory
+
+
+@dataclass(frozen=True)
+class RepetitiveControl(Controller):
+    """Inverse dynamics of a request that is learned from period to period.
+
+    Args:
+        tracking: the law that gives the desired response.
+        repeats: the period of the task, in its unit of time; a whole number of control cycles.
+        gain: gamma; below 2 over the largest plant gain per model gain.
+        smoothing: b of Q, from 0 to 1/4; above 0 what only changes from cycle to cycle is forgotten.
+
+    Raises:
+        InvalidValue: a smoothing outside its range.
+    """
+
+    tracking: Tracking
+    repeats: Duration = field(metadata={"structure": True})
+    gain: Positive = 0.5
+    smoothing: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.smoothing <= 0.25:
+            raise InvalidValue(f"RepetitiveControl(smoothing={self.smoothing!r}): expected a number from 0 to 0.25")
+
+    @property
+    def deformation(self) -> Deformation:
+        """Identity(): no request is iterated from cycle to cycle."""
+        return Identity()
+
+    def cycles(self, problem: Problem) -> int:
+        """Return N.
+
+        Raises:
+            InvalidProblem: the period is no whole number of cycles, fewer than three, or more than 20 000.
+        """
+        ratio = self.repeats / problem.period
+        if not 3 <= round(ratio) <= MOST or abs(ratio - round(ratio)) > 1e-6 * ratio:
+            raise InvalidProblem(
+                f"RepetitiveControl(repeats={self.repeats:g}): {ratio:g} cycles of {problem.period:g} {problem.time_unit}; a "
+                f"period is a whole number of them, from 3 to {MOST}"
+            )
+        return round(ratio)
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the period does not fit the control cycle, as `cycles` does."""
+        self.cycles(problem)
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Return the blocks reference, tracking, repetition, invert, limit, judge, running, tracking update."""
+        plant = problem.plant
+        blocks, delays = law_blocks(problem, self.tracking, self._repetition_block(problem), invert_block(plant))
+        desired, request = plant.response_signal("_desired_last"), plant.response_signal("_deformed_last")
+        return blocks, [*delays, Delay(desired, "desired"), Delay(request, "deformed")]
+
+    def _repetition_block(self, problem: Problem) -> Block:
+        """Block (desired, realised, last request and desired response) -> request."""
+        plant, size, warm_up_cycles = problem.plant, len(problem.plant.controlled_names), problem.warm_up_cycles
+        length = self.cycles(problem) + 1
+        places = tuple(f"{name}@{k}" for k in range(length) for name in plant.controlled_names)
+        lessons = Signal("lessons", places)
+
+        def step(s: Signals) -> dict[str, Expression]:
+            running = s.warm_up > warm_up_cycles - 0.5
+            lesson = s._deformed_last - s._desired_last - self.gain * (s.realised - s._desired_last)
+            # The newest lesson is that of the request of the last cycle; the one for the request of now is N - 1 lessons older.
+            newest = ca.if_else(ca.logic_and(running, is_finite(lesson)), lesson, s.lessons[size : 2 * size])
+            queue = ca.vertcat(s.lessons[size:], newest)
+            before, same, after = (queue[size * k : size * (k + 1)] for k in (0, 1, 2))
+            learned = self.smoothing * (before + after) + (1 - 2 * self.smoothing) * same
+            return {"_deformed_unclipped": s.desired + learned, "_deformation": learned, "lessons_next": queue}
+
+        def wait(s: Signals) -> dict[str, Expression]:
+            """Without a sample nothing is learned of this cycle, and the period goes on: what it had is repeated."""
+            return {"lessons_next": ca.vertcat(s.lessons[size:], s.lessons[size : 2 * size])}
+
+        names = ("desired", "realised", "_deformed_last", "_desired_last")
+        reads = Layout((*map(plant.response_signal, names), scalar("warm_up")))
+        writes = Layout(tuple(map(plant.response_signal, ("_deformed_unclipped", "_deformation"))))
+        waits = Block("repetition_waits", Layout(), Layout(), wait, Layout((lessons,)), opaque=True)
+        return Block("repetition", reads, writes, step, Layout((lessons,)), opaque=True, waits=waits)
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="repetitive control", changes={"duration": 7.0, "measure_from": 0.0}),
+)

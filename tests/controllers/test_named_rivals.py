@@ -1,0 +1,241 @@
+"""Rivals by their names: the published equations as runs, and where they are the fixed-point iteration command by command."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import chain, linear, pendulum
+
+import fpirhc as fp
+from fpirhc.controllers.rivals.intelligent_pid import window_weights
+from fpirhc.errors import FpirhcError, InvalidProblem
+from fpirhc.plant.maps import step_of
+
+RATE = 6.0
+TRACK = fp.Exponential(rate=RATE)
+DIFFERENCES = fp.Sensing(estimator=fp.VelocityDifference())
+
+
+def swing(**changes: Any) -> fp.Problem:
+    """A pendulum along a sine, with a wrong model."""
+    settings: dict[str, Any] = {"reference": fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)})}
+    settings |= {"plant": pendulum(), "start": {"angle": 0.1}, "period": 1e-3, "duration": 1.0}
+    return fp.Problem(**{**settings, **changes})
+
+
+def pushed(plant: fp.Plant, **changes: Any) -> fp.Problem:
+    """A coordinate to be kept at zero under a load that steps."""
+    settings: dict[str, Any] = {"plant": plant, "reference": fp.Trajectory(lambda t: {"y": 0 * t}), "start": {"y": 0.2}}
+    settings |= {"period": 1e-2, "duration": 1.0, "disturbances": {"y": fp.Step(at=0.3, size=-2.0)}}
+    return fp.Problem(**{**settings, **changes})
+
+
+def first_order(**changes: Any) -> fp.Problem:
+    """Y' = 1.7 u, believed y' = u, and the response is the last difference: what deadbeat observers have."""
+    plant = fp.Plant(
+        {"y": "m"}, {"u": "N"}, {"b": fp.Parameter(1.0, 1.7, "1")}, lambda q, u, p: {"y": p.b * u.u}, order=1
+    )
+    moving = fp.Trajectory(lambda t: {"y": ca.sin(3 * t)})
+    return pushed(plant, sensing=DIFFERENCES, **{"reference": moving, **changes})
+
+
+def run(problem: fp.Problem, controller: Any) -> fp.Run:
+    return fp.simulate(problem, controller, seed=0, compiled=False)
+
+
+def assert_same(problem: fp.Problem, one: Any, other: Any, tolerance: float = 1e-12) -> None:
+    """Both give the same commands, to rounding."""
+    first, second = (run(problem, c)["command"] for c in (one, other))
+    assert np.ptp(second) > 0.1
+    np.testing.assert_allclose(first, second, rtol=0, atol=tolerance * max(1.0, np.abs(second).max()))
+
+
+def iterated(gain: float, tracking: Any = TRACK) -> fp.ComputedTorque:
+    """Computed torque with the model-referenced affine map of that effective gain."""
+    return fp.ComputedTorque(tracking, fp.ModelReferenced(fp.Affine(gain=-2 * gain)))
+
+
+# Identities
+
+
+@pytest.mark.parametrize("limits", [(-50.0, 50.0), (-1.5, 1.5)])
+def test_indi_is_the_iteration_of_unit_gain(limits):
+    """The law u + G^-1 (d - f) and the affine map of unit gain, with a wrong model, also where commands are clipped."""
+    problem = swing(limits=fp.Limits(inputs={"torque": limits}))
+    assert_same(problem, fp.rivals.INDI(TRACK), iterated(1.0))
+
+
+@pytest.mark.parametrize("bandwidth", [50.0, 400.0])
+def test_disturbance_observer_is_the_iteration_of_its_pole(bandwidth):
+    """The effective gain is 1 - exp(-g T), because the model's input gain is constant."""
+    problem = swing()
+    gain = -np.expm1(-bandwidth * problem.period)
+    assert_same(problem, fp.rivals.DisturbanceObserver(TRACK, bandwidth), iterated(gain))
+
+
+def test_deadbeat_observer_of_adrc_is_the_iteration_of_unit_gain():
+    """For order one z_2 is the last difference less b_0 u."""
+    law = fp.Exponential(rate=RATE, integral=False)
+    assert_same(first_order(), fp.rivals.ADRC(RATE, observer=1e6), iterated(1.0, law))
+
+
+def test_shortest_window_of_the_intelligent_pid_is_the_iteration_of_unit_gain():
+    """F is the last difference less alpha u, with alpha the model's gain."""
+    law = fp.Exponential(rate=RATE, integral=False)
+    assert_same(first_order(), fp.rivals.IntelligentPID(law, {"y": 1.0}, window=1), iterated(1.0, law))
+
+
+def test_l1_is_the_iteration_on_differences_as_its_predictor_gets_slow():
+    """Of the effective gain 1 - exp(-w_c T)."""
+    problem, law = first_order(), fp.Exponential(rate=RATE, integral=False)
+    rival = fp.rivals.L1Adaptive(law, bandwidth=60.0, predictor=1e-10)
+    assert_same(problem, rival, iterated(-np.expm1(-60.0 * problem.period), law))
+
+
+# Published equations
+
+
+def test_filter_of_indi_has_the_poles_of_its_transfer_function():
+    """w^2 / (s^2 + 2 zeta w s + w^2) with w = 50 rad/s and zeta = 0.55 (Smeur, Chu, de Croon 2016), and gain one at rest."""
+    period, frequency, damping = 1 / 512, 50.0, 0.55
+    first, second = fp.rivals.INDI(TRACK, frequency, damping).filter(period)
+    poles = np.roots([1.0, -first, -second])
+    wanted = np.exp(period * np.roots([1.0, 2 * damping * frequency, frequency**2]))
+    np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(wanted), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("frequency", "gain", "grows"), [(None, 1.9, False), (None, 2.1, True), (50.0, 2.1, False)])
+def test_indi_diverges_beyond_twice_the_gain_of_the_model_unless_it_is_filtered(frequency, gain, grows):
+    law = fp.rivals.INDI(fp.Exponential(rate=1.0), frequency)
+    load = {"y": fp.Pulse(at=0.1, duration=0.05, size=1.0)}
+    responses = run(pushed(linear(gain, 1.0), disturbances=load, duration=3.0), law)
+    late = np.abs(responses["realised.y"][-20:] - responses["desired.y"][-21:-1]).max()
+    assert late > 1.0 if grows else late < 0.02
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_observer_of_adrc_has_all_poles_at_its_bandwidth(order):
+    """Eigenvalues of (1 - l c) Phi (Miklosovic, Radke, Gao 2006), and its published gains for orders one and two."""
+    period, plant, law = 1e-2, chain(order), fp.rivals.ADRC(2.0, observer=20.0)
+    pole, moves = np.exp(-0.2), step_of(plant, np.eye(order + 1, k=1), period)
+    gains = np.array(law.corrections(plant, order, period))
+    polynomial = np.poly(moves - np.outer(gains, moves[0]))
+    np.testing.assert_allclose(polynomial, np.poly(np.full(order + 1, pole)), atol=1e-9)
+    published = {1: [1 - pole**2, (1 - pole) ** 2 / period]}
+    published[2] = [1 - pole**3, 1.5 * (1 - pole) ** 2 * (1 + pole) / period, (1 - pole) ** 3 / period**2]
+    if order in published:
+        np.testing.assert_allclose(gains, published[order], rtol=1e-9)
+
+
+def test_adrc_estimates_the_total_disturbance_of_a_motion_system():
+    """Y'' = -1.41 y' + 23.2 T_d + 23.2 u, told as y'' = 40 u: z_3 is all of the rest, and the load leaves no error (Gao 2003)."""
+    plant = fp.Plant(
+        {"y": "rev"},
+        {"u": "V"},
+        {"b": fp.Parameter(40.0, 23.2, "rev/(s^2 V)"), "c": fp.Parameter(0.0, 1.41, "1/s")},
+        lambda q, v, u, p: {"y": p.b * u.u - p.c * v.y},
+    )
+    load = {"y": fp.Step(at=2.0, size=-23.2)}
+    result = run(pushed(plant, disturbances=load, duration=5.0, period=1e-3), fp.rivals.ADRC(20.0, observer=100.0))
+    rest = -23.2 - 1.41 * result["state.y'"] + (23.2 - 40.0) * result["command.u"]
+    assert result["extended_state.y''"][-1] == pytest.approx(rest[-1], rel=1e-6)
+    assert abs(result["error.y"][-1]) < 1e-9
+    assert np.abs(result["error.y"][2000:]).max() > 1e-3
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_window_of_the_intelligent_pid_is_the_published_integral(order):
+    """For n = 1 -6/L^3 [(L - 2s) y + alpha s (L - s) u]; n = 2: 60/L^5 (L^2 - 6 L s + 6 s^2) y - 30/L^5 alpha s^2 (L - s)^2 u."""
+    count, period = 400, 1e-3
+    length = count * period
+    outputs, inputs = (w[::-1] / period for w in window_weights(chain(order), order, count, period))  # oldest first
+    s, middle = np.arange(count + 1) * period, (np.arange(count) + 0.5) * period
+    of_output = {1: -6 / length**3 * (length - 2 * s), 2: 60 / length**5 * (length**2 - 6 * length * s + 6 * s**2)}
+    of_input = {1: 6 / length**3 * middle * (length - middle), 2: 30 / length**5 * (middle * (length - middle)) ** 2}
+    scale = np.abs(of_output[order]).max()
+    np.testing.assert_allclose(outputs[5:-5], of_output[order][5:-5], atol=0.02 * scale)
+    np.testing.assert_allclose(inputs, of_input[order], atol=0.02 * of_input[order].max())
+
+
+@pytest.mark.parametrize(("order", "window"), [(1, 1), (1, 12), (2, 2), (2, 15)])
+def test_intelligent_pid_estimates_a_constant_rest_exactly(order, window):
+    """Y^(n) = 1.3 u - 2 with alpha = 1: F = 0.3 u - 2 once u has come to rest."""
+    plant = chain(order)
+    law = fp.rivals.IntelligentPID(fp.Exponential(4.0), {"y": 1.0}, window)
+    result = run(pushed(plant, duration=4.0), law)
+    assert result["ultra_local.y"][-1] == pytest.approx(-2.0, abs=1e-6)
+    assert abs(result["error.y"][-1]) < 1e-5
+
+
+def test_disturbance_observer_approaches_a_load_with_its_pole():
+    """d_k = (1 - p^k) of a load that steps, seen in the measured response."""
+    law = fp.rivals.DisturbanceObserver(TRACK, 30.0)
+    seen = run(pushed(chain(2)), law)["input_disturbance.u"]
+    first = int(np.argmax(seen != 0))
+    np.testing.assert_allclose(seen[first : first + 40], -2.0 * (1 - np.exp(-0.3 * np.arange(1, 41))), rtol=1e-9)
+
+
+@pytest.mark.parametrize("predictor", [1.0, 20.0])
+def test_l1_leaves_the_published_share_of_a_load(predictor):
+    """The piecewise-constant law estimates exp(-a_s T) of the mean residual of the last cycle."""
+    problem = pushed(chain(2), duration=3.0)
+    seen = run(problem, fp.rivals.L1Adaptive(TRACK, bandwidth=200.0, predictor=predictor))["response_disturbance.y"]
+    assert seen[-1] == pytest.approx(-2.0 * np.exp(-predictor * problem.period), rel=1e-6)
+
+
+def test_repetition_shrinks_what_repeats_by_its_gain():
+    """With the plant's gain right, the response error of a period is |1 - gamma| of that of the period before."""
+    load = {"y": fp.Sine(amplitude=3.0, frequency=1.0)}
+    problem = pushed(chain(2), disturbances=load, duration=6.0)
+    result = run(problem, fp.rivals.RepetitiveControl(TRACK, repeats=1.0, gain=0.4))
+    errors = result["realised.y"][1:] - result["desired.y"][:-1]
+    sizes = [np.sqrt(np.mean(errors[k : k + 100] ** 2)) for k in range(100, 500, 100)]
+    np.testing.assert_allclose(np.array(sizes[1:]) / sizes[:-1], 0.6, rtol=1e-6)
+
+
+def test_sine_as_disturbance_model_leaves_nothing_of_a_sine():
+    """The internal model principle; a random walk is late, and more so the slower its filter."""
+    problem = pushed(chain(2), disturbances={"y": fp.Sine(amplitude=3.0, frequency=5.0 / (2 * np.pi))}, duration=30.0)
+    measured, drift = {"y": 1e-3, "y'": 1e-2}, {"y": 1.0}
+    late = {}
+    for name, estimator in {
+        "walk": fp.DisturbanceKalman(drift, measured),
+        "sine": fp.DisturbanceKalman(drift, measured, frequencies=(5.0,)),
+    }.items():
+        errors = run(problem, fp.Estimating(fp.ComputedTorque(TRACK), estimator))["error.y"]
+        late[name] = np.abs(errors[-500:]).max()
+    assert late["sine"] < 0.02 * late["walk"]
+
+
+# Refused
+
+
+@pytest.mark.parametrize(
+    ("rival", "message"),
+    [
+        (fp.rivals.IntelligentPID(TRACK, {}, 4), "'angle' has no gain"),
+        (fp.rivals.IntelligentPID(TRACK, {"angel": 1.0}, 4), "Did you mean 'angle'"),
+        (fp.rivals.IntelligentPID(TRACK, {"angle": 0.0}, 4), "other than zero"),
+        (fp.rivals.IntelligentPID(TRACK, {"angle": 1.0}, 1), "from 1 to the window"),
+        (fp.rivals.RepetitiveControl(TRACK, repeats=0.9995), r"999\.5 cycles"),
+    ],
+)
+def test_what_does_not_fit_is_refused(rival, message):
+    with pytest.raises(InvalidProblem, match=message):
+        run(swing(), rival)
+
+
+def test_settings_are_checked():
+    with pytest.raises(FpirhcError, match=r"smoothing=0\.4"):
+        fp.rivals.RepetitiveControl(TRACK, repeats=1.0, smoothing=0.4)
+    with pytest.raises(FpirhcError, match="above 0"):
+        fp.rivals.ADRC(6.0, observer=-1.0)
+
+
+def test_every_rival_has_its_name_in_one_module():
+    """What is a controller of the literature is found there, and by its name at the top."""
+    for name in fp.rivals.__all__:
+        assert getattr(fp, name) is getattr(fp.rivals, name)
