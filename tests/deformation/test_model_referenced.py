@@ -23,6 +23,7 @@ from fpirhc.symbolic.block import Block
 
 LAW = fp.Exponential(rate=6.0)
 TWO_MASS = fp.load_problem("two_mass")
+LONG = ("chain_of_masses", "hodgkin_huxley_silent", "puma560", "three_link_arm")  # others of their kind are quicker
 
 
 def short(problem: fp.Problem, cycles: int) -> fp.Problem:
@@ -113,7 +114,9 @@ def null_change(name: str) -> float:
     return float(np.abs(runs[1][key] - runs[0][key]).max() / np.abs(runs[0][key]).max())
 
 
-@pytest.mark.parametrize("name", sorted(shipped_problems()))
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in sorted(shipped_problems())]
+)
 def test_exact_model_is_left_alone(name):
     """On every shipped problem, behind its sensors and dead time, quanta included: nothing changes beyond rounding."""
     task: Any = fp.load_problem(name)

@@ -249,10 +249,9 @@ def test_settings_are_chosen_for_the_problem_that_the_inner_controller_sees():
     [
         (torque(), {}),
         (fp.Predicted(torque(), inputs=2e-3), {"dead_time": fp.DeadTime(inputs={"u": 2e-3})}),
-        (fp.ExactModel(replace(PLAN, deformation=fp.Affine(-0.5))), LOOKING_AHEAD),
         (fp.Estimating(PLAN, FILTER), LOOKING_AHEAD),
     ],
-    ids=["torque", "predicted", "exact model", "estimating"],
+    ids=["torque", "predicted", "estimating"],
 )
 def test_a_wrapper_of_a_wrapper_is_reviewed_as_what_it_is_made_of(controller, settings):
     """Two wrappers of a user's own change no answer."""

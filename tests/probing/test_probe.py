@@ -95,7 +95,7 @@ def test_the_excitation_is_bounded_and_the_channels_independent():
 # --- The choice -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("known", [KNOWN[1], KNOWN[3]])
+@pytest.mark.parametrize("known", [pytest.param(KNOWN[1], marks=pytest.mark.slow), KNOWN[3]])
 def test_the_choice_is_near_the_best_of_a_grid_by_hand(known):
     """At most 1.2 times the least error of 16 settings that are given the true gain, dead time and lag."""
     gain, dead, _, _ = known

@@ -53,7 +53,7 @@ def movement(problem: fp.Problem, controller: Any) -> float:
         (fp.load_problem("two_mass"), "RHC", 3.0, True),
         (fp.load_problem("leaking_tanks"), "RHC", None, True),
         (abroad.load("flexible_servo"), "RHC+FPI", None, False),
-        (fp.load_problem("hodgkin_huxley_silent"), "RHC offset-free", None, True),
+        pytest.param(fp.load_problem("hodgkin_huxley_silent"), "RHC offset-free", None, True, marks=pytest.mark.slow),
         (fp.load_problem("leaking_tanks"), "RHC offset-free", None, True),
         (fp.load_problem("tumour"), "RHC offset-free", None, True),
     ],

@@ -120,10 +120,9 @@ def contained(name: str, which: str, gain: float) -> None:
     ("name", "which"),
     [
         ("two_mass", "CTC"),
-        ("two_mass", "RHC"),
         ("van_der_pol_duffing", "RHC"),
         ("mrac_pendulum", "CTC"),
-        ("two_link_arm", "RHC"),
+        *(pytest.param(name, "RHC", marks=pytest.mark.slow) for name in ("two_mass", "two_link_arm")),
     ],
 )
 def test_run_is_inside_its_tube(name, which, gain):

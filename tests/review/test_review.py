@@ -43,10 +43,10 @@ def predicted(seeds: range) -> tuple[int, int, int]:
 
 def test_verdicts_on_random_closed_loops():
     """Linear and nonlinear, one to three coordinates, right and wrong signs, over-gained, with dead time: see `random_plants`."""
-    right, wrong, unknown = predicted(range(25))
+    right, wrong, unknown = predicted(range(14))
     assert wrong == 0
-    assert unknown < 0.15 * 25
-    assert right >= 18
+    assert unknown < 0.15 * 14
+    assert right >= 10
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_null_answers_on_random_closed_loops(monkeypatch):
     """A yes of the null test is never wrong; gains of the wrong sign, refused otherwise, are asked and run too."""
     monkeypatch.setattr(contract, "check_gain_sign", lambda *_: None)
     monkeypatch.setattr(contract, "check_gain_size", lambda *_: None)
-    assert wrong_null_answers(range(6)) == []
+    assert wrong_null_answers(range(3)) == []
 
 
 @pytest.mark.slow
@@ -263,7 +263,7 @@ def test_box_spans_model_and_plant_and_a_margin():
 
 def test_prediction_is_the_review_s_verdict():
     """The verdict does not depend on the questions that are asked beside it."""
-    for seed in (0, 9, 20):
+    for seed in (0, 9):
         case = random_case(seed)
         answers_by_question = answers(case.problem, case.controller)
         one = predict(case.problem, case.controller)
@@ -301,6 +301,8 @@ def test_values_that_make_no_sense_are_refused():
 _LONG = (
     *("chain_of_masses", "puma560", "three_link_arm", "planar_arm", "two_link_arm", "van_der_pol", "leaking_tanks"),
     *("delayed_mass", "delayed_tanks"),  # the journey below reviews dead time
+    *("noisy_motor", "anaesthesia", "freeway"),  # others of their kind are quicker
+    *("hodgkin_huxley_silent", "tumour_daily", "turbojet_slow"),  # the plants of others with another task
 )
 
 
