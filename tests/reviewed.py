@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import pkgutil
 from collections.abc import Callable
 from functools import cache
-from importlib import import_module
 from typing import Any
 
 import casadi as ca
@@ -13,33 +11,12 @@ import numpy as np
 
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
-from fpirhc.review import (
-    chatter,
-    commands,
-    convergence,
-    discretisation,
-    gain,
-    horizon,
-    margins,
-    null_test,
-    pays,
-    questions,
-    rates,
-    review,
-    slew,
-    speed,
-    two_cycles,
-    well_posed,
-    zero_dynamics,
-)
-from fpirhc.review.gain_advice import gain_advice
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.maps import largest_product
-from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.nominal_runs import NominalRuns
-from fpirhc.review.planned import is_planned
-from fpirhc.review.question import Case, ProblemQuestion
+from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
+from fpirhc.review.questions.convergence import CONVERGES
+from fpirhc.review.review import predict
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
 PERIOD = 1e-3  # s
@@ -97,68 +74,14 @@ def case(problem: fp.Problem, controller: Any, mismatch: float = 0.0) -> Case:
 
 def answer(problem: fp.Problem, controller: Any, words: str, mismatch: float = 0.0) -> Any:
     """The answer to the question with these words, the others not asked; None where it is not asked of the controller."""
-    every = {**OF_PROBLEMS, **OF_CONTROLLERS}
-    [text] = [text for text in every if words in text]
-    subject: Any = review_grid(problem, mismatch, 0) if text in OF_PROBLEMS else case(problem, controller, mismatch)
-    return next((one for one in (ask(subject) for ask in every[text]) if one is not None), None)
-
-
-def _own(one: Case) -> Any:
-    return spectrum_near(one.grid, one.believed, one.grid.draws[:1], near=False)
-
-
-def _admissible(one: Case) -> fp.Answer:
-    deformation, own = one.controller.deformation, _own(one)
-    boxed = spectrum_near(one.grid, one.believed, one.grid.draws, near=False)
-    limit = largest_product(one.problem, deformation, own.eigenvalues)
-    advice = gain_advice(one, boxed, null_test.leaves_right_model_alone(one))
-    return gain.gain_admissible(deformation, own, boxed, limit, advice)
-
-
-def _ideal(one: Case) -> Any:
-    return one.loops.ideal if is_planned(one.controller) else None
-
-
-def _adaptive(ask: Callable[[Case], Any], of_targets: bool = False) -> Callable[[Case], Any]:
-    """The question where there is a deformation that it is about."""
-
-    def asked(one: Case) -> Any:
-        adapts = one.controller.deformation.adapts and (of_targets or one.controller.deforms != "target")
-        return ask(one) if adapts else None
-
-    return asked
-
-
-OF_PROBLEMS: dict[str, list[Callable[[Any], Any]]] = {
-    well_posed.QUESTION: [well_posed.well_posed],
-    commands.QUESTION: [commands.commands_inside],
-    discretisation.QUESTION: [discretisation.discretisation_follows],
-    horizon.QUESTION: [horizon.horizon_long_enough],
-}
-OF_CONTROLLERS: dict[str, list[Callable[[Case], Any]]] = {
-    convergence.QUESTION: [lambda one: review.predict(one.grid.real or one.problem, one.controller)],
-    margins.QUESTION: [review._margins],
-    rates.QUESTION: [review._rates],
-    zero_dynamics.QUESTION: [review._zero_dynamics],
-    null_test.QUESTION_TEXT: [_adaptive(null_test.leaves_right_model_alone, of_targets=True)],
-    pays.QUESTION: [_adaptive(pays.pays)],
-    two_cycles.QUESTION: [_adaptive(two_cycles.free_of_two_cycles)],
-    gain.QUESTION: [_adaptive(_admissible)],
-    speed.FAST: [_adaptive(lambda one: speed.fast_enough(one, _own(one)))],
-    speed.LAG: [_adaptive(lambda one: speed.bears_lag(one.grid, one.controller, _own(one)))],
-    slew.QUESTION: [
-        _adaptive(lambda one: slew.slew_enough(one.grid, one.controller.deformation, one.believed, _ideal(one)))
-    ],
-    slew.RANGE: [_adaptive(lambda one: slew.range_enough(one.grid, one.controller.deformation, one.believed))],
-    chatter.QUESTION: [_adaptive(lambda one: chatter.chatter_small(one.grid, one.controller))],
-}
-for _module in [import_module(f"{questions.__name__}.{m.name}") for m in pkgutil.iter_modules(questions.__path__)]:
-    _text, _question = getattr(_module, "TEXT", getattr(_module, "FAST", "")), _module.QUESTION
-    if isinstance(_question, ProblemQuestion):
-        OF_PROBLEMS.setdefault(_text, []).append(_question.ask)
-    else:
-        _ask = _adaptive(_question.ask, _question.of_targets) if _question.adaptive else _question.ask
-        OF_CONTROLLERS.setdefault(_text, []).append(_ask)
+    of_problem = [q for q in known_questions(ProblemQuestion) if words in q.text]
+    if of_problem:
+        return of_problem[0].ask(review_grid(problem, mismatch, 0))
+    one = case(problem, controller, mismatch)
+    asked = [q for q in known_questions(ControllerQuestion) if words in q.text and q.concerns(one.controller)]
+    if any(q.text == CONVERGES for q in asked):
+        return predict(problem, controller)
+    return next((found for found in (q.ask(one) for q in asked) if found is not None), None)
 
 
 def linear(dynamics: Any, entry: Any, arriving: Any, state: Any, period: float) -> LinearLoop:

@@ -1,7 +1,7 @@
 """The contract of a question about a problem or a controller: a file of the folder `questions` adds one.
 
-A file defines `QUESTION`, a `ProblemQuestion` or a `ControllerQuestion`. Another package does so with an entry point of the
-group `fpirhc.questions`.
+A file defines `QUESTIONS`, values of `ProblemQuestion` and `ControllerQuestion`. Another package names one of them in an entry
+point of the group `fpirhc.questions`.
 """
 
 from __future__ import annotations
@@ -12,21 +12,23 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 
+from fpirhc.broken import attempted
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import FpirhcError
+from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.review import questions
-from fpirhc.review.answer import Answer
+from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.loops import Loops
-from fpirhc.review.loops_by_gain import LoopsByGain, loops_by_gain
+from fpirhc.review.loops import Loops, LoopsByGain, loops_by_gain
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.prediction import NominalRun
+from fpirhc.review.spectra import spectrum_near
 from fpirhc.simulation.error_pair import ErrorPair
 from fpirhc.simulation.trials import Trials, harm_in
 from fpirhc.task.problem import Problem
@@ -46,12 +48,14 @@ class Case:
         controller: the controller, with its automatic settings chosen.
         loops: its linear loops.
         runs: the models' own runs of this review.
+        general: answers about the problem.
     """
 
     grid: ReviewGrid
     controller: Controller
     loops: Loops
     runs: NominalRuns
+    general: tuple[Answer, ...] = ()
 
     @property
     def problem(self) -> Problem:
@@ -62,6 +66,18 @@ class Case:
     def believed(self) -> np.ndarray:
         """Parameters of the model, shape (np,)."""
         return self.controller.plant_model(self.problem).parameters(self.problem.plant)
+
+    @cached_property
+    def spectra(self) -> tuple[Spectrum, Spectrum] | None:
+        """Eigenvalues of the response Jacobian along the reference and over the box; None where none is finite."""
+        try:
+            own, boxed = (
+                spectrum_near(self.grid, self.believed, draws, near=False)
+                for draws in (self.grid.draws[:1], self.grid.draws)
+            )
+        except InvalidValue:
+            return None
+        return own, boxed
 
     @cached_property
     def by_gain(self) -> LoopsByGain | None:
@@ -114,6 +130,23 @@ class Case:
         return not self.harm(deformation) and (isinstance(trial, str) or trial[0] is None or trial[0].lowers)
 
     @cached_property
+    def _answers(self) -> dict[ControllerQuestion, Answer | None]:
+        return {}
+
+    def answer(self, question: ControllerQuestion) -> Answer | None:
+        """Return the answer to a question, asked once; None where it has no meaning for the controller."""
+        if question not in self._answers:
+            self._answers[question] = asked(question, self) if question.concerns(self.controller) else None
+        return self._answers[question]
+
+    @property
+    def doubts(self) -> list[str]:
+        """Reasons against convergence: answers that are no, about the problem and to questions that may doubt it."""
+        own = [self.answer(question) for question in known_questions(ControllerQuestion) if question.doubts]
+        every = [*self.general, *(a for a in own if a is not None)]
+        return [f"'{a.question}' is answered no" for a in every if a.verdict == Verdict.NO]
+
+    @cached_property
     def nominal(self) -> NominalRun | str:
         """The model's own run over at most `nominal_runs.CYCLES` cycles, or the reason why there is none."""
         return self.runs.of(self.controller)
@@ -125,11 +158,15 @@ class ProblemQuestion:
 
     Args:
         ask: the answer from the points of the reference; None where the question has no meaning for the problem.
+        text: the question in the words of a reader, for an answer that cannot be found.
         order: place among the questions; the built-in ones come first.
+        doubts: whether the verdict alone needs its answer.
     """
 
     ask: Callable[[ReviewGrid], Answer | None]
+    text: str = ""
     order: int = 100
+    doubts: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +175,7 @@ class ControllerQuestion:
 
     Args:
         ask: the answer; None where the question has no meaning for the controller.
+        text: the question in the words of a reader, for an answer that cannot be found.
         order: place among the questions; the built-in ones come first.
         adaptive: whether it is asked about controllers with a deformation alone.
         doubts: whether a no makes it unknown that the deformation converges.
@@ -145,16 +183,32 @@ class ControllerQuestion:
     """
 
     ask: Callable[[Case], Answer | None]
+    text: str = ""
     order: int = 100
     adaptive: bool = True
     doubts: bool = False
     of_targets: bool = False
+
+    def concerns(self, controller: Controller) -> bool:
+        """Return whether the question is asked about a controller."""
+        adapts = controller.deformation.adapts
+        return not self.adaptive or (adapts and (self.of_targets or controller.deforms != "target"))
+
+
+def asked(question: ProblemQuestion | ControllerQuestion, about: ReviewGrid | Case) -> Answer | None:
+    """Return the answer to a question; unknown where asking it breaks."""
+    broken: list[str] = []
+    answer = attempted("the answer", cast("Callable[..., Answer | None]", question.ask), about, broken=broken)
+    if not broken:
+        return answer
+    name = getattr(question.ask, "__name__", type(question.ask).__name__).strip("_").replace("_", " ")
+    return Answer(question.text or f"{name.capitalize()}?", Verdict.UNKNOWN, broken[0])
 
 
 @cache
 def known_questions(kind: type[Kind]) -> tuple[Kind, ...]:
     """Return the questions of one kind in their order, those of installed packages included."""
     modules = (import_module(f"{questions.__name__}.{m.name}") for m in pkgutil.iter_modules(questions.__path__))
-    known = [module.QUESTION for module in modules if hasattr(module, "QUESTION")]
+    known = [question for module in modules for question in module.QUESTIONS]
     known += [point.load() for point in entry_points(group=GROUP)]
     return tuple(sorted((q for q in known if type(q) is kind), key=lambda q: q.order))

@@ -16,16 +16,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.contraction.gains import ContractionReport
+from fpirhc.contraction.gains import ContractionReport, assess_gain
 from fpirhc.contraction.large_errors import two_cycle_limit
+from fpirhc.contraction.spectrum import Spectrum
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
-from fpirhc.review.loops_by_gain import LoopsByGain
-from fpirhc.review.margins import keeps_margins
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import LoopsByGain, loops_along
+from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.question import Case
+from fpirhc.review.questions.margins import keeps_margins
+from fpirhc.review.questions.right_model import leaves_right_model_alone
+from fpirhc.review.spectra import largest_product, spectrum_near
+from fpirhc.task.problem import Problem
 
 MARGIN = 2.0
 SECANT, TWO_CYCLE = "the map's steepest secant", "a two-cycle of the whole loop"
@@ -161,3 +171,54 @@ def _with_margins(loops: LoopsByGain, gain: float) -> float:
 def _own_per_effective(deformation: Deformation) -> float:
     own = getattr(deformation, deformation.gain_name, None)
     return 1.0 if own is None else float(own) / deformation.effective_gain()
+
+
+def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended:
+    """Return the recommended gain of a controller; none where it fails the null test, or where a run with that gain does harm.
+
+    Where its own gain is beyond the limits, the null test of a gain within them counts.
+
+    Args:
+        case: of the controller.
+        boxed: eigenvalues of the response Jacobian over the box of parameters.
+        null: the answer whether adaptation leaves a right model alone.
+    """
+    deformation = case.controller.deformation
+    report = assess_gain(deformation, boxed)
+    share = largest_product(case.problem, deformation, boxed.eigenvalues) / 2
+    low, high = (share * end for end in report.sector_limit)
+    if low < high and not low < deformation.effective_gain() < high:
+        safe = _case_with(case, 0.5 * (low + high))
+        return replace(gain_advice(safe, boxed, leaves_right_model_alone(safe)), exceeded=True)
+    advice = recommended_gain(deformation, report, share, case.by_gain)
+    if advice.why_not:
+        return advice
+    if null is not None and null.verdict == Verdict.NO:
+        against = "adaptation does not leave a right model alone"
+    else:
+        own = getattr(deformation, deformation.gain_name, None)
+        size = advice.value if own is None else advice.value / float(own) * deformation.effective_gain()
+        harm = case.harm(deformation.with_effective_gain(size))
+        against = f"with {advice.value:.3g}, half of it, {harm}" if harm else ""
+    return replace(advice, value=math.nan, why_not=against) if against else advice
+
+
+def recommended_for(problem: Problem, controller: Controller) -> Recommended | None:
+    """Return the gain that a review of a controller recommends, also where its own gain is refused; None where it has no answer."""
+    try:
+        grid = review_grid(problem, 0.0, 0)
+        ready = resolved(grid.problem, controller)
+        boxed = spectrum_near(
+            grid, ready.plant_model(grid.problem).parameters(grid.problem.plant), grid.draws, near=False
+        )
+        case = Case(grid, ready, loops_along(grid, ready), NominalRuns(grid.problem))
+        return gain_advice(case, boxed, leaves_right_model_alone(case))
+    except FpirhcError:
+        return None
+
+
+def _case_with(case: Case, gain: float) -> Case:
+    """The case of the controller with another effective gain."""
+    deformation = case.controller.deformation.with_effective_gain(gain)
+    controller = resolved(case.problem, case.controller.with_deformation(deformation))
+    return Case(case.grid, controller, loops_along(case.grid, controller), case.runs)

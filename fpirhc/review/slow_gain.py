@@ -5,14 +5,12 @@ from __future__ import annotations
 from fpirhc.broken import attempted
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.gain_advice import recommended_for
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.question import Case
-from fpirhc.review.questions.least_gain import plan_keeps_up
-from fpirhc.review.speed import fast_enough
+from fpirhc.review.questions.speed import fast_enough, plan_keeps_up
+from fpirhc.review.recommended_gain import recommended_for
 from fpirhc.task.problem import Problem
 
 
@@ -38,5 +36,4 @@ def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> s
 def _answer(problem: Problem, controller: Controller) -> Answer | None:
     grid = review_grid(problem, 0.0, 0)
     case = Case(grid, controller, loops_along(grid, controller), NominalRuns(grid.problem))
-    own = spectrum_near(grid, case.believed, grid.draws[:1], near=False)
-    return fast_enough(case, own) or plan_keeps_up(case)
+    return fast_enough(case) or plan_keeps_up(case)

@@ -1,7 +1,7 @@
 """Gain and filter pole for a budget of chatter: as much adaptation as the noise of the measured response allows.
 
 The largest gain is sought with which noise alone moves no input by more than its budget per cycle, at any of some
-points of the reference (`contraction.noise`), the filter's pole following the gain so that the iteration keeps its
+points of the reference, the filter's pole following the gain so that the iteration keeps its
 damping. What noise leaves of tracking is independent of both, as long as the iteration is fast against the tracking
 law: the plant then realises d - n, which acts as -n at its response in the loop with the right model.
 """
@@ -12,20 +12,21 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.by_name import FoundByName
-from fpirhc.contraction.noise import filter_pole
+from fpirhc.contraction.spectrum import Array, response_jacobians
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
-from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotContractive, NotSupported, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, NotContractive, NotSupported, nearest
 from fpirhc.fields.checked import checked_call
-from fpirhc.review.grid import review_grid
+from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.noise_along import Noisy, noisy_points
 from fpirhc.review.question import TRIED
+from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.trials import Trials, harm_in
 from fpirhc.summary import line, number, table
@@ -202,3 +203,161 @@ def _floor(ideal: LinearLoop | None, noisy: Noisy, problem: Problem) -> dict[str
     sizes = np.sqrt(np.diag(ideal.errors @ spread @ ideal.errors.T))
     judged = dict(zip(problem.judged_names, map(float, sizes), strict=True))
     return {c: judged.get(c, math.nan) for c in plant.controlled_names}
+
+
+_POINTS = 9
+_DRAWN = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Noisy:
+    """Points of the reference; build it with `noisy_points`.
+
+    Parameters: jacobians J (points, n, n), inverses: the model's inputs per unit of response (points, nu, n),
+    covariance (n, n) of the noise.
+    """
+
+    jacobians: np.ndarray
+    inverses: np.ndarray
+    covariance: np.ndarray
+
+    def steps(self, gain: float, pole: float) -> np.ndarray:
+        """Return the rms step of every input (nu,), the largest of all points.
+
+        Raises:
+            NotContractive: gain and pole with which noise grows.
+        """
+        spreads = [noise_spread(j, self.covariance, gain, pole).step for j in self.jacobians]
+        covariances = [b @ s @ b.T for b, s in zip(self.inverses, spreads, strict=True)]
+        return np.asarray(np.sqrt(np.max([np.diag(m) for m in covariances], axis=0)))
+
+
+def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, float] | None) -> Noisy:
+    """Return the points with the noise of the problem's sensors, or the given one.
+
+    Parameters: `controller`, resolved; `noise`: standard deviation of the measured response by controlled coordinate.
+
+    Raises:
+        InvalidValue: no noise, a negative one. InvalidName: an unknown coordinate. NotSupported: a response that is
+        estimated, whose noise must be given. NotContractive: no finite response Jacobian.
+    """
+    jacobians, inverses = _along_the_reference(
+        grid, controller.plant_model(grid.problem).parameters(grid.problem.plant)
+    )
+    return Noisy(jacobians, inverses, np.diag(_deviations(grid.problem, noise) ** 2))
+
+
+def chatter_of(grid: ReviewGrid, controller: Controller, gain: float, pole: float) -> dict[str, float]:
+    """Return, by input, the rms step of the command per cycle that the noise of the problem's sensors causes.
+
+    Parameters: `controller`, resolved; effective `gain` and `pole` of the filter of its error.
+
+    Raises:
+        InvalidValue, NotSupported, NotContractive: as `noisy_points`.
+    """
+    noisy = noisy_points(grid, controller, None)
+    return dict(zip(grid.problem.plant.inputs, map(float, noisy.steps(gain, pole)), strict=True))
+
+
+def _deviations(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarray:
+    """Standard deviation of every controlled coordinate's measured response."""
+    names = problem.plant.controlled_names
+    spreads = _of_sensors(problem) if noise is None else noise
+    for name, value in spreads.items():
+        if name not in names:
+            raise InvalidName(f"suggest(noise=...): coordinate '{name}' is not controlled.{nearest(name, names)}")
+        if not 0 <= value < math.inf:
+            raise InvalidValue(
+                f"suggest(noise=...): {value!r} for '{name}'; expected a standard deviation of at least 0"
+            )
+    levels = np.array([float(spreads.get(name, 0.0)) for name in names])
+    if not levels.any():
+        raise InvalidValue(
+            "suggest: no response has noise, so no gain chatters; give noise={'"
+            + names[0]
+            + "': ...}, the standard deviation of "
+            "the measured response"
+        )
+    return levels
+
+
+def _of_sensors(problem: Problem) -> dict[str, float]:
+    """Deviation of the noise of the sensors that measure responses."""
+    plant, sensing = problem.plant, problem.sensing
+    measured = dict(zip(response_names(plant), plant.controlled_names, strict=True))
+    if sensing.sensors and not set(measured) & set(sensing.measures(plant)):
+        raise NotSupported(
+            f"suggest: the response is estimated by {type(sensing.estimator).__name__}, whose noise is not white; give "
+            "noise={coordinate: standard deviation of the estimated response}"
+        )
+    times = problem.period * np.arange(_DRAWN)
+    noises = {measured[name]: sensor.noise for name, sensor in sensing.sensors.items() if name in measured}
+    random = np.random.default_rng(0)
+    return {c: float(np.std(n.values(times, random))) for c, n in noises.items() if n is not None}
+
+
+def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Response Jacobians (points, n, n), and the model's inputs per unit of response (points, nu, n), where all are finite."""
+    plant = grid.problem.plant
+    places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
+    exact = np.tile(grid.draws[0], (len(places), 1))
+    jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
+    x, u, p = plant.symbols()
+    slope = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
+    gains = [np.asarray(slope(grid.states[k], grid.commands[0, k], believed).full()) for k in places]
+    usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
+    if not usable:
+        raise NotContractive(
+            "the response Jacobian is finite nowhere along the reference; see whether the problem is well posed"
+        )
+    return jacobians[usable], np.array([np.linalg.inv(gains[k]) for k in usable])
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSpread:
+    """Covariances of the request and of its step per cycle.
+
+    Args:
+        request: covariance of r, shape (n, n), in the unit of the response squared.
+        step: covariance of r_k - r_{k-1}, shape (n, n), in the same unit.
+    """
+
+    request: Array
+    step: Array
+
+
+def noise_spread(jacobian: Array, noise: Array, gain: float, pole: float) -> NoiseSpread:
+    """Return the stationary covariances of g_k = p g_{k-1} + (1 - p)(J r_{k-1} + n_k), r_k = r_{k-1} - a g_k.
+
+    Args:
+        jacobian: J, shape (n, n), dimensionless.
+        noise: covariance of the noise of the response, shape (n, n), in the unit of the response squared.
+        gain: effective gain a.
+        pole: p of the filter of the error, in [0, 1).
+
+    Raises:
+        InvalidShape: matrices that do not fit.
+        NotContractive: a loop that is not stable.
+    """
+    j, covariance = np.atleast_2d(jacobian), np.atleast_2d(noise)
+    if j.shape != covariance.shape or j.shape[0] != j.shape[1]:
+        raise InvalidShape(f"jacobian {j.shape} and noise {covariance.shape}: expected two square matrices of one size")
+    one, share = np.eye(len(j)), 1 - pole
+    loop = np.block([[one - gain * share * j, -gain * pole * one], [share * j, pole * one]])
+    radius = float(np.abs(np.linalg.eigvals(loop)).max())
+    if not radius < 1:
+        raise NotContractive(
+            f"gain {gain:.4g} with the filter's pole {pole:.4g}: an error changes by {radius:.4g} per cycle, so noise grows; lower "
+            "the gain"
+        )
+    entry = share * np.vstack([-gain * one, one])
+    from scipy.linalg import solve_discrete_lyapunov  # it takes longer to import than a problem to load
+
+    spread = solve_discrete_lyapunov(loop, entry @ covariance @ entry.T)
+    n = len(j)
+    return NoiseSpread(spread[:n, :n], gain**2 * spread[n:, n:])
+
+
+def filter_pole(product: float, ringing: float) -> float:
+    """Return p with a lambda / (1 - p) = ringing; 0 where the product exceeds the ringing, and where the ringing is 0."""
+    return max(0.0, 1 - product / ringing) if ringing else 0.0

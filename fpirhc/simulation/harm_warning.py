@@ -50,7 +50,7 @@ def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[
         yield
     except NotContractive as error:
         review = import_module(
-            "fpirhc.review.gain_advice"
+            "fpirhc.review.recommended_gain"
         )  # of a layer above, which is only asked when nothing else follows
         advice = review.recommended_for(problem, controller)
         if advice is None:

@@ -16,7 +16,7 @@ from fpirhc.controllers.contract import with_optimiser
 from fpirhc.controllers.receding_horizon import _optimal_control
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
-from fpirhc.review.horizon import plan_gain
+from fpirhc.review.questions.horizon import plan_gain
 from fpirhc.task.problem import cycles_per_plan
 
 STAGES, STEP, PERIOD = 6, 0.08, 0.02

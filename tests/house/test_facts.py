@@ -424,7 +424,7 @@ GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/
 # Values that generic code builds for itself; it asks nobody whether he is one.
 BUILDS = {
     "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map
-    "review/forms.py": {"Increment", "ModelReferenced"},  # the forms that are compared
+    "review/questions/form.py": {"Increment", "ModelReferenced"},  # the forms that are compared
     "review/prediction.py": {"Identity"},  # no adaptation
     "review/suggest.py": {"Filtered"},  # the suggested deformation
     "simulation/held_input.py": {"Identity"},  # no controller: nothing is adapted

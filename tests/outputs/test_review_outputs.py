@@ -15,7 +15,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.slew import effect, slew_enough
+from fpirhc.review.questions.slew import effect, slew_enough
 
 LEVEL = 3.0  # mg/l
 CONVERGED = fp.RecedingHorizon(fp.FixedPoint(iterations=8, tolerance=1e-9))

@@ -11,7 +11,7 @@ from abroad import load
 from reviewed import answer
 
 import fpirhc as fp
-from fpirhc.review.forms import forms_of
+from fpirhc.review.questions.form import forms_of
 
 
 def test_the_reactor_drifts_within_a_cycle():

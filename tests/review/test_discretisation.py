@@ -10,8 +10,8 @@ import pytest
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Verdict
-from fpirhc.review.discretisation import discretisation_follows
 from fpirhc.review.grid import review_grid
+from fpirhc.review.questions.integration import discretisation_follows
 
 PLANT = fp.Plant(
     coordinates={"x": "m"},

@@ -10,7 +10,8 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.review.questions.iterations import MANY, TEXT
+from fpirhc.review.questions.horizon import ITERATIONS as TEXT
+from fpirhc.review.questions.horizon import MANY
 from fpirhc.status import Status
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fpirhc.review.margins import LEAST_GAIN, LEAST_PHASE, keeps_margins, margins
+from fpirhc.review.questions.margins import LEAST_GAIN, LEAST_PHASE, keeps_margins, margins
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
 

@@ -15,7 +15,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.margins import margins
+from fpirhc.review.questions.margins import margins
 
 
 class Multiplied:

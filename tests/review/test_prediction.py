@@ -16,7 +16,7 @@ from fpirhc.contraction.large_errors import least_product
 from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.review.prediction import nominal_run, response_errors
-from fpirhc.review.tube import majorant, tube
+from fpirhc.review.response_prediction import majorant, tube
 
 SCALES = {"two_mass": 20.0, "mrac_pendulum": 50.0}  # m/s^2, rad/s^2; 50 for the others
 

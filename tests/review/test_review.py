@@ -18,11 +18,11 @@ from fpirhc.cli.main import main
 from fpirhc.controllers import contract
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.problem_files.shipped import shipped_problems
-from fpirhc.review.forms import forms_of
 from fpirhc.review.grid import review_grid
-from fpirhc.review.horizon import plan_gain
 from fpirhc.review.loops import loops_along
-from fpirhc.review.margins import margins
+from fpirhc.review.questions.form import forms_of
+from fpirhc.review.questions.horizon import plan_gain
+from fpirhc.review.questions.margins import margins
 from fpirhc.review.review import predict
 
 

@@ -16,15 +16,15 @@ import fpirhc as fp
 from fpirhc.contraction.gains import assess_gain
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
-from fpirhc.review.commands import commands_inside
-from fpirhc.review.convergence import _NEAR, _without, box_converges, converges
-from fpirhc.review.gain import gain_admissible, gain_of_target
+from fpirhc.review.answer import duration, per_cycle
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
-from fpirhc.review.margins import margins_enough
+from fpirhc.review.questions.commands import commands_inside
+from fpirhc.review.questions.convergence import _NEAR, _without, box_converges, converges
+from fpirhc.review.questions.gain import gain_admissible, gain_of_target
+from fpirhc.review.questions.margins import margins_enough
+from fpirhc.review.questions.slew import effect, range_enough, slew_enough
 from fpirhc.review.recommended_gain import FAR, recommended_gain
-from fpirhc.review.slew import effect, range_enough, slew_enough
-from fpirhc.review.wording import duration, per_cycle
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 PERIOD, CYCLES = 0.1, 100
@@ -266,7 +266,7 @@ def test_both_signs_of_an_inverse_are_inside():
 )
 def test_gain_of_a_map_on_targets(monkeypatch, limit, radius, verdict, said, change):
     """A_c = -0.5 is the effective gain 0.25: numbers are those of A_c, and a loop that converges at the plant refuses nothing."""
-    monkeypatch.setattr("fpirhc.review.gain.limit_of_loop", lambda deformation, loops: (limit, "a pole"))
+    monkeypatch.setattr("fpirhc.review.questions.gain.limit_of_loop", lambda deformation, loops: (limit, "a pole"))
     controller, loops = SimpleNamespace(deformation=fp.Affine(-0.5)), SimpleNamespace(radii=np.array([0.5, radius]))
     case: Any = SimpleNamespace(controller=controller, by_gain=object(), loops=loops)
     one = gain_of_target(case)

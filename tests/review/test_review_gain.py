@@ -11,8 +11,8 @@ from reviewed import about, answer, answers
 from test_review_laws import PERIOD, RATE, moving
 
 import fpirhc as fp
+from fpirhc.review.questions.speed import gain_times
 from fpirhc.review.review import predict
-from fpirhc.review.speed import gain_times
 
 DAILY = fp.load_problem("problems/gallery/tumour_daily.py")
 PLANNED = "RHC+FPI, gentle"

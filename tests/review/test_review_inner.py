@@ -14,7 +14,7 @@ from reviewed import answer
 import fpirhc as fp
 from fpirhc.review.grid import review_grid
 from fpirhc.review.inner import inner_motion, inner_places
-from fpirhc.review.zero_dynamics import zero_dynamics
+from fpirhc.review.questions.zero_dynamics import zero_dynamics
 
 PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-3))
 LAW = fp.ComputedTorque(fp.Exponential(rate=2.0))

@@ -13,7 +13,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.grid import review_grid
-from fpirhc.review.questions.jumps import jumps, reference_free_of_jumps
+from fpirhc.review.questions.reference import jumps, reference_free_of_jumps
 
 
 def mass(motion: Callable[[Any], Any], **settings: Any) -> fp.Problem:

@@ -13,8 +13,8 @@ import scipy.linalg
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.review.grid import review_grid
-from fpirhc.review.horizon import plan_gain
 from fpirhc.review.loops import loops_along
+from fpirhc.review.questions.horizon import plan_gain
 
 STEP = 0.05  # s
 

@@ -16,7 +16,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import ideal_loops
-from fpirhc.review.slew import slew_enough
+from fpirhc.review.questions.slew import slew_enough
 
 # Parameters
 

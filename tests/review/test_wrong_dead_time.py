@@ -16,9 +16,8 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation import Deformation
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.review.convergence import box_converges
-from fpirhc.review.questions.dead_time import bears_wrong_dead_time
-from fpirhc.review.questions.late_runs import pays_when_late
+from fpirhc.review.questions.convergence import box_converges
+from fpirhc.review.questions.dead_time import bears_wrong_dead_time, pays_when_late
 from fpirhc.review.review import predict
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING

@@ -11,6 +11,9 @@ import pytest
 import fpirhc as fp
 from fpirhc.review import review as reviewing
 from fpirhc.review.answer import Verdict
+from fpirhc.review.question import known_questions
+from fpirhc.review.questions.commands import COMMANDS
+from fpirhc.review.questions.gain import GAIN
 from fpirhc.simulation import run_signals
 from fpirhc.studies.comparison import compare as comparing
 from fpirhc.studies.comparison import side_by_side
@@ -86,10 +89,14 @@ def test_a_signal_that_breaks_after_the_run_does_not_lose_it(monkeypatch):
     assert sentence.startswith("the signal 'contraction' could not be computed (LinAlgError")
 
 
-def answers(monkeypatch, *names):
-    """Questions with their answers, of the problem and of the adaptive controller, where some functions break."""
-    for name in names:
-        monkeypatch.setattr(reviewing, name, breaks)
+def answers(monkeypatch, *texts):
+    """Questions with their answers, of the problem and of the adaptive controller, where some questions break."""
+    known = known_questions
+    monkeypatch.setattr(
+        reviewing,
+        "known_questions",
+        lambda kind: tuple(replace(q, ask=breaks) if q.text in texts else q for q in known(kind)),
+    )
     review = fp.review(PROBLEM, CONTROLLERS, mismatch=20.0, seed=0)
     return {a.question: a for a in review.problem}, {a.question: a for a in review.controllers["CTC+FPI (eq 6)"]}
 
@@ -99,8 +106,8 @@ def test_a_question_that_breaks_is_unknown_by_name(monkeypatch):
     with monkeypatch.context() as context:
         whole, discrete = answers(context)
     with monkeypatch.context() as context:
-        broken, of_broken = answers(context, "commands_inside", "gain_admissible")
-    for before, after, name in ((whole, broken, "Breaks?"), (discrete, of_broken, "Breaks?")):
+        broken, of_broken = answers(context, COMMANDS, GAIN)
+    for before, after, name in ((whole, broken, COMMANDS), (discrete, of_broken, GAIN)):
         assert after[name].verdict == Verdict.UNKNOWN
         assert "LinAlgError: Array must not contain" in after[name].evidence
         assert len(after) == len(before)
@@ -111,7 +118,8 @@ def test_a_question_that_breaks_is_unknown_by_name(monkeypatch):
 
 def test_a_linear_loop_that_is_not_finite_is_unknown(monkeypatch):
     """The controllers have that answer, and the problem has its own ones."""
-    whole, of_broken = answers(monkeypatch, "loops_along")
+    monkeypatch.setattr(reviewing, "loops_along", breaks)
+    whole, of_broken = answers(monkeypatch)
     assert [(q, a.verdict) for q, a in of_broken.items()] == [
         ("Is there a linear loop along the reference?", Verdict.UNKNOWN)
     ]

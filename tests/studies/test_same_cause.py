@@ -13,7 +13,7 @@ from test_verdict_sentences import EFFORT, entry, first, no_difference
 
 import fpirhc as fp
 from fpirhc.report.html import render
-from fpirhc.review.gain_advice import recommended_for
+from fpirhc.review.recommended_gain import recommended_for
 from fpirhc.review.slow_gain import reviewed_gain
 from fpirhc.studies.comparison.outcome import Outcome
 

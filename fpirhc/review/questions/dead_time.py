@@ -1,4 +1,4 @@
-"""Does the loop bear a dead time that is wrong by one cycle? The linear loop is built with other dead times.
+"""Does the loop bear a wrong dead time? By a cycle, as its poles say, and by a tenth, as runs say.
 
 A pairing without a leak couples its interleaved iterations as soon as the dead time is wrong: high modes grow at any gain. The true
 dead time is made longer and shorter by 1, 2, 5, ... cycles, for all inputs together and, where they differ, for each alone.
@@ -10,15 +10,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import without_deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.late import is_late, shifted
+from fpirhc.review.late import is_late, scaled, shifted
 from fpirhc.review.loops import loops_at
-from fpirhc.review.margins import margins
+from fpirhc.review.nominal_runs import CYCLES
 from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.questions.margins import margins
+from fpirhc.simulation.error_pair import ErrorPair, errors_of
+from fpirhc.simulation.model_as_plant import shortened
+from fpirhc.simulation.simulate import simulate
 from fpirhc.task.problem import Problem
 
-TEXT = "Does it bear a dead time that is wrong by a cycle?"
+WRONG_DEAD_TIME = "Does it bear a dead time that is wrong by a cycle?"
 _STEPS = (1, 2, 5, 10, 20, 50)  # cycles
 _CHANGE = (
     "Give the pairing an uncertainty of some cycles (Increment or ModelReferenced, which leak), or lower the gain."
@@ -31,31 +37,28 @@ def bears_wrong_dead_time(case: Case) -> Answer | None:
     if not is_late(case.problem) and (pairing is None or pairing.cycles == 0):
         return None
     if not case.loops.loops:
-        return Answer(TEXT, Verdict.UNKNOWN, f"no linear loop: {case.loops.reason}")
+        return Answer(WRONG_DEAD_TIME, Verdict.UNKNOWN, f"no linear loop: {case.loops.reason}")
     radius = float(case.loops.radii.max())
     if radius >= 1:
         text = f"with the dead time as it is the slowest mode is multiplied by {radius:.6g} per cycle"
-        return Answer(TEXT, Verdict.UNKNOWN, text, "See the convergence.", {"radius": radius})
+        return Answer(WRONG_DEAD_TIME, Verdict.UNKNOWN, text, "See the convergence.", {"radius": radius})
     try:
         borne, beyond = _borne(case)
     except FpirhcError as error:
-        return Answer(TEXT, Verdict.UNKNOWN, str(error))
+        return Answer(WRONG_DEAD_TIME, Verdict.UNKNOWN, str(error))
     if borne:
         more = (
             "or more"
             if beyond is None
             else f"at {beyond[0]} the slowest mode is multiplied by {beyond[1]:.6g} per cycle"
         )
-        return Answer(TEXT, Verdict.YES, f"it bears {borne} cycles, {more}", "", {"borne": float(borne)})
+        return Answer(WRONG_DEAD_TIME, Verdict.YES, f"it bears {borne} cycles, {more}", "", {"borne": float(borne)})
     assert beyond is not None
     margin = _margin_below_one(case)
     text = f"delay margin {margin:.3g} cycles; wrong by one cycle, the slowest mode is multiplied by {beyond[1]:.6g} per cycle"
     verdict = Verdict.UNKNOWN if case.loops.learns or not case.controller.deformation.iteration.constant else Verdict.NO
     numbers = {"borne": 0.0, "radius_one_cycle": beyond[1]} | ({"delay_margin": margin} if margin < 1 else {})
-    return Answer(TEXT, verdict, text, _CHANGE, numbers)
-
-
-QUESTION = ControllerQuestion(bears_wrong_dead_time, order=20, of_targets=True)
+    return Answer(WRONG_DEAD_TIME, verdict, text, _CHANGE, numbers)
 
 
 def _borne(case: Case) -> tuple[int, tuple[int, float] | None]:
@@ -98,3 +101,50 @@ def _margin_below_one(case: Case) -> float:
     loop = case.loops.loops[int(np.argmax(case.loops.radii))]
     delays = [margins(loop, i)[2] / case.problem.period for i in range(len(case.problem.plant.inputs))]
     return min(delays)
+
+
+PAYS_LATE = "Does adaptation pay with a dead time that is wrong by a tenth?"
+_PERCENT = 10.0
+
+
+def pays_when_late(case: Case) -> Answer | None:
+    """Return the errors with the dead time 10 % longer and shorter, by whole cycles; None without one, or for a plant outside."""
+    problem = case.grid.real or case.problem
+    if not is_late(problem) or problem.foreign is not None:
+        return None
+    short = shortened(problem, CYCLES)
+    try:
+        errors = {name: _errors(scaled(short, p), case.controller) for name, p in _CHANGES.items()}
+    except FpirhcError as error:
+        return Answer(PAYS_LATE, Verdict.UNKNOWN, f"no run: {error}")
+    text = "; ".join(f"{name}: {_sentence(one)}" for name, one in errors.items())
+    numbers = {f"{name}_{which}": value for name, one in errors.items() for which, value in _numbers(one).items()}
+    if all(one.passes for one in errors.values()):
+        return Answer(PAYS_LATE, Verdict.YES, text, "", numbers)
+    harmful = any(one.fails for one in errors.values()) and not case.controller.learns
+    change = "Lower the gain or the rate of the loop, or measure the dead time better than to a tenth."
+    return Answer(PAYS_LATE, Verdict.NO if harmful else Verdict.UNKNOWN, text, change, numbers)
+
+
+_CHANGES = {"longer": _PERCENT, "shorter": -_PERCENT}
+
+
+def _errors(late: Problem, controller: Controller) -> ErrorPair:
+    return errors_of(
+        late, [simulate(late, one, seed=0, compiled=False) for one in (without_deformation(controller), controller)]
+    )
+
+
+def _sentence(one: ErrorPair) -> str:
+    name = one.worst
+    return f"rms error of {name} {one.without[name]:.3g} without adaptation and {one.adapted[name]:.3g} with it"
+
+
+def _numbers(one: ErrorPair) -> dict[str, float]:
+    return {"without": one.without[one.worst], "with": one.adapted[one.worst]}
+
+
+QUESTIONS = (
+    ControllerQuestion(bears_wrong_dead_time, WRONG_DEAD_TIME, order=50, of_targets=True),
+    ControllerQuestion(pays_when_late, PAYS_LATE, order=51, of_targets=True),
+)

@@ -17,7 +17,7 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, each
 from fpirhc.review.question import Case, ControllerQuestion
 
-TEXT = "Does the deformation reach the wrong parameters?"
+REACHED = "Does the deformation reach the wrong parameters?"
 
 
 def reaches_parameters(case: Case) -> Answer:
@@ -26,9 +26,11 @@ def reaches_parameters(case: Case) -> Answer:
     names = plant.parameter.elements
     wrong = [k for k, (believed, exact) in enumerate(zip(case.believed, plant.exact, strict=True)) if believed != exact]
     if not wrong and case.grid.elsewhere:
-        return Answer(TEXT, Verdict.UNKNOWN, "what differs is the reality, and no parameter of the model's own plant")
+        return Answer(
+            REACHED, Verdict.UNKNOWN, "what differs is the reality, and no parameter of the model's own plant"
+        )
     if not wrong:
-        return Answer(TEXT, Verdict.YES, "every parameter of the model is right", "", {"wrong": 0.0, "reached": 0.0})
+        return Answer(REACHED, Verdict.YES, "every parameter of the model is right", "", {"wrong": 0.0, "reached": 0.0})
     present = _present(plant)
     reached, missed = ([names[k] for k in wrong if present[k] is there] for there in (True, False))
     sizes = {names[k]: _effect(case.grid, case.believed, k) for k in wrong if present[k]}
@@ -37,11 +39,11 @@ def reaches_parameters(case: Case) -> Answer:
     idle = _without_task(case.grid, missed)
     text = "; ".join([*_reached(sizes), *_missed(missed, idle)])
     if reached and not set(missed) - set(idle):
-        return Answer(TEXT, Verdict.YES, text, "", numbers)
+        return Answer(REACHED, Verdict.YES, text, "", numbers)
     change = f"Control a coordinate in whose response {missed[0]} is, or correct {', '.join(missed)} in the model."
     if reached:
-        return Answer(TEXT, Verdict.UNKNOWN, text, change, numbers)
-    return Answer(TEXT, Verdict.NO, text, f"{change} A deformation has nothing to correct.", numbers)
+        return Answer(REACHED, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(REACHED, Verdict.NO, text, f"{change} A deformation has nothing to correct.", numbers)
 
 
 def _reached(sizes: dict[str, float]) -> list[str]:
@@ -85,4 +87,4 @@ def _effect(grid: ReviewGrid, believed: np.ndarray, place: int) -> float:
     return float(change[np.isfinite(change)].max(initial=0.0))
 
 
-QUESTION = ControllerQuestion(ask=reaches_parameters, order=30)
+QUESTIONS = (ControllerQuestion(reaches_parameters, REACHED, order=65),)

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fpirhc.plant.units import with_space
-from fpirhc.review.questions import effort
-from fpirhc.review.questions.iterations import MANY
-from fpirhc.review.slew import SPARE
+from fpirhc.review.questions.horizon import EFFORT_CHANGE, EFFORT_FACT, MANY
+from fpirhc.review.questions.slew import SPARE
 from fpirhc.status import Status
 from fpirhc.studies.comparison.changes import times
 from fpirhc.summary import in_percent
@@ -79,7 +78,7 @@ def _slew_cause(plain: Entry, adaptive: Entry) -> str:
 
 def effort_cause(entry: Entry) -> str:
     """Return the sentence of a review where the cost weighs the absolute effort; else nothing."""
-    return f"I{effort.FACT[1:]}. {effort.CHANGE}" if entry.run.settings.get("weighs_effort") else ""
+    return f"I{EFFORT_FACT[1:]}. {EFFORT_CHANGE}" if entry.run.settings.get("weighs_effort") else ""
 
 
 def plan_cause(plain: Entry, adaptive: Entry) -> str:

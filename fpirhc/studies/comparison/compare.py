@@ -19,7 +19,7 @@ from fpirhc.errors import FpirhcError, Mistakes, NotContractive, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.review.gain_advice import recommended_for
+from fpirhc.review.recommended_gain import recommended_for
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view

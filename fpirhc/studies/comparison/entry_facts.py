@@ -7,8 +7,8 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Verdict
-from fpirhc.review.discretisation import discretisation_follows
 from fpirhc.review.grid import review_grid
+from fpirhc.review.questions.integration import discretisation_follows
 from fpirhc.simulation.metrics import Metrics
 from fpirhc.status import Status
 from fpirhc.studies.comparison.optimality import Optimality

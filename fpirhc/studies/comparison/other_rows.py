@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from fpirhc.review.margins import SLOWER
+from fpirhc.review.questions.margins import SLOWER
 from fpirhc.studies.comparison.changes import HELPS, HURTS, ROUNDING, times
 from fpirhc.studies.comparison.outcome import Finding
 

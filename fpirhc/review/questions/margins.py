@@ -19,13 +19,13 @@ from dataclasses import replace
 import numpy as np
 import scipy.linalg
 
-from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.loops import Loops
-from fpirhc.review.wording import duration
+from fpirhc.review.answer import Answer, Verdict, duration
+from fpirhc.review.loops import Loops, is_planned
+from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
 from fpirhc.task.problem import Problem
 
-QUESTION = "Has the linear loop enough margin?"
+MARGINS = "Has the linear loop enough margin?"
 LEAST_GAIN = 1.4  # as a factor, up or down
 LEAST_PHASE = 25.0  # degrees
 _LARGEST = 400  # states of a loop whose margins are computed
@@ -49,12 +49,12 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         learner: whether its model changes in a run.
     """
     if not loops.loops:
-        return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
+        return Answer(MARGINS, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
     first, radius = loops.loops[0], float(loops.radii.max())
     text = f"largest closed-loop pole magnitude {radius:.6g}"
     if len(first.dynamics) > _LARGEST:
         text += f"; no margins of a loop of {len(first.dynamics)} states"
-        return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
+        return Answer(MARGINS, Verdict.UNKNOWN, text, "", {"radius": radius})
     if radius >= 1:  # there is no margin to lose
         change = SLOWER if learner else _poles_advice(loops, adapts)
         return replace(_outside(loops.radii, text, {"radius": radius}, learns=loops.learns), change=change)
@@ -73,7 +73,7 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     gentler = "weigh the inputs more" if planned else "lower the rate"
     change = "" if good else f"Lower the map's gain, or {gentler}." if adapts else f"{gentler.capitalize()}."
-    return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
+    return Answer(MARGINS, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
 
 
 def _poles_advice(loops: Loops, adapts: bool) -> str:
@@ -91,7 +91,7 @@ def _outside(radii: np.ndarray, text: str, numbers: dict[str, float], *, learns:
     on_circle = float(radii.max()) < 1 + NEUTRAL
     text += f"; a pole is {'on' if on_circle else 'outside'} the unit circle {where} the reference"
     verdict = Verdict.NO if smallest >= 1 + NEUTRAL and not learns else Verdict.UNKNOWN
-    return Answer(QUESTION, verdict, text, "", numbers)
+    return Answer(MARGINS, verdict, text, "", numbers)
 
 
 def _sizes(gain: float, phase: float, delay: float, problem: Problem) -> str:
@@ -210,3 +210,11 @@ def _first(poles: Callable[[np.ndarray], np.ndarray], most: float) -> float:
         return math.inf
     k = int(beyond[0])
     return _root(lambda x: float(outside(np.array([x]))[0]), steps[k - 1], steps[k], 1e-6) if k else 0.0
+
+
+def _asked(case: Case) -> Answer:
+    adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
+    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
+
+
+QUESTIONS = (ControllerQuestion(_asked, MARGINS, order=22, adaptive=False),)

@@ -10,24 +10,34 @@ import casadi as ca
 import numpy as np
 import scipy.linalg
 
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import with_optimiser, without_deformation
+from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.maps import growth_of
 from fpirhc.plant.motion import controlled_places, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.nominal_runs import null_problem
+from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion
 from fpirhc.review.stages import stiff_advice
 from fpirhc.review.state_slopes import state_slopes
+from fpirhc.simulation.model_as_plant import shortened
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import simulate
+from fpirhc.status import Status
 from fpirhc.summary import in_percent
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
 
-QUESTION = "Is the horizon long enough?"
+LONG_ENOUGH = "Is the horizon long enough?"
 _SAME = 0.1  # relative change of the plan's feedback
 _LITTLE = 0.1  # growth over the run, as a share, that the run does not show
 _STILL = 1e-6  # of a growth per stage: a mode that neither decays nor grows
@@ -42,7 +52,7 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     try:
         first, second = (plan_gain(problem, one, grid.states_at) for one in (problem.horizon, _longer(problem.horizon)))
     except (FpirhcError, np.linalg.LinAlgError) as error:
-        return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
+        return Answer(LONG_ENOUGH, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
     change = float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
     grows = _growth(grid, first)
     slowest = _slowest(grid)
@@ -55,12 +65,12 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
         text += f"; the model under the plan's feedback diverges at {grows:.3g} {problem.rate_unit}"
         stiff = stiff_advice(grid, plant.approximate, planned=True)
         verdict = Verdict.UNKNOWN if grows * problem.duration <= _LITTLE else Verdict.NO
-        return Answer(QUESTION, verdict, text, stiff or _advice(plant, change), numbers)
+        return Answer(LONG_ENOUGH, verdict, text, stiff or _advice(plant, change), numbers)
     if change > _SAME:
         return Answer(
-            QUESTION, Verdict.UNKNOWN, text, "A longer horizon, or a weight of its end, plans differently.", numbers
+            LONG_ENOUGH, Verdict.UNKNOWN, text, "A longer horizon, or a weight of its end, plans differently.", numbers
         )
-    return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    return Answer(LONG_ENOUGH, Verdict.YES, text, "", numbers)
 
 
 def plan_gain(
@@ -191,3 +201,81 @@ def _model(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:
     needed = grid.needed(plant.approximate)[0]
     slopes = state_slopes(plant, grid.states[0], needed, plant.approximate)
     return slopes.a, slopes.b
+
+
+ITERATIONS = "Do the optimiser's iterations suffice for this horizon?"
+MANY = 0.05  # share of the cycles from which plans that did not converge are a cause
+_PLANS = 100  # of a run
+_MORE = (2, 4, 8, 16)
+
+
+def iterations_suffice(case: Case) -> Answer | None:
+    """Return the share of the cycles whose plan did not converge on the right model; None for a controller that does not plan."""
+    planner, horizon = case.controller.planner, case.problem.horizon
+    if planner is None or horizon is None:
+        return None
+    try:
+        bare = without_deformation(case.controller)
+        model = shortened(null_problem(case.problem, bare), _PLANS * cycles_per_plan(horizon, case.problem.period))
+        share, later = unsolved(case.runs.bare(bare), model.cycles)
+    except FpirhcError as error:
+        return Answer(ITERATIONS, Verdict.UNKNOWN, f"no run of the model: {error}")
+    text = f"on its own model {in_percent(share)} of the first {model.cycles} cycles have a plan that did not converge"
+    numbers = {"unsolved": share, "unsolved_later": later}
+    if share < MANY:
+        return Answer(ITERATIONS, Verdict.YES, text, "", numbers)
+    text += f", of the second half of them {in_percent(later)}"
+    if later < MANY:
+        return Answer(
+            ITERATIONS, Verdict.UNKNOWN, text, "Give the optimiser more iterations where the start matters.", numbers
+        )
+    return Answer(ITERATIONS, Verdict.NO, text, _remedy(model, bare, planner.optimiser), numbers)
+
+
+def unsolved(run: Run, cycles: int) -> tuple[float, float]:
+    """Return the share of the first cycles with a plan that did not converge, and of their second half; 1 where the run ends."""
+    if run.cycles < cycles:
+        return 1.0, 1.0
+    failed = run["status"][:cycles] == Status.NOT_CONVERGED
+    return float(np.mean(failed)), float(np.mean(failed[cycles // 2 :]))
+
+
+def _remedy(model: Problem, bare: Controller, optimiser: Optimiser) -> str:
+    for times in _MORE:
+        longer = optimiser.longer(times)
+        if longer is None:
+            return "Take an optimiser that iterates until its plans are solved, or shorten the horizon."
+        try:
+            run = simulate(model, with_optimiser(bare, longer), seed=0, compiled=False)
+            if unsolved(run, model.cycles)[1] < MANY:
+                return f"Give the optimiser {times} times the iterations: {as_written(longer)}."
+        except FpirhcError:
+            break
+    return f"Not even {_MORE[-1]} times the iterations suffice: shorten the horizon, or make the cost or its reference gentler."
+
+
+EFFORT = "Does the cost leave the effort free that the plant needs?"
+EFFORT_FACT = (
+    "its cost weighs the absolute effort, so the optimum of the wrong model trades tracking against a wrong effort and adaptation "
+    "realises that plan faithfully"
+)
+EFFORT_CHANGE = "Weigh the deviation from the model's feedforward, or the input's rate."
+
+
+def leaves_effort_free(case: Case) -> Answer | None:
+    """Return whether a plan weighs the absolute effort; None without a plan, and where the model is right."""
+    planner = case.controller.planner
+    cost = None if planner is None else planner.cost or case.problem.cost
+    right = case.grid.real is None and np.array_equal(case.believed, case.problem.plant.exact)
+    if cost is None or right:
+        return None
+    if cost.weighs_effort:
+        return Answer(EFFORT, Verdict.UNKNOWN, EFFORT_FACT, EFFORT_CHANGE)
+    return Answer(EFFORT, Verdict.YES, "its cost weighs no absolute effort")
+
+
+QUESTIONS = (
+    ProblemQuestion(horizon_long_enough, LONG_ENOUGH, order=6),
+    ControllerQuestion(iterations_suffice, ITERATIONS, order=31, adaptive=False),
+    ControllerQuestion(leaves_effort_free, EFFORT, order=32),
+)

@@ -20,18 +20,17 @@ import math
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.answer import Answer, Verdict, per_cycle
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.loops import Loops
-from fpirhc.review.maps import largest_product
-from fpirhc.review.neighbourhood import eigenvalues_near
-from fpirhc.review.planned import is_planned
+from fpirhc.review.loops import Loops, is_planned
+from fpirhc.review.question import ControllerQuestion
+from fpirhc.review.questions.zero_dynamics import of_zero_dynamics, zero_dynamics_modes
+from fpirhc.review.spectra import eigenvalues_near, largest_product
 from fpirhc.review.stages import stiff_advice
-from fpirhc.review.wording import per_cycle
-from fpirhc.review.zero_dynamics import of_zero_dynamics, zero_dynamics_modes
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
-QUESTION = "Does the deformation converge?"
+CONVERGES = "Does the deformation converge?"
+BOX = "Does it converge all over the box of parameters?"
 _OF_THE_PLANT = "The slowest mode is that of the zero dynamics, which no gain changes: see there."
 _SURE = math.log(100)
 _NEAR = 0.1  # distance from a mode of the zero dynamics, as a share of its own distance from 1
@@ -47,7 +46,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
         doubts: reasons against convergence from other answers.
     """
     if not loops.loops:
-        return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}", "Run it and look at the factor.")
+        return Answer(CONVERGES, Verdict.UNKNOWN, f"no linear loop: {loops.reason}", "Run it and look at the factor.")
     radii, left_out = _own_radii(grid, loops)
     growth = np.log(np.maximum(radii, 1e-300)) * grid.problem.cycles
     worst = float(radii.max())
@@ -63,37 +62,36 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
             else f"{type(deformation).__name__} changes its map"
         )
         change = f"{what} on line; the factor is that of the first cycle."
-        return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
+        return Answer(CONVERGES, Verdict.UNKNOWN, text, change, numbers)
     if growth.min() > _SURE:
         return Answer(
-            QUESTION, Verdict.NO, f"{text}: it grows all along the reference", _mend(grid, controller, loops), numbers
+            CONVERGES, Verdict.NO, f"{text}: it grows all along the reference", _mend(grid, controller, loops), numbers
         )
     if growth.max() > -_SURE:
         ends = [f"{end:.6g}" for end in (radii.min(), worst)]
         text += f" (between {' and '.join(ends)} along the reference)" if ends[0] != ends[1] else ""
-        return Answer(QUESTION, Verdict.UNKNOWN, text, _mend(grid, controller, loops), numbers)
+        return Answer(CONVERGES, Verdict.UNKNOWN, text, _mend(grid, controller, loops), numbers)
     against = [*([] if controller.deforms == "target" else _steep(grid, controller)), *doubts]
     if against:
         return Answer(
-            QUESTION, Verdict.UNKNOWN, f"{text}, but {'; '.join(against)}", "See the questions named.", numbers
+            CONVERGES, Verdict.UNKNOWN, f"{text}, but {'; '.join(against)}", "See the questions named.", numbers
         )
-    return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    return Answer(CONVERGES, Verdict.YES, text, "", numbers)
 
 
 def box_converges(grid: ReviewGrid, loops: Loops) -> Answer:
     """Return in how many draws of the parameters the linear loop converges; unknown where it is not all of them."""
-    question = "Does it converge all over the box of parameters?"
     if not loops.loops:
-        return Answer(question, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
+        return Answer(BOX, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
     # Without draws the box is a point: approximate and exact parameters are the same.
     radii = np.array([one.radius for one in loops.drawn or loops.loops])
     share, worst = float((radii < 1).mean()), float(radii.max())
     text = f"in {100 * share:.3g} % of {len(radii)} draws; the worst mode is multiplied by {worst:.6g} per cycle"
     numbers = {"share": share, "radius": worst}
     if share == 1:
-        return Answer(question, Verdict.YES, text, "", numbers)
+        return Answer(BOX, Verdict.YES, text, "", numbers)
     change = _OF_THE_PLANT if of_zero_dynamics(grid, worst) else "Lower the gain, or narrow the box of the parameters."
-    return Answer(question, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(BOX, Verdict.UNKNOWN, text, change, numbers)
 
 
 def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
@@ -146,3 +144,11 @@ def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
     return [
         f"near the reference its steepest secant times an eigenvalue reaches {reached:.3g}, and the limit is {limit:.3g}"
     ]
+
+
+QUESTIONS = (
+    ControllerQuestion(
+        lambda case: converges(case.grid, case.controller, case.loops, case.doubts), CONVERGES, order=1, of_targets=True
+    ),
+    ControllerQuestion(lambda case: box_converges(case.grid, case.loops), BOX, order=2, of_targets=True),
+)

@@ -11,16 +11,21 @@ vanished or is known to stay. A jump of the highest derivative is none of the re
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fpirhc.errors import FpirhcError
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
+from fpirhc.plant.motion import controlled_places
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.grid import ReviewGrid, each
 from fpirhc.review.question import ProblemQuestion
 from fpirhc.task.problem import Problem
 
-TEXT = "Is the reference free of jumps?"
+JUMPS = "Is the reference free of jumps?"
 _INTERVALS = 4000  # of the run
 _LOOKED_AT = 6  # intervals with the largest rests, of every state
 _HALVINGS = 40
@@ -66,11 +71,11 @@ def reference_free_of_jumps(grid: ReviewGrid) -> Answer:
     problem = grid.problem
     if problem.plant.step is not None:
         text = "a map follows differences of the reference over its cycles, which a jump does not hide"
-        return Answer(TEXT, Verdict.YES, text, "", {"jumps": 0.0})
+        return Answer(JUMPS, Verdict.YES, text, "", {"jumps": 0.0})
     detected = jumps(problem)
     if not detected:
         return Answer(
-            TEXT, Verdict.YES, "every state of the reference is the integral of the next one", "", {"jumps": 0.0}
+            JUMPS, Verdict.YES, "every state of the reference is the integral of the next one", "", {"jumps": 0.0}
         )
     units = dict(zip(problem.plant.output.elements, problem.plant.output.units, strict=True))
     listed = [f"{j.state} by {j.size:.3g} {units[j.state]} at t = {j.time:.4g} {problem.time_unit}" for j in detected]
@@ -79,7 +84,7 @@ def reference_free_of_jumps(grid: ReviewGrid) -> Answer:
     text = (
         f"{', '.join(listed)}; its derivative there is not that of the expressions, so that no other answer covers it"
     )
-    return Answer(TEXT, Verdict.NO, text, _instead(problem, first), numbers)
+    return Answer(JUMPS, Verdict.NO, text, _instead(problem, first), numbers)
 
 
 def _instead(problem: Problem, jump: Jump) -> str:
@@ -135,4 +140,81 @@ def _jump(motion: Motion, place: int, name: str, first: float, last: float) -> J
     return Jump(name, time, float(_rests(around, *motion(around))[place, 0]))
 
 
-QUESTION = ProblemQuestion(ask=reference_free_of_jumps, order=10)
+LIMITS = "Does the reference keep the limits of states, rates and paths?"
+_TOUCHES = 1e-6  # of the interval's size, within which a value is at its limit
+
+
+def reference_keeps_limits(grid: ReviewGrid) -> Answer | None:
+    """Return the limits that the reference leaves or touches; None without such limits or without a plan."""
+    problem, limits = grid.problem, grid.problem.limits
+    if problem.horizon is None or problem.cost is None or not (limits.states or limits.rates or limits.paths):
+        return None
+    horizon = replace(problem.horizon, terminal=())
+    try:
+        all_hard, start = replace(limits, soft={}, prices={}), problem.start_state
+        ocp = transcribe(problem.plant, problem.reference, horizon, problem.cost, all_hard, start=start)
+    except FpirhcError as error:
+        return Answer(LIMITS, Verdict.UNKNOWN, str(error))
+    values = _values(grid, ocp)
+    usable = np.isfinite(values).all(axis=1)
+    if not usable.any():
+        return Answer(LIMITS, Verdict.UNKNOWN, "no finite command is known", "See whether the problem is well posed.")
+    low, high = values[usable].min(axis=0), values[usable].max(axis=0)
+    rooms = _rooms(ocp, low, high)
+    bound = [k for k in range(len(rooms)) if np.isfinite(rooms[k])]
+    name_of = dict(enumerate(zip(ocp.state.elements, ocp.state.units, strict=True)))
+    text = "; ".join(
+        f"{name_of[k][0]} from {low[k]:.3g} to {high[k]:.3g} {name_of[k][1]}, limits {ocp.state_lower[k]:.3g} and "
+        f"{ocp.state_upper[k]:.3g}"
+        for k in bound
+    )
+    numbers = {f"room_{name_of[k][0]}": float(rooms[k]) for k in bound}
+    outside = [name_of[k][0] for k in bound if rooms[k] < -_TOUCHES]
+    touched = [name_of[k][0] for k in bound if abs(rooms[k]) <= _TOUCHES]
+    if not outside and not touched:
+        return Answer(LIMITS, Verdict.YES, text, "", numbers)
+    change = f"Move the reference inside the limits of {', '.join([*outside, *touched])}, or widen them."
+    softened = {*limits.soft, *limits.prices} | {f"{i} rate" for i in {*limits.soft, *limits.prices}}
+    hard = [name for name in outside if name not in softened]
+    return Answer(LIMITS, Verdict.NO if hard else Verdict.UNKNOWN, text, change, numbers)
+
+
+def _rooms(ocp: OptimalControl, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Distance to the nearest limit as a share of the interval, negative outside; infinite where nothing is limited."""
+    with np.errstate(invalid="ignore"):
+        interval = ocp.state_upper - ocp.state_lower
+    scale = np.where(np.isfinite(interval) & (interval > 0), interval, np.maximum(np.maximum(abs(low), abs(high)), 1.0))
+    return np.asarray(np.minimum(ocp.state_upper - high, low - ocp.state_lower) / scale)
+
+
+def _values(grid: ReviewGrid, ocp: OptimalControl) -> np.ndarray:
+    """The stage's state along the reference with the limited rates and paths as its last entries, shape (m, ns)."""
+    problem, plant = grid.problem, grid.problem.plant
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    nx, nu = plant.state.size, plant.input.size
+    data_of = stage_data(plant, problem.reference, replace(problem.horizon, terminal=()), problem.cost)
+    data = np.array([np.asarray(data_of(t, plant.approximate).full())[:, 0] for t in grid.times])
+    states = np.zeros((len(grid.times), ocp.state.size))
+    states[:, :nx] = grid.states
+    if ocp.state.size - ocp.written > nx:
+        states[:, nx : nx + nu] = _commands_before(grid)
+    written = each(ocp.dynamics, states, grid.commands[0], data)
+    states[:, ocp.state.size - ocp.written :] = written[:, ocp.state.size - ocp.written :]
+    return states
+
+
+def _commands_before(grid: ReviewGrid) -> np.ndarray:
+    """Inputs that the reference needs one stage earlier, shape (m, nu)."""
+    problem, plant = grid.problem, grid.problem.plant
+    assert problem.horizon is not None
+    earlier = np.maximum(grid.times - problem.horizon.step, 0.0)
+    responses = np.asarray(problem.reference.function(plant).map(len(earlier))(earlier[None, :])[1].full())
+    exact = np.tile(plant.exact, (len(earlier), 1))
+    return each(plant.equations.inverse, grid.states_at(earlier), responses[controlled_places(plant)].T, exact)
+
+
+QUESTIONS = (
+    ProblemQuestion(reference_free_of_jumps, JUMPS, order=10),
+    ProblemQuestion(reference_keeps_limits, LIMITS, order=30),
+)

@@ -12,17 +12,21 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import null_space
 
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import tracking_law
 from fpirhc.plant.maps import growth_of
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.loops import Loops
-from fpirhc.review.loops_by_gain import LITTLE
+from fpirhc.review.loops import LITTLE, Loops, is_planned
+from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.spectra import dead_cycles
+from fpirhc.review.stages import stiff_advice
 from fpirhc.review.state_slopes import StateSlopes, state_slopes
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 
-QUESTION = "Are the zero dynamics stable?"
+ZERO_DYNAMICS = "Are the zero dynamics stable?"
 _BESIDE = 1.1  # the growth of the zero dynamics is that of the plant, and the nominal loop is that of the model
 _STILL = 1e-4  # growth over the run, as a share, below which a mode is neutral
 
@@ -72,7 +76,7 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
         loops: linear loops of the controller.
     """
     if rate is None:
-        return Answer(QUESTION, Verdict.YES, "there are none: every coordinate is controlled")
+        return Answer(ZERO_DYNAMICS, Verdict.YES, "there are none: every coordinate is controlled")
     numbers, text = {"rate": rate}, _text(problem, rate)
     neutral = abs(rate) * problem.duration <= _STILL
     if ((planned and rate > 0) or neutral) and loops.loops:
@@ -81,19 +85,21 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
         text += f"; the slowest mode of the linear loop is multiplied by {radius:.6g} per cycle"
         if radius < 1:
             held = text.replace("unstable: ", "unstable by themselves and held by the plan: ", 1)
-            return Answer(QUESTION, Verdict.YES, held, "", numbers)
+            return Answer(ZERO_DYNAMICS, Verdict.YES, held, "", numbers)
         little = radius < 1 + NEUTRAL or min(rate * problem.duration, radius**problem.cycles - 1) < LITTLE
         verdict = Verdict.UNKNOWN if loops.learns or neutral or little else Verdict.NO
-        return Answer(QUESTION, verdict, text, "Weigh the other states in the cost, or lengthen the horizon.", numbers)
+        return Answer(
+            ZERO_DYNAMICS, verdict, text, "Weigh the other states in the cost, or lengthen the horizon.", numbers
+        )
     if rate < 0 and not neutral:
-        return Answer(QUESTION, Verdict.YES, text, "", numbers)
+        return Answer(ZERO_DYNAMICS, Verdict.YES, text, "", numbers)
     if rate * problem.duration > LITTLE and not planned:
         change = "Let a plan carry those states in its cost, use time slots, or control another coordinate."
-        return Answer(QUESTION, Verdict.NO, text, change, numbers)
+        return Answer(ZERO_DYNAMICS, Verdict.NO, text, change, numbers)
     change = "Run it and look at the coordinates that are not controlled."
     if planned and rate > 0 and not neutral:
         change = f"A plan holds them only if its cost weighs those states. {change}"
-    return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(ZERO_DYNAMICS, Verdict.UNKNOWN, text, change, numbers)
 
 
 def _text(problem: Problem, rate: float) -> str:
@@ -109,3 +115,54 @@ def _text(problem: Problem, rate: float) -> str:
         over = f", by {in_percent(grown)} over the run" if grown <= LITTLE else ""
         return f"unstable: while the reference is followed they grow at up to {rate:.3g} {unit}{over}"
     return f"stable: while the reference is followed they decay at {-rate:.3g} {unit} or faster"
+
+
+RATES = "Is the sampling fast enough for the tracking law?"
+
+
+def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answer:
+    """Return the two products, and whether the loop of plant = model without deformation converges."""
+    period, cycles = grid.problem.period, dead_cycles(grid.problem)
+    rate = _rate(controller)
+    numbers = {} if rate is None else {"rate_period": rate * period, "rate_dead_time": rate * cycles * period}
+    text = f"dead time {cycles:g} cycles"
+    if rate is not None:
+        text = f"rate x period {rate * period:.3g}, rate x dead time {rate * cycles * period:.3g}"
+    if loops.ideal is None:
+        return Answer(RATES, Verdict.UNKNOWN, f"{text}; no linear loop: {loops.reason}", "", numbers)
+    radius = loops.ideal.radius
+    numbers["ideal_radius"] = radius
+    text += f"; in the nominal loop, plant = model, the slowest mode is multiplied by {radius:.6g} per cycle"
+    if radius < 1:
+        return Answer(RATES, Verdict.YES, text, "", numbers)
+    if of_zero_dynamics(grid, radius):
+        change = "It is the mode of the zero dynamics, which no rate and no period changes: see there."
+        return Answer(RATES, Verdict.UNKNOWN, text, change, numbers)
+    believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
+    change = stiff_advice(grid, believed, planned=is_planned(controller)) or (
+        "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
+    )
+    if radius < 1 + NEUTRAL:
+        change = "A mode neither grows nor decays: weigh the state or the input in which it is."
+        return Answer(RATES, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(RATES, Verdict.NO, text, change, numbers)
+
+
+def _rate(controller: Controller) -> float | None:
+    """Rate of the tracking law, per unit of time, where the controller has such a law."""
+    law = tracking_law(controller)
+    return None if law is None else law.speed
+
+
+def _rates(case: Case) -> Answer:
+    return rates_inside(case.grid, case.controller, case.loops)
+
+
+def _zero_dynamics(case: Case) -> Answer:
+    return zero_dynamics(case.problem, zero_dynamics_rate(case.grid), is_planned(case.controller), case.loops)
+
+
+QUESTIONS = (
+    ControllerQuestion(_rates, RATES, order=20, adaptive=False),
+    ControllerQuestion(_zero_dynamics, ZERO_DYNAMICS, order=21, adaptive=False),
+)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from fpirhc.contraction.lag import bearable_lag
 from fpirhc.contraction.large_errors import least_product
-from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.forms import INCREMENT, REFERENCED, forms_of
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.question import Case
+from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.questions.form import INCREMENT, REFERENCED, forms_of
 
 FAST = "Does the iteration keep up with its tracking law?"
 LAG = "Does it bear a small lag that is not in the model?"
@@ -21,16 +22,16 @@ _DAMPING = 0.3
 _CYCLES = 3.0  # of lag that it should bear
 
 
-def fast_enough(case: Case, own: Spectrum) -> Answer | None:
+def fast_enough(case: Case) -> Answer | None:
     """Return the smallest a lambda beside the one that the plain form needs; None for other forms, unknown poles, and maps."""
     grid, controller = case.grid, case.controller
     law = law_of(grid, controller)
     if grid.problem.plant.step is not None:
         return None  # the linear loop of a map is exact
-    if law is None or not controller.deformation.iteration.slows_desired:
+    if law is None or case.spectra is None or not controller.deformation.iteration.slows_desired:
         return None
     rate, poles = law
-    product = _products(controller, own)[0]
+    product = _products(case)[0]
     ratio = product / least_product(poles, rate, grid.problem.period)
     text = f"gain x eigenvalue is at least {product:.3g}, {ratio:.3g} times what {poles} poles"
     text += f" at {rate:g} {grid.problem.rate_unit} need"
@@ -71,15 +72,16 @@ def gain_times(deformation: Deformation, factor: float) -> str:
     return f"effective gain = {larger.effective_gain():.3g}" if own is None else f"{larger.gain_name} = {own:.3g}"
 
 
-def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
+def bears_lag(case: Case) -> Answer | None:
     """Return the longest unknown lag with which the fast modes are still damped.
 
     None for laws without known poles, for maps, and where the response is late already.
     """
-    law, period, unit = law_of(grid, controller), grid.problem.period, grid.problem.time_unit
-    if law is None or grid.problem.response_delay > 0 or grid.problem.plant.step is not None:
+    grid = case.grid
+    law, period, unit = law_of(grid, case.controller), grid.problem.period, grid.problem.time_unit
+    if law is None or case.spectra is None or grid.problem.response_delay > 0 or grid.problem.plant.step is not None:
         return None
-    (rate, poles), product = law, _products(controller, own)[1]
+    (rate, poles), product = law, _products(case)[1]
     longest = bearable_lag(product, period, rate, poles, damping=_DAMPING)
     limit = 1 / (poles * rate)
     text = (
@@ -100,7 +102,65 @@ def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None
     return max(known, key=lambda pair: pair[1]) if known else None
 
 
-def _products(controller: Controller, own: Spectrum) -> tuple[float, float]:
+def _products(case: Case) -> tuple[float, float]:
     """Smallest and largest |a lambda| along the reference."""
-    sizes = abs(controller.deformation.effective_gain()) * abs(own.eigenvalues)
+    assert case.spectra is not None
+    sizes = abs(case.controller.deformation.effective_gain()) * abs(case.spectra[0].eigenvalues)
     return float(sizes.min()), float(sizes.max())
+
+
+_PLAN_SPARE = 1.5
+_SMALLEST, _LARGEST, _STEPS = 1e-3, 30.0, 80  # factors of the map's own gain that are searched
+_POINTS = 3
+
+
+def plan_keeps_up(case: Case) -> Answer | None:
+    """Return the map's gain over the smallest stable one of its plan; None for other forms and laws with known poles."""
+    deformation = case.controller.deformation
+    if (
+        tracking_law(case.controller) is not None
+        or not deformation.iteration.slows_desired
+        or not deformation.iteration.constant
+    ):
+        return None
+    factor = _least_factor(case) if case.loops.loops and deformation.effective_gain() else None
+    too_large = factor is not None and factor <= 1 and case.loops.radii.max() >= 1  # which other questions say
+    if factor is None or too_large:
+        return None
+    ratio = 1 / factor
+    size = abs(deformation.effective_gain())
+    text = f"the effective gain is {size:.3g}, {ratio:.3g} times the smallest with which the plan converges"
+    numbers = {"ratio": ratio, "least": factor * size}
+    if ratio >= _PLAN_SPARE:
+        return Answer(FAST, Verdict.YES, text, "", numbers)
+    verdict = Verdict.NO if ratio < 1 and not case.controller.learns else Verdict.UNKNOWN
+    return Answer(FAST, verdict, text, faster(case, _PLAN_SPARE * factor, "plan with a shorter period"), numbers)
+
+
+def _least_factor(case: Case) -> float | None:
+    """Smallest factor of the map's gain from which on gains converge; None where none of those tried does."""
+    loops = case.by_gain
+    if loops is None:
+        return None
+    factors, pairs = np.geomspace(_SMALLEST, _LARGEST, _STEPS), loops.along(_POINTS)
+
+    def stable(factor: float) -> bool:
+        return all(loops.at(factor * loops.gains[1], pair).radius < 1 for pair in pairs)
+
+    first = next((k for k, factor in enumerate(factors) if stable(float(factor))), None)
+    if first is None:
+        return None
+    if first == 0:
+        return float(factors[0])
+    low, high = float(factors[first - 1]), float(factors[first])
+    for _ in range(20):
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if stable(middle) else (middle, high)
+    return high
+
+
+QUESTIONS = (
+    ControllerQuestion(fast_enough, FAST, order=9),
+    ControllerQuestion(bears_lag, LAG, order=10),
+    ControllerQuestion(plan_keeps_up, FAST, order=60),
+)

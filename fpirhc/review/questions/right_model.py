@@ -1,0 +1,193 @@
+"""Does adaptation pay, and does it leave a right model alone? The null test: with the model as the plant it must not do harm.
+
+Both errors are predicted along the own run of the model (`prediction`); where a prediction does not say, runs do. The iteration
+takes whatever moves the response within a cycle for an error of the model: a plant that is fast against the period drifts within
+it, and the plain form and `Increment` ask for less or more than they should.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from fpirhc.errors import FpirhcError
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.nominal_runs import null_runs
+from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, response_errors
+from fpirhc.review.question import TRIED, Case, ControllerQuestion
+from fpirhc.review.questions.form import form_of, forms_of
+from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
+from fpirhc.simulation.model_as_plant import with_believed_way
+
+PAYS = "Does adaptation lower the response error?"
+_HARM = 0.5  # share of the error without adaptation that adaptation may make of a model that is right
+
+ROUNDING = 1e-6  # of the desired response's rms, below which a response error is rounding
+
+
+def pays(case: Case) -> Answer:
+    """Return the rms response errors without adaptation, with it, and with it on a right model, where every change does harm."""
+    nominal = case.nominal
+    if isinstance(nominal, str):
+        return _by_runs(case, nominal)
+    without = rms(nominal, errors_without_adaptation(nominal))
+    adapted = rms(nominal, response_errors(nominal))
+    null = rms(nominal, response_errors(nominal, exact=nominal.believed))
+    text = f"predicted rms response error: {without:.3g} without adaptation, {adapted:.3g} with it, {null:.3g} with a right model"
+    numbers = {"without": without, "with": adapted, "null": null}
+    if case.loops.loops and case.loops.radii.min() >= 1 and not case.loops.learns:
+        change = "The prediction leaves the outer loop out, and this one does not converge: see the convergence."
+        return Answer(PAYS, Verdict.NO, f"{text}, but errors grow in every cycle", change, numbers)
+    if max(without, adapted) <= ROUNDING * nominal_size(nominal):
+        return Answer(PAYS, Verdict.UNKNOWN, f"{text}: there is no error to lower", "", numbers)
+    if not adapted < without:
+        return _no_gain(text, numbers, elsewhere=case.grid.elsewhere)
+    if null > _HARM * without:
+        change = "Adaptation would do harm with a slightly better model: raise the gain or shorten the period."
+        return Answer(PAYS, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(PAYS, Verdict.YES, text, "", numbers)
+
+
+def _by_runs(case: Case, reason: str) -> Answer:
+    """The answer where nothing predicts it: the tracking errors of two runs on the plant decide."""
+    trial = case.trial(case.controller.deformation)
+    pair = None if isinstance(trial, str) else trial[0]
+    if pair is None:
+        why = trial if isinstance(trial, str) else "the plant is outside"
+        return Answer(PAYS, Verdict.UNKNOWN, f"{reason}; and no run, because {why}")
+    numbers = {"without": pair.without[pair.worst], "with": pair.adapted[pair.worst]}
+    text = f"in a run of at most {TRIED} cycles {pair.sentence} ({reason})"
+    if pair.lower:
+        return Answer(PAYS, Verdict.YES, text, "", numbers)
+    if pair.fails and not case.controller.learns:
+        return Answer(
+            PAYS, Verdict.NO, text, "Lower the gain, use another form, or leave the deformation out.", numbers
+        )
+    return Answer(PAYS, Verdict.UNKNOWN, text, "Run it for longer and compare.", numbers)
+
+
+def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer:
+    """The answer where adaptation does not lower the predicted error."""
+    if elsewhere:
+        text += ", for the exact values of the model's own parameters, which move nothing beside a reality"
+        return Answer(PAYS, Verdict.UNKNOWN, text, "Run it and compare.", numbers)
+    change = "Leave the deformation out, or use a form that leaves a right model alone: the model is right enough."
+    return Answer(PAYS, Verdict.NO, text, change, numbers)
+
+
+def rms(nominal: NominalRun, errors: ResponseErrors) -> float:
+    """Return the rms response error over all coordinates, from `measure_from` on; infinite where the errors do not stay finite."""
+    first = min(round(nominal.problem.measure_from / nominal.problem.period), nominal.cycles - 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = float(np.sqrt(np.mean(np.sum(errors.error[first:] ** 2, axis=1))))
+    return size if np.isfinite(size) else float("inf")
+
+
+def nominal_size(nominal: NominalRun) -> float:
+    """Return the rms of the desired response over all coordinates."""
+    largest = float(np.abs(nominal.desired).max())  # a diverging model's own run would overflow when it is squared
+    return largest * float(np.sqrt(np.mean(np.sum((nominal.desired / max(largest, 1e-300)) ** 2, axis=1))))
+
+
+NULL_TEST = "Does adaptation leave a right model alone?"
+_PRACTICAL = 100  # times, by which a period may be shortened in earnest
+_SHORTER = 16  # times, of the interpolated run from which on the error falls in proportion to the period
+
+
+def leaves_right_model_alone(case: Case) -> Answer:
+    """Return the errors with the model as the plant, with adaptation and without."""
+    # The model's own run, without simulation, knows nothing of a lag or a dead time that the deformation believes.
+    foreseen = with_believed_way(case.problem, case.controller.deformation) is case.problem
+    nominal = case.nominal if foreseen and not isinstance(case.nominal, str) else None
+    predicted = None if nominal is None else rms(nominal, response_errors(nominal, exact=nominal.believed))
+    numbers, text = {}, ""
+    if nominal is not None and predicted is not None:
+        numbers = {"response_without": 0.0, "response_with": predicted}
+        text = f"predicted rms response error on a right model {predicted:.3g}, without adaptation 0; "
+        if predicted <= ROUNDING * nominal_size(nominal):
+            return Answer(NULL_TEST, Verdict.YES, f"{text}the request stays the desired response", "", numbers)
+    ideal = case.loops.ideal
+    if ideal is not None and ideal.radius >= 1:
+        text += "the loop with the right model does not converge without adaptation"
+        return Answer(NULL_TEST, Verdict.UNKNOWN, text, "See the rates.", numbers)
+    try:
+        runs = null_runs(case.problem, case.controller, case.runs)
+    except FpirhcError as error:
+        return Answer(NULL_TEST, Verdict.UNKNOWN, f"{text}no run of the model: {error}", "", numbers)
+    worst = runs.worst
+    numbers |= {"without": runs.without[worst], "with": runs.adapted[worst], "added": runs.added(worst)}
+    text += runs.text
+    if runs.passes:
+        return Answer(NULL_TEST, Verdict.YES, text, "", numbers)
+    harmful = runs.fails and not case.controller.learns and not _cures_more(nominal, predicted)
+    if runs.fails and not harmful:
+        text += ", less than what the wrong model costs without it" if not case.controller.learns else ""
+    verdict = Verdict.NO if harmful else Verdict.UNKNOWN
+    change, more = _remedy(case, runs, predicted)
+    return Answer(NULL_TEST, verdict, text, change, numbers | more)
+
+
+def _cures_more(nominal: NominalRun | None, predicted: float | None) -> bool:
+    """Whether the wrong model makes a larger response error without adaptation than adaptation makes of a right model."""
+    return (
+        nominal is not None and predicted is not None and predicted < rms(nominal, errors_without_adaptation(nominal))
+    )
+
+
+def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, dict[str, float]]:
+    """Which form passes, by a run, and which period would do, by the prediction."""
+    sentences, numbers = [], {}
+    used = form_of(case.controller.deformation)
+    for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
+        trial = case.trial(form) if name != used else "it is in use"
+        if not isinstance(trial, str) and not case.harm(form):
+            null = trial[1]
+            sentences.append(f"The {name} form passes: rms error of {null.worst} {null.adapted[null.worst]:.3g}.")
+            numbers["with_form"] = null.adapted[null.worst]
+            break
+    grows = bool(case.loops.loops) and case.loops.radii.max() >= 1
+    period = None if predicted is None or grows else _period(case, runs, predicted)
+    if period is not None and period < case.problem.period:
+        shorter = case.problem.period / period
+        text = f"The form in use needs a period about {shorter:.2g} times shorter, {period:.2g}."
+        sentences.append(text if shorter <= _PRACTICAL else "No practical period would do for the form in use.")
+        numbers["period"] = period
+    if not sentences:
+        sentences.append(
+            "No form does better than none: leave the deformation out, or choose other controlled coordinates."
+        )
+    return " ".join(sentences), numbers
+
+
+def _period(case: Case, runs: ErrorPair, predicted: float) -> float | None:
+    """The period with which the predicted response error is as small as the null test asks for.
+
+    The prediction leaves the outer loop out, and the error that adaptation adds to the coordinates is taken to be proportional to
+    the response error. From a period `_SHORTER` times shorter on, the response error is taken to fall in proportion to it.
+    """
+    nominal, added = case.nominal, runs.added(runs.worst)
+    if isinstance(nominal, str) or not math.isfinite(added):
+        return None
+    faster = _faster(nominal, _SHORTER)
+    error = rms(faster, response_errors(faster, exact=faster.believed))
+    share = predicted * SLIGHT / added / error
+    return min(case.problem.period, case.problem.period / _SHORTER * share)
+
+
+def _faster(nominal: NominalRun, share: int) -> NominalRun:
+    """The run at a period `share` times shorter, interpolated."""
+    coarse = np.arange(nominal.cycles + 1)
+    fine = np.arange(nominal.cycles * share + 1) / share
+    states = np.column_stack([np.interp(fine, coarse, column) for column in nominal.states.T])
+    desired = np.column_stack([np.interp(fine[:-1], coarse[:-1], column) for column in nominal.desired.T])
+    return replace(
+        nominal, problem=replace(nominal.problem, period=nominal.problem.period / share), states=states, desired=desired
+    )
+
+
+QUESTIONS = (
+    ControllerQuestion(pays, PAYS, order=14),
+    ControllerQuestion(leaves_right_model_alone, NULL_TEST, order=15, of_targets=True),
+)
