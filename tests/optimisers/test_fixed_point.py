@@ -132,7 +132,7 @@ def test_clipping_a_newton_step_is_not_done():
     np.testing.assert_allclose(gain.full().ravel(), [0.0, -1.0], atol=1e-12)
 
 
-@settings(deadline=None, derandomize=True, max_examples=200)
+@settings(deadline=None, derandomize=True, max_examples=100)
 @given(seed=st.integers(0, 10**6), size=st.integers(1, 4))
 def test_stage_box_programs_against_scipy(seed, size):
     """Never worse than standing still; nearly always the minimiser that an independent solver finds."""

@@ -38,9 +38,10 @@ def test_the_independent_plant_moves_as_scipy_moves_it(name: str) -> None:
 # One plant of every relative order from 1 to 4, and one with two outputs of different orders. The slow study has all fifteen.
 RMS = {"growth": 1.0e-4, "anaesthesia": 0.0104, "link": 2.1e-5, "flexible_joint": 2.5e-6, "vehicle": 5.7e-5}
 """Rms errors with the model-referenced deformation; without adaptation 28 (growth) to 3 300 (flexible joint) times as large."""
+SHORT = [pytest.param(name, marks=pytest.mark.slow) if name in ("anaesthesia", "link") else name for name in RMS]
 
 
-@pytest.mark.parametrize("name", RMS)
+@pytest.mark.parametrize("name", SHORT)
 def test_plans_of_a_wrong_model_are_those_of_an_independent_controller(name: str) -> None:
     problem = study.PLANTS[name]()
     assert problem.horizon is not None
@@ -51,7 +52,7 @@ def test_plans_of_a_wrong_model_are_those_of_an_independent_controller(name: str
     assert np.abs((run["command"] - own.commands) / study.spans(problem)).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", RMS)
+@pytest.mark.parametrize("name", SHORT)
 def test_with_adaptation_the_plant_does_what_the_plan_foresaw(name: str) -> None:
     problem = study.PLANTS[name]()
     adaptive = study.judged(problem, study.ways(problem)["RHC+FPI, model-referenced"])
