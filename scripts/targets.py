@@ -1,7 +1,8 @@
-"""Write docs/targets.md: what exported controllers need and how they answer, by the compilers and FMPy that are here."""
+"""Write docs/targets.md: what exported controllers need and how they answer, by the compilers, FMPy and Node that are here."""
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import re
 import subprocess
@@ -24,6 +25,7 @@ CASES = (
     ("anaesthesia", "RHC+FPI", {}),
     ("fishery", "RHC+FPI", {}),
 )
+WEB = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("anaesthesia", "RHC+FPI"))
 UNITS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"))
 CYCLES = 2000
 
@@ -78,6 +80,25 @@ def unit_row(problem: str, title: str, target: str) -> list[str]:
     return [f"{problem}, {title}", target, f"{size / 1000:.0f}", f"{found}", f"{through[1]:.1g}", f"{late[1]:.3g}"]
 
 
+def web_row(problem: str, title: str) -> list[str]:
+    """One line of the table of WebAssembly: its size, and the hash of the commands there and in C here."""
+    task, compiler = fp.load_problem(problem), str(find_compiler())
+    device = device_of(task.problem, task.controllers[title], title, name="c", cycles=CYCLES, libm="own")
+    with tempfile.TemporaryDirectory() as name:
+        web, here = Path(name) / "web", Path(name) / "c"
+        write(device, target_called("wasm"), web)
+        write(device, target_called("c"), here)
+        module = (web / "c.wasm").read_bytes()
+        sources, program = [str(path) for path in sorted(here.glob("*.c"))], here / "replay"
+        subprocess.run(
+            [compiler, "-std=c99", "-O2", "-ffp-contract=off", *sources, "-o", str(program), "-lm"], check=True
+        )
+        texts = (_said("node", str(web / "replay.mjs")), _said(str(program), str(here / "samples.bin")))
+    hashes = [text.split("answers ")[1][:12] for text in texts]
+    sizes = (len(module), len(gzip.compress(module)))
+    return [f"{problem}, {title}", *(f"{size / 1000:.0f}" for size in sizes), *hashes]
+
+
 def _said(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
@@ -97,7 +118,9 @@ def main() -> None:
         "one period late",
     ]
     rows = [unit_row(problem, title, target) for problem, title in UNITS for target in ("fmu", "fmu2")]
-    PAGE.write_text(_filled(text, "units", head, rows), encoding="utf-8")
+    text = _filled(text, "units", head, rows)
+    head = ["controller", "module, kB", "compressed, kB", "commands in Node", "commands in C here"]
+    PAGE.write_text(_filled(text, "web", head, [web_row(*case) for case in WEB]), encoding="utf-8")
 
 
 def _filled(text: str, place: str, head: list[str], rows: list[list[str]]) -> str:

@@ -1,4 +1,4 @@
-"""Shared libraries of C files: for this machine by its compiler, and for others where ziglang is installed."""
+"""Libraries of C files: for this machine by its compiler, for others and for the web where ziglang is installed."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from fpirhc.errors import CompileError
+from fpirhc.errors import CompileError, package
 from fpirhc.symbolic.native import find_compiler
 
 # No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.
-_FLAGS = ("-std=c99", "-O2", "-s", "-shared", "-ffp-contract=off", "-fvisibility=hidden")
+_FLAGS = ("-std=c99", "-O2", "-s", "-ffp-contract=off")
+_SHARED = ("-shared", "-fvisibility=hidden")
+_ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
 _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 _SYSTEMS = {"linux": "linux", "darwin": "darwin", "win32": "windows"}
 ENDINGS = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}
@@ -36,7 +38,20 @@ def shared_libraries(files: Mapping[str, str]) -> dict[str, bytes]:
     Raises:
         CompileError: a compiler refuses them, with its message.
     """
-    return {place: _built(files, command, place) for place, command in _compilers().items()}
+    return {place: _compiled(files, command, place) for place, command in _compilers().items()}
+
+
+def web_module(files: Mapping[str, str]) -> bytes:
+    """Return a WebAssembly module of C files, without imports.
+
+    Raises:
+        NotSupported: ziglang is not installed.
+        CompileError: it refuses the files.
+    """
+    package("ziglang", "compiler", "the target wasm")
+    # 256 kB hold the deepest plan; zig's own 16 MB are all that a page would ask for.
+    flags = ("-mexec-model=reactor", "-Wl,-z,stack-size=262144", "-Wl,--no-entry")
+    return _compiled(files, [*_ZIG, "wasm32-wasi", *flags], "wasm32")
 
 
 def _compilers() -> dict[str, list[str]]:
@@ -45,10 +60,10 @@ def _compilers() -> dict[str, list[str]]:
     if find_spec("ziglang") is not None:
         # The plainest processor of each kind, for a library that goes to other machines.
         for place, target in PLATFORMS.items():
-            commands[place] = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-mcpu=baseline"]
+            commands[place] = [*_ZIG, target, "-mcpu=baseline", *_SHARED]
     own = find_compiler()
     if own is not None:
-        commands[_here()] = [own]
+        commands[_here()] = [own, *_SHARED]
     return commands
 
 
@@ -57,13 +72,13 @@ def _here() -> str:
     return f"{_MACHINES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
 
 
-def _built(files: Mapping[str, str], command: Sequence[str], place: str) -> bytes:
+def _compiled(files: Mapping[str, str], command: Sequence[str], place: str) -> bytes:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in files.items():
             (folder / file).write_text(text, encoding="utf-8")
         library, sources = folder / "library", [str(folder / file) for file in files if file.endswith(".c")]
-        elsewhere = () if place.endswith("windows") else ("-fPIC", "-lm")
+        elsewhere = ("-fPIC", "-lm") if place.endswith(("linux", "darwin")) else ()
         done = subprocess.run(
             [*command, *_FLAGS, *sources, *elsewhere, "-o", str(library)], capture_output=True, text=True, check=False
         )

@@ -49,6 +49,7 @@ class Device:
         controller: as the problem file has it.
         stepper: of the controller; compiled where there is a compiler, so that its numbers are those of C to the last bit.
         cycles: number of cycles that are recorded for a replay.
+        libm: "system" or "own": exp, log, pow, sin, cos, tanh and atanh of the machine, or those with the same bits everywhere.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Device:
     controller: Controller
     stepper: Stepper
     cycles: int
+    libm: str = "system"
 
     @cached_property
     def inputs(self) -> Layout:

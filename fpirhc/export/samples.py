@@ -22,12 +22,13 @@ _NAN = 0x7FF8000000000000
 def recorded(device: Device) -> bytes:
     """Return the file: a head of four 32-bit numbers (cycles, numbers given, commands, whether bits count), and the cycles.
 
-    Bits do not count where there is no compiler and a plan was solved by the virtual machine, which rounds in another order.
+    Bits do not count where exp, sin and the like are the target's own, and where there is no compiler and a plan was solved by the
+    virtual machine, which rounds in another order.
 
     Samples are those of a run, again from its beginning where it is too short; a plant outside is not run, but its model is.
     """
     stepper, rows = device.stepper, with_faults(_samples(device), device.problem)
-    exact = stepper.compiled or stepper.function.is_a("SXFunction")
+    exact = device.libm == "system" and (stepper.compiled or stepper.function.is_a("SXFunction"))
     head = struct.pack("<4i", len(rows), rows.shape[1], device.problem.plant.input.size, exact)
     memory, parts = stepper.start(), [head]
     for k, row in enumerate(rows):

@@ -28,11 +28,13 @@ class Target:
         name: word after --to.
         summary: what comes out, in one line.
         files: function of a device that returns the contents of all files by name.
+        libm: whose exp, sin and the like it takes, unless told otherwise: "system" or "own".
     """
 
     name: str
     summary: str
     files: Callable[[Device], Mapping[str, str | bytes]]
+    libm: str = "system"
 
 
 @cache
@@ -61,6 +63,7 @@ def device_of(
     name: str | None = None,
     live: Sequence[str] = (),
     cycles: int = 2000,
+    libm: str = "system",
 ) -> Device:
     """Return a controller for a device.
 
@@ -71,6 +74,7 @@ def device_of(
         name: prefix of everything in C; None: made of the title.
         live: paths of live settings.
         cycles: to be recorded for a replay.
+        libm: "system", or "own" for the same bits on every machine.
 
     Raises:
         InvalidName: no C name, or no setting.
@@ -82,7 +86,7 @@ def device_of(
     try:
         # A solver without a bound of its time is refused below, for what it is.
         stepper = Stepper(problem, controller, live=live, bounded=False)
-        device = Device(chosen, whole, problem, controller, stepper, cycles)
+        device = Device(chosen, whole, problem, controller, stepper, cycles, libm)
         _ = device.sources, device.bounds
     except NotSupported as error:
         raise NotSupported(f"'{title}' cannot be exported: {error}{_instead(controller)}") from None

@@ -16,13 +16,15 @@ def _add(parser: argparse.ArgumentParser) -> None:
         "--to",
         metavar="TARGET",
         default="c",
-        help="c: C99 for every compiler (default); fmu, fmu2: unit for other simulators",
+        help="c: C99 for every compiler (default); fmu, fmu2: unit for other simulators; wasm: a web page",
     )
     parser.add_argument("--out", metavar="FOLDER", required=True, help="folder for the files, new or empty")
     text = "prefix of everything in C (default: made of the names of problem and controller)"
     parser.add_argument("--name", metavar="NAME", help=text)
     text = "settings that stay open, such as deformation.gain or limits.inputs.Q1; all others are constants"
     parser.add_argument("--live", nargs="+", default=[], metavar="PATH", help=text)
+    text = "exp, sin, pow and the like: of the machine, or own ones with the same bits everywhere (default: by target)"
+    parser.add_argument("--libm", choices=("system", "own"), help=text)
     text = "cycles that are recorded for the replay, faults among them (default: 2000)"
     parser.add_argument("--cycles", type=int, default=2000, metavar="N", help=text)
 
@@ -36,7 +38,13 @@ def _run(options: argparse.Namespace) -> ExitCode:
     task = load_problem(options.problem)
     controller = select(task, [options.controller])[options.controller]
     device = device_of(
-        task.problem, controller, options.controller, name=options.name, live=options.live, cycles=options.cycles
+        task.problem,
+        controller,
+        options.controller,
+        name=options.name,
+        live=options.live,
+        cycles=options.cycles,
+        libm=options.libm or target.libm,
     )
     for file in write(device, target, Path(options.out)):
         print(f"wrote {file}")
@@ -61,6 +69,7 @@ VERB = Verb(
             "and arm_set, which refuses numbers outside their bounds",
         ),
         ('fpirhc export two_mass "RHC+FPI" --to fmu --out device', "an FMI 3.0 unit for co-simulation"),
+        ('fpirhc export two_mass "RHC+FPI" --to wasm --out web', "WebAssembly with a wrapper in JavaScript"),
     ),
     notes="""
 Where there is a compiler, recorded cycles with faults are compared bit by bit:

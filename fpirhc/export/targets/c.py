@@ -39,14 +39,18 @@ def sources(device: Device) -> dict[str, str]:
     name = device.name
     before = f"/* {device.title}. Made by fpirhc from its symbolic step. */\n"
     steps = {f"{name}_step{k or ''}.c": before + body for k, body in enumerate(device.sources)}
-    return {f"{name}.h": _header(device), f"{name}.c": _controller(device), **steps}
+    files = {f"{name}.h": _header(device), f"{name}.c": _controller(device), **steps}
+    if device.libm == "system":
+        return files
+    own = {file: text.replace("#include <math.h>", f'#include "{name}_math.h"') for file, text in files.items()}
+    return {**own, f"{name}_math.h": filled(device, "math.h"), f"{name}_math.c": filled(device, "math.c")}
 
 
 def _files(device: Device) -> Mapping[str, str | bytes]:
     own = sources(device)
     return {
         **own,
-        "layout.json": json.dumps(_layout(device), indent=1),
+        "layout.json": json.dumps(layout_of(device), indent=1),
         "samples.bin": recorded(device),
         "main.c": filled(device, "main.c"),
         "CMakeLists.txt": filled(device, "CMakeLists.txt", sources=" ".join(n for n in own if n.endswith(".c"))),
@@ -262,9 +266,17 @@ def _table(name: str, values: np.ndarray) -> str:
     return "\n".join([f"static const casadi_real {name}[] = {{", *lines, line.rstrip(","), "};"])
 
 
-def _layout(device: Device) -> dict[str, object]:
+def layout_of(device: Device) -> dict[str, object]:
+    """Return names, units, start values and bounds of everything."""
     stepper = device.stepper
-    layouts = {"inputs": device.inputs, **data_of(device), "memory": stepper.memory, "trace": stepper.signals}
+    command = Layout((stepper.signals["command"],))
+    layouts = {
+        "inputs": device.inputs,
+        **data_of(device),
+        "memory": stepper.memory,
+        "command": command,
+        "trace": stepper.signals,
+    }
     return {
         "name": device.name,
         "of": device.title,
