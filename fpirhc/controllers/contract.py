@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
-from fpirhc.controllers.mirror import NONE
+from fpirhc.controllers.model_inputs import NONE
 from fpirhc.controllers.scale_selection import plan_demand, reference_demand
 from fpirhc.deformation.base import Deformation, automatic, with_inner
 from fpirhc.deformation.identity import Identity

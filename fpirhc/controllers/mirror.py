@@ -10,28 +10,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.exogenous_block import KnownSignals
-from fpirhc.deformation.base import Deformation, Mirror
+from fpirhc.controllers.model_inputs import NONE, CommandPath
+from fpirhc.deformation.base import Deformation
 from fpirhc.plant.motion import controlled_places, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names, values_of
 from fpirhc.symbolic.block import Block, Delay, unseen
 from fpirhc.symbolic.expression import Signals, expression, is_finite, total
-from fpirhc.symbolic.functions import left_after, left_in_mean, numbers, stays
 from fpirhc.symbolic.gap import GAP, straightened
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.queue import Queue, every
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.queue import Queue
 from fpirhc.task.problem import Problem
 
 MEASURED_OUTPUT = "_measured_output"  # the outputs of the same instant
 MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
 MEASURED_TIME = "_measured_time"  # the time at which it is given, where a controller may act on a predicted one
-NONE = 1e-9  # a fraction of a cycle below this counts as zero
 
 
 def measured_state(plant: Plant) -> Signal:
@@ -42,92 +40,6 @@ def measured_state(plant: Plant) -> Signal:
 def measured_output(plant: Plant) -> Signal:
     """Return the signal of the measured outputs."""
     return Signal(MEASURED_OUTPUT, plant.output.elements, plant.output.units)
-
-
-@dataclass(frozen=True, eq=False)
-class Path:
-    """The believed way from the commands to the model.
-
-    The whole cycles of the measurement's dead time come before the model: the twin runs in the time of the samples.
-
-    Args:
-        problem: the problem.
-        mirror: the beliefs.
-        counts: whether the first cycles differ from the others.
-    """
-
-    problem: Problem
-    mirror: Mirror
-    counts: bool
-
-    @property
-    def known(self) -> KnownSignals:
-        """What the model is told of signals from outside."""
-        return KnownSignals(self.problem.plant, self.problem.signals, self.problem.period)
-
-    @property
-    def late(self) -> int:
-        """Whole cycles of the measurement's dead time."""
-        return math.floor(self.mirror.measurement + NONE)
-
-    @property
-    def fraction(self) -> float:
-        """The rest of the measurement's dead time, in cycles."""
-        rest = self.mirror.measurement - self.late
-        return rest if rest > NONE else 0.0
-
-    @property
-    def decays(self) -> tuple[float, ...]:
-        """Share of an actuator's distance from its command that is left after one cycle; empty where none lags."""
-        taus = every(self.mirror.lag)
-        lags = not all(stays(t, 0.0) for t in taus)
-        return tuple(left_after(self.problem.period, t) for t in taus) if lags else ()
-
-    @property
-    def queue(self) -> Queue:
-        """Queue of the commands; the newest one is that of the last cycle."""
-        cycles, longest = self.mirror.cycles, self.mirror.longest
-        delays = tuple(c + self.late for c in cycles) if isinstance(cycles, tuple) else cycles + self.late
-        return Queue(delays, longest=None if longest is None else longest + self.late)
-
-    @property
-    def memory(self) -> tuple[Signal, ...]:
-        """Commands on their way, positions of lagging actuators, and the number of cycles so far."""
-        plant, length = self.problem.plant, self.queue.length
-        start = tuple(map(float, self.problem.inputs_before))
-        names = tuple(f"{e}@{k}" for k in range(1, length) for e in plant.input.elements)
-        queued = (Signal("mirror_commands", names, start=start * (length - 1)),) if length > 1 else ()
-        lagging = (Signal("mirror_actuators", plant.input.elements, plant.input.units, start),) if self.decays else ()
-        counted = (scalar("mirror_cycles"),) if self.counts else ()
-        return (*queued, *lagging, *counted, *self.known.memory(self.late))
-
-    @property
-    def reads(self) -> tuple[Signal, ...]:
-        """Signals that every mirror reads."""
-        plant = self.problem.plant
-        before = Signal("_command_before", plant.input.elements, plant.input.units)
-        return measured_state(plant), before, plant.parameter, *self.known.reads
-
-    def acted(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
-        """Return the input that acted in the last cycle, at its end and in the mean, and what is remembered."""
-        size, newest = self.problem.plant.input.size, s._command_before
-        remembered: dict[str, Expression] = {}
-        if self.counts:
-            first = ca.DM(self.problem.inputs_before)
-            newest = ca.if_else(s.mirror_cycles < 0.5, first, newest)
-            remembered["mirror_cycles_next"] = ca.fmin(s.mirror_cycles + 1, self.late + 1)
-        column = newest
-        if self.queue.length > 1:
-            column = ca.vertcat(newest, s.mirror_commands)
-            remembered["mirror_commands_next"] = column[: size * (self.queue.length - 1)]
-        arrived = self.queue.delayed(column, size)
-        if not self.decays:
-            return arrived, arrived, remembered
-        decay = numbers(self.decays, arrived)
-        share = numbers([left_in_mean(self.problem.period, t) for t in every(self.mirror.lag)], arrived)
-        away = s.mirror_actuators - arrived
-        end = arrived + decay * away
-        return end, arrived + share * away, {**remembered, "mirror_actuators_next": end}
 
 
 _BEFORE, _ANSWERS = "mirror_state_before", "mirror_answers"
@@ -147,12 +59,14 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
     if mirror is None:
         return [], []
     estimated = not problem.sensing.estimator.shows_response or mirror.measurement % 1 > NONE
-    late = max(every(mirror.cycles)) if mirror.longest is None else mirror.longest
-    path = Path(problem, mirror, estimated or late + mirror.measurement > 0)
+    inputs = problem.plant.input
+    last, waits = Signal("_command_before", inputs.elements, inputs.units), Queue(mirror.cycles, longest=mirror.longest)
+    path = CommandPath(problem, "mirror", last, waits, mirror.measurement, mirror.lag, counts=False)
     if problem.plant.step is not None:
         return [map_mirror(path)], []
     if not estimated:
         return [_instant_block(path)], []
+    path = replace(path, counts=True)
     if problem.plant.outputs:
         return [twin_of_outputs(path)], []
     return [twin_block(path)], [Delay(problem.plant.response_signal(BEFORE), "_deformation")]
@@ -183,7 +97,7 @@ def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
     return tuple([signal for signal in every if signal.name in read])
 
 
-def map_mirror(path: Path, *, lost: bool = False) -> Block:
+def map_mirror(path: CommandPath, *, lost: bool = False) -> Block:
     """Return the block (measured state, last command, parameters) -> the model's response that is measured in this cycle.
 
     A response of relative order r is complete r cycles after its command. The model's response to the same command, from the same
@@ -206,7 +120,7 @@ def map_mirror(path: Path, *, lost: bool = False) -> Block:
         acting, _, remembered = path.acted(s)
         last = getattr(s, _BEFORE)
         last = straightened(last, getattr(s, MEASURED), s.gap) if lost else last
-        parameters, signals = path.known.acted(s, path.late)
+        parameters, signals = path.parameters(s)
         answers = ca.vertsplit(plant.equations.controlled_response(last, acting, parameters))
         past = ca.vertsplit(getattr(s, _ANSWERS)) if waiting else []
         modelled, later, at = [], [], 0
@@ -220,15 +134,16 @@ def map_mirror(path: Path, *, lost: bool = False) -> Block:
             remembered[f"{_ANSWERS}_next"] = ca.vertcat(*later)
         return {"_modelled": ca.vertcat(*modelled), **remembered}
 
+    reads = measured_state(plant), *path.reads
     writes, memory = Layout((plant.response_signal("_modelled"),)), Layout((*path.memory, before, *queues))
     if not lost:
-        return Block("mirror", Layout(path.reads), writes, step, memory, bridged=lambda: map_mirror(path, lost=True))
+        return Block("mirror", Layout(reads), writes, step, memory, bridged=lambda: map_mirror(path, lost=True))
     waits = unseen(map_mirror(path), (MEASURED,))
     held = replace(waits, step=lambda s: {**waits.step(s), f"{_BEFORE}_next": getattr(s, _BEFORE)})
-    return Block("mirror", Layout((*path.reads, GAP)), writes, step, memory, waits=held)
+    return Block("mirror", Layout((*reads, GAP)), writes, step, memory, waits=held)
 
 
-def _instant_block(path: Path) -> Block:
+def _instant_block(path: CommandPath) -> Block:
     """Block (measured state, last command, parameters) -> the model's response at this instant."""
     plant = path.problem.plant
     x, u, p = plant.symbols()
@@ -236,18 +151,18 @@ def _instant_block(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, _, remembered = path.acted(s)
-        parameters, signals = path.known.acted(s, path.late)
+        parameters, signals = path.parameters(s)
         return {"_modelled": response(getattr(s, MEASURED), end, parameters), **remembered, **signals}
 
     writes = Layout((plant.response_signal("_modelled"),))
-    block = Block("mirror", Layout(path.reads), writes, step, Layout(path.memory))
+    block = Block("mirror", Layout((measured_state(plant), *path.reads)), writes, step, Layout(path.memory))
     return replace(block, waits=unseen(block, (MEASURED,))) if path.memory else block
 
 
 BEFORE = "_deformation_before"
 
 
-def twin_block(path: Path) -> Block:
+def twin_block(path: CommandPath) -> Block:
     """Block (measured state, last command, last deformation, parameters) -> the twin's estimated response and the deformation's."""
     problem, plant = path.problem, path.problem.plant
     start, names = problem.start_state, problem.sensing.estimator.measures(plant)
@@ -265,9 +180,9 @@ def twin_block(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
-        parameters, signals = path.known.acted(s, path.late)
+        parameters, signals = path.parameters(s)
         acting, answered, next_deformations = past.seen(s)
-        waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
+        waits = path.cycles(s) < path.late + 0.5  # the samples still show the start
         at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, -acting))
         sample = seen(at, end, parameters, -acting[controlled])
         arrived = (1 - path.fraction) * sample + path.fraction * s.mirror_sample if late else sample
@@ -286,7 +201,7 @@ def twin_block(path: Path) -> Block:
         Layout((plant.response_signal("_modelled"),)),
         Layout((*path.memory, past.memory, twin, *late, *own)),
     )
-    reads = Layout((*path.reads, plant.response_signal(BEFORE)))
+    reads = Layout((measured_state(plant), *path.reads, plant.response_signal(BEFORE)))
     block = Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
     return replace(block, waits=unseen(block, (MEASURED,)))
 
@@ -294,7 +209,7 @@ def twin_block(path: Path) -> Block:
 class _Deformations:
     """Deformations of earlier cycles: the one that acts, and their share in the estimated response."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: CommandPath) -> None:
         plant = path.problem.plant
         self._plant, self._names = plant, plant.controlled_names
         self._acting = path.queue
@@ -340,7 +255,7 @@ def _seen(problem: Problem, names: Sequence[str], shifted: Sequence[str]) -> ca.
 class _Moves:
     """Matrices that turn a move of the estimated state into moves of the twin and of what its estimator remembers."""
 
-    def __init__(self, problem: Problem, names: Sequence[str], path: Path) -> None:
+    def __init__(self, problem: Problem, names: Sequence[str], path: CommandPath) -> None:
         plant, period = problem.plant, problem.period
         self.state = ca.DM(drift(plant.output, path.fraction * period))
         places = {e: k for k, e in enumerate(plant.state.elements)}
@@ -385,7 +300,7 @@ def drift(motion: Signal, time: float) -> np.ndarray:
 _STATE, _OFFSET = "mirror_state", "mirror_offset"
 
 
-def twin_of_outputs(path: Path) -> Block:
+def twin_of_outputs(path: CommandPath) -> Block:
     """Block (state, outputs, last command, parameters) -> the model's response behind the estimator.
 
     The model moves over a cycle from the state that is given, x_{k-1}, to x^ = F(x_{k-1}, u), and shows its outputs there. Outputs
@@ -413,8 +328,8 @@ def twin_of_outputs(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
-        parameters, signals = path.known.acted(s, path.late)
-        waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
+        parameters, signals = path.parameters(s)
+        waits = path.cycles(s) < path.late + 0.5  # the samples still show the start
         at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, calm))
         offset = ca.if_else(waits, s.mirror_offset, ahead @ s.mirror_offset)
         sample = shown(at, end, parameters, offset)
@@ -430,7 +345,10 @@ def twin_of_outputs(path: Path) -> Block:
         return {"_modelled": response, **remembered}
 
     memory = Layout((*path.memory, *_starts(problem), *own))
-    reads, writes = Layout((*path.reads, measured_output(plant))), Layout((plant.response_signal("_modelled"),))
+    reads, writes = (
+        Layout((measured_state(plant), *path.reads, measured_output(plant))),
+        Layout((plant.response_signal("_modelled"),)),
+    )
     block = Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
     return replace(block, waits=unseen(block, (MEASURED, MEASURED_OUTPUT)))
 

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.observed_state import SampleTime
+from fpirhc.controllers.observed_state import sample_path
 from fpirhc.controllers.reference_states import nominal_motion
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.nominal import known_on_reference, nominal_run, reference_state
@@ -110,11 +110,11 @@ def check_believed(problem: Problem, controller: Controller) -> None:
 
 def _check_late(problem: Problem) -> None:
     """Raise where the signals of the time of the samples are not known."""
-    if SampleTime(problem).fraction and known_places(problem.plant, problem.signals):
+    if sample_path(problem).fraction and known_places(problem.plant, problem.signals):
         late, unit = problem.dead_time.measurement, problem.time_unit
         raise NotSupported(
             f"believed states beside signals from outside need a measurement that is late by whole cycles, and {late:g} {unit} are "
-            f"{late / problem.period:.4g} cycles; use {SampleTime(problem).late * problem.period:g} {unit}"
+            f"{late / problem.period:.4g} cycles; use {sample_path(problem).late * problem.period:g} {unit}"
         )
 
 

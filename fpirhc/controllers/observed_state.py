@@ -9,7 +9,6 @@ a plant are measured or estimated, as 'output' beside 'state'.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +17,7 @@ from typing import cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.exogenous_block import KnownSignals
+from fpirhc.controllers.model_inputs import CommandPath
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
@@ -27,7 +26,7 @@ from fpirhc.sensing.state_observer import Evidence, Model, StateObserver
 from fpirhc.symbolic.block import Block, Delay, bridged, call
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.gap import GAP
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.problem import Problem
@@ -53,11 +52,11 @@ class Believing:
     def block(self) -> Block:
         """Block (raw measurements, parameters, last command) -> (state, [output], realised)."""
         plant = self.problem.plant
-        reads = Layout((self.raw, *self._time.reads, *((GAP,) if self.lost else ())))
+        reads = Layout((self.raw, *self._path.reads, *((GAP,) if self.lost else ())))
         writes = Layout((*measured_signals(plant), plant.response_signal("realised")))
-        own = Layout((*self._time.memory, *self.observer.memory(self.model).signals)) + self._estimator.memory
+        own = Layout((*self._path.memory, *self.observer.memory(self.model).signals)) + self._estimator.memory
         opaque, lossy = self.observer.opaque, None if self.lost else lambda: replace(self, lost=True).block
-        waits = Block("believe_waits", Layout((*self._time.reads, GAP)), Layout(), self._wait, own, opaque=opaque)
+        waits = Block("believe_waits", Layout((*self._path.reads, GAP)), Layout(), self._wait, own, opaque=opaque)
         return Block(
             "believe", reads, writes, self._step, own, opaque, waits=waits if self.lost else None, bridged=lossy
         )
@@ -65,7 +64,7 @@ class Believing:
     @property
     def delay(self) -> Delay:
         """The last command, carried to the next cycle."""
-        return Delay(self._time.commanded, self.problem.plant.input.name)
+        return Delay(self._path.last, self.problem.plant.input.name)
 
     @property
     def observer(self) -> StateObserver:
@@ -78,12 +77,12 @@ class Believing:
     def model(self) -> Model:
         """What the observer is built from."""
         problem = self.problem
-        move = moving(problem.plant, believed_integrator(problem), problem.period, fraction=bool(self._time.fraction))
+        move = moving(problem.plant, believed_integrator(problem), problem.period, fraction=bool(self._path.fraction))
         return Model(problem.plant, move, problem.start_state, problem.sensing.measures(problem.plant))
 
-    @property
-    def _time(self) -> SampleTime:
-        return SampleTime(self.problem)
+    @cached_property
+    def _path(self) -> CommandPath:
+        return sample_path(self.problem)
 
     @cached_property
     def _estimator(self) -> Block:
@@ -133,8 +132,14 @@ class Believing:
 
     def _evidence(self, s: Signals, shown: Mapping[str, Expression]) -> tuple[Evidence, dict[str, Expression]]:
         """What the observer is told, with no state known yet, and what is remembered for the next cycle."""
-        (command, commands), (parameters, signals) = self._time.command(s), self._time.parameters(s)
-        evidence = Evidence(shown, {}, command, parameters, self._time.moves(s), self._time.counts(s))
+        path = self._path
+        (command, _, commands), (parameters, signals), cycles = path.acted(s), path.parameters(s), path.cycles(s)
+        moves: Expression = cycles > path.late + 0.5  # share of a cycle by which the sample is later than the last one
+        if path.fraction:
+            whole = cycles > path.late + 1.5
+            mean = (1 - path.fraction) * command + path.fraction * path.acted_before(s)
+            command, moves = ca.if_else(whole, mean, command), ca.if_else(whole, 1, (1 - path.fraction) * moves)
+        evidence = Evidence(shown, {}, command, parameters, moves, cycles > path.late - 0.5)
         return evidence, {**commands, **signals}
 
     def _estimates(self, s: Signals, seen: Mapping[str, Expression]) -> tuple[Expression, ...]:
@@ -166,14 +171,8 @@ def believed_integrator(problem: Problem) -> Integrator:
     return RungeKutta4() if problem.integrator.opaque else problem.integrator
 
 
-COMMANDED = "_commanded"  # the last command
-_COUNT, _QUEUE, _SIGNALS = "observer_cycles", "observer_commands", "observer_signals"
-_WHOLE = 1e-6  # a fraction of a cycle below this counts as zero
-
-
-@dataclass(frozen=True, eq=False)
-class SampleTime:
-    """What acted until a sample was taken: an observer lives in the time of the samples.
+def sample_path(problem: Problem) -> CommandPath:
+    """Return what acted until a sample was taken, with the dead times that the problem states.
 
     Behind a measurement that is late by d + phi cycles, 0 <= phi < 1, a sample is interpolated,
 
@@ -182,90 +181,12 @@ class SampleTime:
     and moves as the plant does with the mean of the commands that acted, (1 - phi) u_{k-d-1} + phi u_{k-d-2}. For a linear plant
     this is exact; else the error is of second order in the cycle, as that of the interpolation. The first sample that moves is a
     mean with the start, so it moves by 1 - phi of a cycle.
-
-    Args:
-        problem: whose measurements may be late.
     """
-
-    problem: Problem
-
-    @property
-    def late(self) -> int:
-        """Whole cycles of the measurement's dead time."""
-        return math.floor(self._cycles + _WHOLE)
-
-    @property
-    def fraction(self) -> float:
-        """The rest of the measurement's dead time, in cycles."""
-        rest = self._cycles - self.late
-        return rest if rest > _WHOLE else 0.0
-
-    @property
-    def commanded(self) -> Signal:
-        """Signal of the last command."""
-        inputs = self.problem.plant.input
-        return Signal(COMMANDED, inputs.elements, inputs.units, tuple(map(float, self.problem.inputs_before)))
-
-    @property
-    def reads(self) -> tuple[Signal, ...]:
-        """The last command, the parameters, and the signals of the last cycle."""
-        return (self.problem.plant.parameter, self.commanded, *self._known.reads)
-
-    @property
-    def memory(self) -> tuple[Signal, ...]:
-        """The number of cycles so far, older commands, and older signals."""
-        elements, length = self.commanded.elements, self._length
-        names = tuple(f"{e}@{k}" for k in range(1, length) for e in elements)
-        queued = (Signal(_QUEUE, names, start=self.commanded.start * (length - 1)),) if length > 1 else ()
-        return (scalar(_COUNT), *queued, *self._known.memory(self.late, _SIGNALS))
-
-    def command(self, s: Signals) -> tuple[Expression, dict[str, Expression]]:
-        """Return the command that acted, and what is remembered."""
-        size, newest, length = self.problem.plant.input.size, getattr(s, COMMANDED), self._length
-        count, column, remembered = getattr(s, _COUNT), newest, {}
-        remembered[f"{_COUNT}_next"] = ca.fmin(count + 1, self.late + (2 if self.fraction else 1))
-        if length > 1:
-            column = ca.vertcat(newest, getattr(s, _QUEUE))
-            remembered[f"{_QUEUE}_next"] = column[: size * (length - 1)]
-        acted = self._queue(0).delayed(column, size)
-        if self.fraction:
-            mean = (1 - self.fraction) * acted + self.fraction * self._queue(1).delayed(column, size)
-            acted = ca.if_else(count > self.late + 1.5, mean, acted)
-        return acted, remembered
-
-    def parameters(self, s: Signals) -> tuple[Expression, dict[str, Expression]]:
-        """Return the model's parameters with the signals from outside that acted, and what is remembered."""
-        return self._known.acted(s, self.late, _SIGNALS)
-
-    def moves(self, s: Signals) -> Expression:
-        """Return the share of a cycle by which the sample is later than the last one."""
-        count = getattr(s, _COUNT)
-        later = count > self.late + 0.5
-        if not self.fraction:
-            return later
-        return ca.if_else(count > self.late + 1.5, 1, (1 - self.fraction) * later)
-
-    def counts(self, s: Signals) -> Expression:
-        """Return whether the sample was taken in this run."""
-        return getattr(s, _COUNT) > self.late - 0.5
-
-    @property
-    def _cycles(self) -> float:
-        return self.problem.dead_time.measurement / self.problem.period
-
-    @property
-    def _known(self) -> KnownSignals:
-        return KnownSignals(self.problem.plant, self.problem.signals, self.problem.period)
-
-    def _queue(self, more: int) -> Queue:
-        """Queue of the commands: the newest one is that of the last cycle, and acts on the sample's cycle after all dead times."""
-        names, late = self.problem.plant.inputs, self.late + more
-        waits = [self.problem.dead_time.wait(name, self.problem.period) for name in names]
-        cycles = [cast(float, wait.cycles) for wait in waits]
-        rooms = [nominal(c) if wait.longest is None else wait.longest for c, wait in zip(cycles, waits, strict=True)]
-        longest = max(rooms) + late if any(wait.longest is not None for wait in waits) else None
-        return Queue(tuple(c + late for c in cycles), longest=longest)
-
-    @property
-    def _length(self) -> int:
-        return self._queue(1 if self.fraction else 0).length
+    inputs, period = problem.plant.input, problem.period
+    last = Signal("_commanded", inputs.elements, inputs.units, tuple(map(float, problem.inputs_before)))
+    waits = [problem.dead_time.wait(name, period) for name in inputs.elements]
+    cycles = tuple(cast(float, wait.cycles) for wait in waits)
+    rooms = [nominal(c) if wait.longest is None else wait.longest for c, wait in zip(cycles, waits, strict=True)]
+    longest = max(rooms) if any(wait.longest is not None for wait in waits) else None
+    late = problem.dead_time.measurement / period
+    return CommandPath(problem, "observer", last, Queue(cycles, longest=longest), late)

@@ -54,6 +54,11 @@ class Queue:
             )
         return self._reach(nominal(self.cycles))
 
+    def later(self, cycles: int) -> Queue:
+        """Return the queue with every delay longer by whole cycles."""
+        delays = tuple(c + cycles for c in self.cycles) if isinstance(self.cycles, tuple) else self.cycles + cycles
+        return Queue(delays, self.width, None if self.longest is None else self.longest + cycles)
+
     def needed(self, beside: Expression) -> Expression | int:
         """Return how many of them the delays reach back to; `beside` is an expression of the same kind."""
         if not is_live(self.cycles):

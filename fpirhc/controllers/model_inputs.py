@@ -1,0 +1,213 @@
+"""What a model of the controller's own is given: signals from outside, and the commands that acted until a sample was taken.
+
+    parameters, time -> parameters with the values of this cycle -> controller
+    last command -> dead time of the input -> whole cycles of the measurement's dead time -> lag of the actuator -> model
+
+A response that is measured at the end of a cycle belongs to the signals of that cycle, so a model that is compared with it is given
+the signals of the last cycle, `_signals_acted`. A parallel model and an observer stand behind the same path.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.plant.motion import time_signal
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import left_after, left_in_mean, numbers, stays
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.queue import Queue, every
+from fpirhc.task.exogenous import Exogenous, known_places, model_values, rows_of
+from fpirhc.task.problem import Problem
+
+ACTED = "_signals_acted"
+NOW = "_parameters_now"
+NONE = 1e-9  # a fraction of a cycle below this counts as zero
+
+
+@dataclass(frozen=True, eq=False)
+class KnownSignals:
+    """What a model is told.
+
+    Args:
+        plant: the model.
+        signals: from outside, by name.
+        period: of the control cycle.
+    """
+
+    plant: Plant
+    signals: Mapping[str, Exogenous]
+    period: float
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Places among the parameters of the signals of which it is told something."""
+        return known_places(self.plant, self.signals)
+
+    @property
+    def reads(self) -> tuple[Signal, ...]:
+        """The signals of the last cycle, in the first cycle those of the cycle itself; nothing where it is told nothing."""
+        plant, places = self.plant, self.places
+        if not places:
+            return ()
+        at = np.array([self.period / 2])
+        first = rows_of(model_values(plant, self.signals), at, plant.approximate)[0]
+        names, units = (tuple(v[k] for k in places) for v in (plant.parameter.elements, plant.parameter.units))
+        return (Signal(ACTED, names, units, tuple(float(first[k]) for k in places)),)
+
+    def memory(self, late: int, name: str) -> tuple[Signal, ...]:
+        """Return the signals of `late` more cycles before the last one, remembered under a name."""
+        if not (self.reads and late):
+            return ()
+        [one] = self.reads
+        names = tuple(f"{e}@{k}" for k in range(1, late + 1) for e in one.elements)
+        return (Signal(name, names, start=one.start * late),)
+
+    def acted(self, s: Signals, late: int, name: str) -> tuple[Expression, dict[str, Expression]]:
+        """Return the parameters of the last cycle, or of `late` cycles before it, and what is remembered.
+
+        They are the parameters of this cycle, with the signals of that one.
+        """
+        if not self.places:
+            return s.parameters, {}
+        column, size = getattr(s, ACTED), len(self.places)
+        remembered = {}
+        if late:
+            column = ca.vertcat(column, getattr(s, name))
+            remembered[f"{name}_next"] = column[: size * late]
+        acted = dict(zip(self.places, ca.vertsplit(column[size * late :]), strict=True))
+        parameters = ca.vertcat(*(acted.get(k, s.parameters[k]) for k in range(self.plant.parameter.size)))
+        return parameters, remembered
+
+    def block(self, *, remembers: bool) -> Block | None:
+        """Return the block (time, parameters) -> parameters of this cycle; None where the model is told nothing.
+
+        Args:
+            remembers: whether it also writes the signals of the last cycle.
+        """
+        values = model_values(self.plant, self.signals)
+        if values is None:
+            return None
+        (acted,), places, half = self.reads, list(self.places), self.period / 2
+        last = Signal("signals_last", acted.elements, acted.units, acted.start)
+
+        def step(s: Signals) -> dict[str, Expression]:
+            now = values(s.time + half, s.parameters)
+            if not remembers:
+                return {NOW: now}
+            return {NOW: now, ACTED: s.signals_last, "signals_last_next": now[places]}
+
+        parameter, opaque = self.plant.parameter, not values.is_a("SXFunction")
+        writes = Layout((Signal(NOW, parameter.elements, parameter.units), *((acted,) if remembers else ())))
+        memory = Layout((last,)) if remembers else Layout()
+        block = Block("signals", Layout((time_signal(self.plant), parameter)), writes, step, memory, opaque)
+        return replace(block, waits=block)  # time goes on
+
+
+@dataclass(frozen=True, eq=False)
+class CommandPath:
+    """What acted until a sample was taken.
+
+    Args:
+        problem: with the model.
+        owner: first part of the names of what is remembered.
+        last: signal of the command of the last cycle.
+        inputs: how many cycles commands are late.
+        measurement: cycles by which samples are late.
+        lag: time constant of the actuators, one for all or one for each.
+        counts: whether the first cycles differ from the others.
+    """
+
+    problem: Problem
+    owner: str
+    last: Signal
+    inputs: Queue
+    measurement: float = 0.0
+    lag: float | tuple[float, ...] = 0.0
+    counts: bool = True
+
+    @property
+    def late(self) -> int:
+        """Whole cycles of the measurement's dead time."""
+        return math.floor(self.measurement + NONE)
+
+    @property
+    def fraction(self) -> float:
+        """The rest of the measurement's dead time, in cycles."""
+        rest = self.measurement - self.late
+        return rest if rest > NONE else 0.0
+
+    @cached_property
+    def queue(self) -> Queue:
+        """How late the commands are on which a whole sample depends."""
+        return self.inputs.later(self.late)
+
+    @property
+    def reads(self) -> tuple[Signal, ...]:
+        """The last command, the parameters, and the signals of the last cycle."""
+        return (self.last, self.problem.plant.parameter, *self._known.reads)
+
+    @cached_property
+    def memory(self) -> tuple[Signal, ...]:
+        """Commands on their way, positions of lagging actuators, the number of cycles so far, and older signals."""
+        inputs, length = self.problem.plant.input, self._column.length
+        start = tuple(map(float, self.problem.inputs_before))
+        names = tuple(f"{e}@{k}" for k in range(1, length) for e in inputs.elements)
+        queued = (Signal(f"{self.owner}_commands", names, start=start * (length - 1)),) if length > 1 else ()
+        lagging = (Signal(f"{self.owner}_actuators", inputs.elements, inputs.units, start),) if self._lags else ()
+        counted = (scalar(f"{self.owner}_cycles"),) if self.counts else ()
+        return (*queued, *lagging, *counted, *self._known.memory(self.late, f"{self.owner}_signals"))
+
+    def cycles(self, s: Signals) -> Expression:
+        """Return the number of cycles so far; it stops where no sample shows the time before the run."""
+        return getattr(s, f"{self.owner}_cycles")
+
+    def acted(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
+        """Return the input that acted in the cycle of the last whole sample, at its end and in the mean, and what is remembered."""
+        arrived, remembered = self._arrived(s, self.queue)
+        if not self._lags:
+            return arrived, arrived, remembered
+        taus, period = every(self.lag), self.problem.period
+        decay, share = (numbers([left(period, t) for t in taus], arrived) for left in (left_after, left_in_mean))
+        away = getattr(s, f"{self.owner}_actuators") - arrived
+        end = arrived + decay * away
+        return end, arrived + share * away, {**remembered, f"{self.owner}_actuators_next": end}
+
+    def acted_before(self, s: Signals) -> Expression:
+        """Return the input that acted one cycle earlier, without lag."""
+        return self._arrived(s, self._column)[0]
+
+    def parameters(self, s: Signals) -> tuple[Expression, dict[str, Expression]]:
+        """Return the model's parameters with the signals from outside that acted, and what is remembered."""
+        return self._known.acted(s, self.late, f"{self.owner}_signals")
+
+    def _arrived(self, s: Signals, queue: Queue) -> tuple[Expression, dict[str, Expression]]:
+        size, column, remembered = self.last.size, getattr(s, self.last.name), dict[str, Expression]()
+        if self.counts:
+            most = self.late + (2 if self.fraction else 1)
+            remembered[f"{self.owner}_cycles_next"] = ca.fmin(self.cycles(s) + 1, most)
+        length = self._column.length
+        if length > 1:
+            column = ca.vertcat(column, getattr(s, f"{self.owner}_commands"))
+            remembered[f"{self.owner}_commands_next"] = column[: size * (length - 1)]
+        return queue.delayed(column, size), remembered
+
+    @cached_property
+    def _column(self) -> Queue:
+        """How late the oldest commands are on which an interpolated sample depends."""
+        return self.inputs.later(self.late + 1) if self.fraction else self.queue
+
+    @property
+    def _lags(self) -> bool:
+        return not all(stays(t, 0.0) for t in every(self.lag))
+
+    @property
+    def _known(self) -> KnownSignals:
+        return KnownSignals(self.problem.plant, self.problem.signals, self.problem.period)
