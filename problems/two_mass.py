@@ -61,7 +61,7 @@ problem = fp.Problem(
 
 tracking = fp.Exponential(rate=6.0)  # 1/s
 optimiser = fp.FixedPoint(iterations=1, tolerance=5e-2)  # N
-# The plain form, as published: it serves where the model is far away and the gain is large. Begin with fp.ModelReferenced(sigmoid).
+# As published, in the plain form: it serves where the model is far away and the gain is large. Begin with fp.ModelReferenced.
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=20.0)  # scale in m/s^2
 absolute = fp.Quadratic(states={"q1": 1e2, "q2": 1e2, "q1'": 1.0, "q2'": 1.0}, effort={"Q1": 1e-3, "Q2": 1e-3})
 stiff = fp.Quadratic(states={"q1": 1e4, "q2": 1e4, "q1'": 1.0, "q2'": 1.0}, deviation={"Q1": 1e-3, "Q2": 1e-3})
@@ -71,6 +71,7 @@ controllers = {
     "CTC+FPI (eq 3)": fp.ComputedTorque(tracking, fp.RFPTVector(offset=1e4, sign=-1.0, gain=2e-5)),
     "CTC+FPI (eq 6)": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0)),
     "RHC": fp.RecedingHorizon(optimiser),
+    "RHC+FPI, model-referenced": fp.RecedingHorizon(optimiser, fp.ModelReferenced(sigmoid)),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
     # Two cases where the method does not help, recognised and explained by the verdict:
@@ -79,7 +80,7 @@ controllers = {
     "RHC, stiff": fp.RecedingHorizon(optimiser, cost=stiff),
     "RHC+FPI, stiff, small S": fp.RecedingHorizon(optimiser, fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), cost=stiff),
 }
-headline = ("RHC", "RHC+FPI")
+headline = ("RHC", "RHC+FPI, model-referenced")
 tuning = {
     "CTC": {"tracking.rate": fp.LogSpan(2.0, 20.0)},  # 1/s
     "CTC+FPI (eq 6)": {"tracking.rate": fp.LogSpan(2.0, 20.0), "deformation.gain": fp.LogSpan(-1.5, -0.05)},
