@@ -4,8 +4,7 @@ from .baselines.check import accept, check_baseline
 from .controllers import rivals
 from .controllers.computed_torque import ComputedTorque
 from .controllers.feedforward_only import FeedforwardOnly
-from .controllers.on_failure import Feedforward, HoldPlan, StopRun
-from .controllers.receding_horizon import RecedingHorizon
+from .controllers.receding_horizon import Feedforward, HoldPlan, RecedingHorizon, StopRun
 from .controllers.replanning import FromMeasurement, FromMeasurementTracked, FromPlan
 from .controllers.rivals.pid import PID
 from .controllers.slots.chosen_schedules import ByError, ByLookAhead
@@ -33,10 +32,10 @@ from .errors import FpirhcError, HarmfulAdaptation
 from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.horizon import Horizon
+from .learning.estimators.base import Uncertain
 from .learning.estimators.disturbance_kalman import DisturbanceKalman, disturbed
 from .learning.estimators.moving_horizon import MovingHorizon
 from .learning.estimators.recursive_least_squares import RecursiveLeastSquares
-from .learning.estimators.uncertain import Uncertain
 from .learning.rules.lyapunov_rule import LyapunovRule
 from .learning.rules.projection import Projection
 from .optimisers.anderson import Anderson

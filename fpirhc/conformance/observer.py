@@ -18,8 +18,7 @@ from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.observability import unobservable
-from fpirhc.sensing.sensing import Sensing
-from fpirhc.sensing.sensor import Sensor
+from fpirhc.sensing.sensing import Sensing, Sensor
 from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run

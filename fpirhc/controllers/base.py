@@ -24,8 +24,14 @@ from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measured_state
 from fpirhc.controllers.model_inputs import ACTED, NOW, KnownSignals
-from fpirhc.controllers.online_reference import given_signals, motion_of, own_signals, own_values, with_reference
-from fpirhc.controllers.reference_states import largest_response
+from fpirhc.controllers.reference_states import (
+    given_signals,
+    largest_response,
+    motion_of,
+    own_signals,
+    own_values,
+    with_reference,
+)
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.given import described

@@ -25,21 +25,161 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip
-from fpirhc.controllers.gap import Gap
-from fpirhc.controllers.step_outcome import FAILED, counted, is_trial, outcome
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Derived, Values, call
 from fpirhc.symbolic.expression import FINITE, Signals, expression, kind
-from fpirhc.symbolic.finite import every_finite, finite
-from fpirhc.symbolic.gap import GAPS
+from fpirhc.symbolic.finite import every_finite, finite, kept_if_finite
+from fpirhc.symbolic.gap import GAP, GAPS, LONG, SETTLING
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
+
+AGAIN = 100 * FINITE  # time of a cycle that is given once more: no number that fits, and no cycle that is missing
+BRIDGED = 50  # cycles: the longest gap that is bridged, where nobody states another
+MISSING = Signal(
+    "missing_cycles", start=(-1.0,)
+)  # in the memory: cycles since the last sample; -1 before the first one
+_STILL = Signal("still_settling")  # in the memory: cycles for which what was learned is held
+
+
+Counts: TypeAlias = dict[str, Expression]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How many cycles went by without a sample, and what the next sample is told.
+
+        sample missing      the count goes up, and what is a memory of the passing time goes on: queues, filters, observers
+        the next sample     estimators and queues are moved over the gap (`fpirhc.symbolic.gap`); status BRIDGED
+        after a long gap    estimators begin anew with their derivatives, and what was learned is held until their windows hold
+                            samples of now alone, as after a start; status SETTLING
+
+    Args:
+        bridged: number of missing cycles up to which a gap is bridged.
+        settles: number of samples after a long gap that a response needs: that of the start, and what a filter forgets in.
+    """
+
+    bridged: int
+    settles: float
+
+    @property
+    def memory(self) -> tuple[Signal, ...]:
+        """Cycles since the last sample, and cycles for which what was learned is held."""
+        return (MISSING, _STILL)
+
+    def counts(self, s: Signals, *, trusted: bool) -> Counts:
+        """Return the remembered counts; those that a memory cannot have held are those of the start.
+
+        Args:
+            s: signals of the cycle.
+            trusted: whether nobody else can have written the memory.
+        """
+        missing, still = getattr(s, MISSING.name), getattr(s, _STILL.name)
+        if trusted:
+            return {MISSING.name: missing, _STILL.name: still}
+        good = ca.logic_and(ca.fabs(missing) <= self.bridged + 1, ca.fabs(still) <= self.settles)
+        return {MISSING.name: ca.if_else(good, missing, -1), _STILL.name: ca.if_else(good, still, 0)}
+
+    def passes(self, counts: Counts, time: Expression) -> Expression:
+        """Return whether a cycle without a sample is one of a gap: there has been a sample, and the cycle is a new one."""
+        return ca.logic_and(counts[MISSING.name] > -0.5, ca.logic_not(time >= AGAIN))
+
+    def seen(self, counts: Counts) -> Counts:
+        """Return what the step is told, by name of its signal."""
+        missing = counts[MISSING.name]
+        long = missing > self.bridged + 0.5
+        settling = ca.if_else(long, self.settles, ca.fmax(counts[_STILL.name] - 1, 0)) if self.settles else 0.0
+        return {GAP.name: ca.if_else(long, LONG, ca.fmax(missing, 0)), SETTLING.name: expression(settling)}
+
+    def status(self, status: Expression, told: Counts) -> Expression:
+        """Return the status of a cycle with a sample: that of the step, unless it is OK and a gap came before."""
+        bridged = ca.if_else(told[GAP.name] > 0.5, int(Status.BRIDGED), status)
+        gap = ca.if_else(told[SETTLING.name] > 0.5, int(Status.SETTLING), bridged)
+        return ca.if_else(status == int(Status.OK), gap, status)
+
+    def remembered(self, fits: Expression, passes: Expression, counts: Counts, told: Counts) -> Counts:
+        """Return the counts one cycle later, by name."""
+        missing = counts[MISSING.name]
+        more = ca.if_else(passes, ca.fmin(missing + 1, self.bridged + 1), missing)
+        still = ca.if_else(fits, told[SETTLING.name], counts[_STILL.name])
+        return {MISSING.name: ca.if_else(fits, 0, more), _STILL.name: still}
+
+
+def gap_of(problem: Problem, bridged: int) -> Gap:
+    """Return the gap counter of a problem's steps.
+
+    Args:
+        problem: of the steps; where state and response are measured as they are, nothing settles.
+        bridged: number of missing cycles up to which a gap is bridged.
+    """
+    if not problem.sensing.estimates:
+        return Gap(bridged, 0.0)
+    settling = problem.sensing.settling_cycles(problem.plant, problem.period)
+    return Gap(bridged, float(problem.longest_warm_up + settling))
+
+
+def across_gaps(step: Composite) -> Composite:
+    """Return a controller's step as it is where samples may be lost."""
+    lossy = step.bridged_if_any
+    return step if lossy is None else lossy()
+
+
+FAILED = "not_finite"  # in the memory: steps in a row that were not finite, of samples that fit
+PATIENCE = 10  # such steps before one is tried with the memory of the start
+
+
+def outcome(
+    memory_next: Expression,
+    memory: Expression,
+    command: Expression,
+    trace: Expression,
+    layout: Layout,
+    ran: Expression,
+    *,
+    opaque: bool,
+) -> tuple[Expression, Expression]:
+    """Return (memory to keep, whether the step is fine): memory and command are finite, and no status says that something was not.
+
+    Args:
+        memory_next: of the next cycle.
+        memory: as it was.
+        command: of this cycle.
+        trace: of this cycle.
+        layout: of the trace.
+        ran: whether the results are to be kept where they are fine.
+        opaque: whether the step is a graph of calls.
+    """
+    said = expression(1.0) if "status" not in layout else trace[layout.slice("status")] != int(Status.NON_FINITE)
+    if not opaque:
+        fine = ca.logic_and(every_finite(ca.vertcat(memory_next, command)), said)
+        return ca.if_else(ca.logic_and(ran, fine), memory_next, memory), fine
+    good = ca.logic_and(ca.mmin(ca.fabs(command) <= FINITE), said)
+    kept, finite = kept_if_finite(memory_next, memory, ca.logic_and(ran, good))
+    return kept, ca.logic_and(finite, good)
+
+
+def counted(failed: Expression, fits: Expression, fine: Expression) -> Expression:
+    """Return the count of the next cycle: bad samples leave it, and after a trial it begins anew; NaN counts as none."""
+    more = ca.if_else(failed < PATIENCE - 0.5, failed + 1, 0)
+    return ca.if_else(fits, ca.if_else(fine, 0, more), ca.if_else(failed < PATIENCE + 0.5, failed, 0))
+
+
+def is_trial(failed: Expression) -> Expression:
+    """Return whether this cycle is tried with the memory of the start; a count that cannot be, after a flipped bit, is none."""
+    return ca.fabs(failed - PATIENCE) < 0.5
+
+
+def was_skipped(status: Expression) -> Expression:
+    """Return whether a cycle of this status was skipped: its sample, its time or its step was not good."""
+    bad = ca.logic_or(status == int(Status.BAD_SAMPLE), status == int(Status.NON_FINITE))
+    return ca.logic_or(bad, status == int(Status.BAD_TIME))
+
 
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 DOUBTED = "doubted"  # in the memory: samples in a row that were finite but not plausible

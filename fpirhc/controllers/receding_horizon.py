@@ -13,6 +13,7 @@ The first plan is computed before the run, for the problem's start, so that a ca
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -21,8 +22,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.contract import Planner
-from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
-from fpirhc.controllers.online_reference import motion_of, own_signals, own_values, preview_of
+from fpirhc.controllers.reference_states import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import (
     FromMeasurement,
     Replanning,
@@ -37,6 +37,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidProblem, NotSupported
+from fpirhc.fields.checked import Checked
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.nominal import feedforward, known_on_reference
 from fpirhc.horizon.problem import OptimalControl
@@ -55,6 +56,85 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, live_numbers, nominal, not_live, settled
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
+
+STOPPED = "stopped"  # signal of a policy that stops: NaN where it does, which ends a run by this name
+
+
+class OnFailure(Checked, ABC):
+    """Contract: the input to apply when the solve failed, and the status to report."""
+
+    @property
+    def uses_feedforward(self) -> bool:
+        """Whether the input that the model needs along the reference is applied; False by default."""
+        return False
+
+    @property
+    def stops(self) -> bool:
+        """Whether a failed solve ends the run; False by default."""
+        return False
+
+    @abstractmethod
+    def choose(
+        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
+    ) -> tuple[Expression, Expression]:
+        """Return (input, status).
+
+        Args:
+            failed: whether the solve failed, a scalar expression.
+            planned: first input of the plan.
+            feedforward: input that the model needs along the reference.
+            status: of the solve.
+        """
+
+
+@dataclass(frozen=True)
+class HoldPlan(OnFailure):
+    """Use the plan that the optimiser returns where it fails, with the status HELD.
+
+    Where a horizon cannot be kept, `FixedPoint` returns a plan of least violation; where nothing is finite, every optimiser returns
+    its remembered plan, shifted.
+    """
+
+    def choose(
+        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
+    ) -> tuple[Expression, Expression]:
+        """Return the plan that the optimiser returns."""
+        del feedforward
+        return planned, ca.if_else(failed, int(Status.HELD), status)
+
+
+@dataclass(frozen=True)
+class Feedforward(OnFailure):
+    """Apply the input that the model needs along the reference, without feedback from the plan."""
+
+    @property
+    def uses_feedforward(self) -> bool:
+        """Whether the feedforward is applied: it is."""
+        return True
+
+    def choose(
+        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
+    ) -> tuple[Expression, Expression]:
+        """Return the feedforward in place of the plan."""
+        return ca.if_else(failed, feedforward, planned), ca.if_else(failed, int(Status.HELD), status)
+
+
+@dataclass(frozen=True)
+class StopRun(OnFailure):
+    """Stop: the planned input becomes NaN, which holds the last command and ends the run with this status."""
+
+    @property
+    def stops(self) -> bool:
+        """True: a failed solve ends the run."""
+        return True
+
+    def choose(
+        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
+    ) -> tuple[Expression, Expression]:
+        """Return NaN in place of the plan."""
+        del feedforward
+        return ca.if_else(failed, nan_where(failed), planned), status
+
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")

@@ -19,9 +19,8 @@ import numpy as np
 from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.mirror import with_measured_state
-from fpirhc.controllers.observed import check_believed
-from fpirhc.controllers.observed_state import Believing
-from fpirhc.controllers.online_reference import with_reference
+from fpirhc.controllers.observed_state import Believing, check_believed
+from fpirhc.controllers.reference_states import with_reference
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names

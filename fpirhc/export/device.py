@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.gap import BRIDGED
+from fpirhc.controllers.gate import BRIDGED
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.c_text import portable
 from fpirhc.simulation.clock import most_missed

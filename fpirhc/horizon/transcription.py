@@ -29,9 +29,9 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, known_on_reference, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
+from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.motion import outside_of
 from fpirhc.plant.plant import Plant
-from fpirhc.plant.stiffness import spurious_growth
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
 from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal, settled

@@ -21,8 +21,7 @@ from fpirhc.horizon.nominal import known_on_reference
 from fpirhc.plant.parameter import Parameter, outside
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
-from fpirhc.sensing.sensing import Sensing
-from fpirhc.sensing.sensor import Sensor
+from fpirhc.sensing.sensing import Sensing, Sensor
 from fpirhc.simulation.model_as_plant import behind_actuators
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from fpirhc.errors import OutputError
-from fpirhc.simulation.common_columns import shown_motion
 from fpirhc.simulation.drawing import (
     PALETTE,
     by_unit,
@@ -25,6 +24,7 @@ from fpirhc.simulation.drawing import (
     thinned,
     time_label,
 )
+from fpirhc.simulation.log import shown_motion
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

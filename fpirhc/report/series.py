@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fpirhc.simulation.common_columns import shown_motion
+from fpirhc.simulation.log import shown_motion
 
 if TYPE_CHECKING:
     from fpirhc.simulation.run import Run

@@ -3,8 +3,7 @@
 from fpirhc.sensing.base import DerivativeEstimator
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.positions import PositionDifference, SavitzkyGolay, StepDifference
-from fpirhc.sensing.sensing import Sensing
-from fpirhc.sensing.sensor import Sensor
+from fpirhc.sensing.sensing import Sensing, Sensor
 from fpirhc.sensing.state_filter import StateVariableFilter
 from fpirhc.sensing.velocities import LowPassDifference, VelocityDifference
 

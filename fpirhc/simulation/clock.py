@@ -18,7 +18,7 @@ from typing import ParamSpec, TypeVar
 
 import casadi as ca
 
-from fpirhc.controllers.gap import AGAIN
+from fpirhc.controllers.gate import AGAIN
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status

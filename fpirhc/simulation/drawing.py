@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.simulation.common_columns import shown_motion
-from fpirhc.simulation.log import Log
+from fpirhc.simulation.log import Log, shown_motion
 from fpirhc.summary import printable
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.simulation.common_columns import judged_motion
+from fpirhc.simulation.log import judged_motion
+from fpirhc.simulation.metrics.base import measured_errors
 from fpirhc.simulation.metrics.entries.errors import rms_error
-from fpirhc.simulation.metrics.window import measured_errors
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 

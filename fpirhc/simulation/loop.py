@@ -12,12 +12,10 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.gap import BRIDGED, across_gaps, gap_of
-from fpirhc.controllers.gate import INNER, Gate
+from fpirhc.controllers.gate import BRIDGED, INNER, Gate, across_gaps, gap_of
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.online_reference import given_signals
-from fpirhc.controllers.plausible import plausible_range
-from fpirhc.controllers.response_jumps import response_jumps
+from fpirhc.controllers.plausible import plausible_range, response_jumps
+from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.sensing_chain import compose_seeing, seeing_blocks
 from fpirhc.plant.motion import time_signal
 from fpirhc.simulation.path import acting_blocks, disturbance_signals, moving, outside_blocks, sensing_blocks

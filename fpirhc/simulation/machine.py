@@ -15,12 +15,10 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, fed
-from fpirhc.controllers.gap import across_gaps, gap_of
-from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.gate import Gate, across_gaps, gap_of, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.response_jumps import response_jumps
+from fpirhc.controllers.plausible import response_jumps
 from fpirhc.controllers.sensing_chain import compose_seeing, given_states, raw_signal
-from fpirhc.controllers.step_outcome import was_skipped
 from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported

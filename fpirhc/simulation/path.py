@@ -8,7 +8,7 @@ What moves is a reality, the model itself with its exact parameters, or a body o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Response, error_signal, like, rename
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.online_reference import own_signals
+from fpirhc.controllers.reference_states import own_signals
 from fpirhc.controllers.sensing_chain import first_estimates, first_shown
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import forcing_units, outside_names, time_signal
@@ -30,7 +30,6 @@ from fpirhc.symbolic.queue import Queue
 from fpirhc.task.dead_time import MEASUREMENT, delay_block
 from fpirhc.task.exogenous import model_values, real_values
 from fpirhc.task.external_plant import ExternalPlant
-from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, logged_signal
 from fpirhc.task.problem import Problem
 
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
@@ -456,3 +455,57 @@ def _block(name: str, problem: Problem, plant: Plant, values: ca.Function, shown
 def _unchanged(plant: Plant) -> ca.Function:
     t, p = ca.SX.sym("t"), ca.SX.sym("p", plant.parameter.size)
     return ca.Function("fpirhc_signals", [t, p], [p])
+
+
+SIGNAL = "disturbance"  # what a loop reads in every cycle
+LOGGED = "output_disturbance"
+
+
+def disturbance_columns(problem: Problem) -> tuple[tuple[str, int], ...]:
+    """Return name and derivative of every column of the disturbances: first all names, then d', d'', ... of outputs."""
+    orders = problem.disturbed_outputs
+    higher = ((name, k) for name, order in orders.items() for k in range(1, order + 1))
+    return (*((name, 0) for name in problem.disturbances), *higher)
+
+
+def disturbance_signal(problem: Problem) -> Signal:
+    """Return the signal that a loop reads: every disturbance, and the derivatives of those of outputs."""
+    return Signal(SIGNAL, tuple(name + "'" * k for name, k in disturbance_columns(problem)))
+
+
+def disturbance_values(problem: Problem, times: np.ndarray, seed: int) -> np.ndarray:
+    """Return all columns at some times, shape (m, columns); each disturbance has its own stream."""
+    streams = np.random.SeedSequence(seed).spawn(len(problem.disturbances))
+    values = [
+        one.values(times, np.random.default_rng(stream))
+        for one, stream in zip(problem.disturbances.values(), streams, strict=True)
+    ]
+    by_name = dict(zip(problem.disturbances, values, strict=True))
+    for name, k in disturbance_columns(problem):
+        if k and problem.plant.step is not None:
+            values.append(np.diff(by_name[name], prepend=by_name[name][:1]) / problem.period)
+        elif k:
+            values.append(problem.disturbances[name].derivative(times, k))
+    return np.column_stack(values) if values else np.zeros((len(times), 0))
+
+
+def logged_signal(problem: Problem) -> Signal:
+    """Return the signal of what disturbances add to y, y', ... below the responses."""
+    output = problem.plant.output
+    return Signal(LOGGED, output.elements, output.units)
+
+
+def added(problem: Problem, disturbance: Expression) -> tuple[Expression, Expression]:
+    """Return what disturbances add to y, y', ... below the responses, and to the controlled responses.
+
+    Args:
+        problem: with disturbed outputs.
+        disturbance: value of `disturbance_signal`.
+    """
+    plant, orders = problem.plant, problem.disturbed_outputs
+    values: Mapping[str, Expression] = dict(
+        zip(disturbance_signal(problem).elements, ca.vertsplit(disturbance), strict=True)
+    )
+    own = {e: v for e, v in values.items() if e.rstrip("'") in orders}
+    below = [own.get(e, 0) for e in plant.output.elements]
+    return ca.vertcat(*below), ca.vertcat(*(own.get(n + "'" * orders.get(n, 0), 0) for n in plant.controlled_names))

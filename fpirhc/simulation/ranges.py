@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fpirhc.controllers.on_failure import STOPPED
+from fpirhc.controllers.receding_horizon import STOPPED
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.layout import Layout

@@ -27,7 +27,7 @@ from collections.abc import Mapping, Sequence
 from fpirhc.errors import FpirhcError, OutputError
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Positive
-from fpirhc.simulation.common_columns import with_common_columns
+from fpirhc.simulation.log import with_common_columns
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.whole_file import write_whole
 

@@ -11,16 +11,15 @@ from fpirhc.broken import attempted
 from fpirhc.contraction.measured import identified_factor, sampled_jacobians
 from fpirhc.contraction.spectrum import contraction_along, factors_along, response_jacobians
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.online_reference import own_signals
+from fpirhc.controllers.reference_states import own_signals
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.simulation.path import REALITY_STATE
+from fpirhc.simulation.path import LOGGED, REALITY_STATE
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.exogenous import model_values, real_values, rows_of
-from fpirhc.task.output_disturbance import LOGGED
 from fpirhc.task.problem import Problem
 
 _CHUNK = 500  # cycles whose costs are evaluated in one call

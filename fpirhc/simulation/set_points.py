@@ -7,14 +7,14 @@ from typing import cast
 
 import numpy as np
 
-from fpirhc.controllers.online_reference import given_signals
+from fpirhc.controllers.reference_states import given_signals
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.fields.given import described
 from fpirhc.fields.kinds import named_entries, real_number
 from fpirhc.fields.user_code import called
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps
-from fpirhc.task.steps import check_values, in_force, pairs
+from fpirhc.task.set_point import check_values, in_force, pairs
 
 Setpoints = Mapping[
     str, Steps | Callable[[float], float]

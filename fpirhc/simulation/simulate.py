@@ -20,8 +20,9 @@ from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.changes import Changes, InForce, in_force
-from fpirhc.simulation.common_columns import with_common_columns
+from fpirhc.simulation.log import with_common_columns
 from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.simulation.path import disturbance_values
 from fpirhc.simulation.ranges import Dropped, physical_ranges, ranges_of
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
@@ -30,7 +31,6 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
-from fpirhc.task.output_disturbance import disturbance_values
 from fpirhc.task.problem import Problem
 
 CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C

@@ -15,7 +15,7 @@ import numpy as np
 from fpirhc.by_name import ByName
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
-from fpirhc.controllers.online_reference import given_signals
+from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.sensing_chain import given_states, raw_signal
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue
 from fpirhc.fields.kinds import named_entries

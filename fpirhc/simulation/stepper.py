@@ -13,8 +13,7 @@ import numpy as np
 from fpirhc.by_name import ByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, name_in_task
-from fpirhc.controllers.gap import BRIDGED
-from fpirhc.controllers.gate import HELD
+from fpirhc.controllers.gate import BRIDGED, HELD
 from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.errors import ConcurrentUse

@@ -19,9 +19,11 @@ import os
 import platform
 import re
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -33,7 +35,6 @@ import casadi as ca
 from fpirhc.errors import CompileError, NotSupported
 from fpirhc.symbolic import driver
 from fpirhc.symbolic.driver import of_type, substitute, with_less_work
-from fpirhc.symbolic.private_folder import BUILDING, own_name, private_folder, read_own
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
 # -z defs: a missing symbol must fail here and not end the process at the first call.
@@ -371,3 +372,58 @@ def _first_error(messages: str) -> str:
     """The line that names the error, not the line that names the function around it."""
     lines = messages.strip().splitlines()
     return next((line for line in lines if "error" in line or "undefined" in line), lines[0] if lines else "")
+
+
+BUILDING = "building-"  # beginning of the names of folders in which something is being compiled
+_ABANDONED = 3600.0  # s; no compilation takes that long, so its process was killed
+
+
+def private_folder(folder: Path) -> Path:
+    """Create the folder where needed, close it to others, and remove what killed processes left behind.
+
+    Raises:
+        OSError: it cannot be made, or it belongs to another user.
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    facts = folder.stat()
+    if not _is_own(facts) or not _is_own(folder.lstat()):  # a link of a stranger leads to what is not meant
+        raise PermissionError(f"'{folder}' belongs to another user")
+    if os.name == "posix" and stat.S_IMODE(facts.st_mode) & 0o077:
+        folder.chmod(0o700)
+    _remove_abandoned(folder)
+    return folder
+
+
+def own_name() -> str:
+    """Return the name of the user's folder in a folder that several users may share."""
+    return f"fpirhc-{os.geteuid()}" if os.name == "posix" else "fpirhc"
+
+
+def read_own(path: Path) -> bytes:
+    """Return the contents of a file that nobody else can have written.
+
+    Raises:
+        OSError: it is missing, no regular file, a link, of another user, or writable by others.
+    """
+    # Without O_NONBLOCK the opening of a FIFO would wait for a writer.
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    with os.fdopen(os.open(path, flags), "rb") as file:
+        facts = os.fstat(file.fileno())
+        shared = os.name == "posix" and stat.S_IMODE(facts.st_mode) & 0o022
+        if not stat.S_ISREG(facts.st_mode) or not _is_own(facts) or shared:
+            raise PermissionError(f"'{path}' is no file of the user's own, or others may write to it")
+        return file.read()
+
+
+def _is_own(facts: os.stat_result) -> bool:
+    return os.name != "posix" or facts.st_uid == os.geteuid()
+
+
+def _remove_abandoned(folder: Path) -> None:
+    for path in folder.glob(f"{BUILDING}*"):
+        try:
+            facts = path.lstat()
+        except OSError:
+            continue  # another process has just removed it
+        if stat.S_ISDIR(facts.st_mode) and _is_own(facts) and time.time() - facts.st_mtime > _ABANDONED:
+            shutil.rmtree(path, ignore_errors=True)

@@ -18,11 +18,11 @@ from fpirhc.fields.kinds import Duration, finite_number
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
-from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of
 from fpirhc.plant.motion import followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
+from fpirhc.plant.plant_check import unsolved
 from fpirhc.plant.units import derivative_unit
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line, number, table
@@ -36,7 +36,7 @@ from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
-from fpirhc.task.steps import check_steps
+from fpirhc.task.set_point import check_steps
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _TRIED = 8  # states near the start, at which an input may have an effect that it lacks there

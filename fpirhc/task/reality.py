@@ -20,13 +20,12 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
-from fpirhc.plant.integrators import Integrator
+from fpirhc.plant.integrators import Integrator, stiffness
 from fpirhc.plant.lie_derivatives import output_order, structural_order
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant
-from fpirhc.plant.stiffness import stiffness
+from fpirhc.plant.plant_check import unsolved
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,7 @@ from fpirhc import doctor as machine
 from fpirhc.cli.main import main
 from fpirhc.doctor import Diagnosis, Finding, Outcome, ask
 from fpirhc.scaffold.create import create_problem
-from fpirhc.symbolic.native import Native, cache_folder
-from fpirhc.symbolic.private_folder import own_name
+from fpirhc.symbolic.native import Native, cache_folder, own_name
 
 pytest_plugins = ["pytester"]
 

@@ -12,7 +12,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.gap import AGAIN, Gap, across_gaps, gap_of
+from fpirhc.controllers.gate import AGAIN, Gap, across_gaps, gap_of
 from fpirhc.controllers.sensing_chain import compose_seeing
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, compose

@@ -14,8 +14,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.gate import Gate
-from fpirhc.controllers.step_outcome import was_skipped
+from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Derived, compose
 from fpirhc.symbolic.layout import Layout, Signal, scalar

@@ -388,7 +388,7 @@ def test_a_wrapper_that_hides_its_inner_controller_says_what_to_do():
 PACKAGE = Path(fpirhc.__file__).parent
 CONTRACTS = (
     "controllers.contract.Controller",
-    "controllers.on_failure.OnFailure",
+    "controllers.receding_horizon.OnFailure",
     "controllers.replanning.Replanning",
     "controllers.slots.schedules.Schedule",
     "controllers.wrappers.predicted.Predictor",

@@ -11,7 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.conformance.live import check_live
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.on_failure import StopRun
+from fpirhc.controllers.receding_horizon import StopRun
 from fpirhc.symbolic.functions import nan_where
 
 MAP = fp.Sigmoid(gain=-0.3, scale=50.0)

@@ -16,7 +16,7 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.observed import free_errors
+from fpirhc.controllers.observed_state import free_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.sensing.observability import unobservable
 from fpirhc.sensing.state_observer import StateObserver

@@ -18,7 +18,7 @@ from gaps import gone_on
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.observed import free_errors
+from fpirhc.controllers.observed_state import free_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.sample import raw_measurements

@@ -14,7 +14,7 @@ from lossy import Lossy
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller
-from fpirhc.learning.estimators.uncertain import Uncertain
+from fpirhc.learning.estimators.base import Uncertain
 from fpirhc.members import examples
 from fpirhc.sensing.base import DerivativeEstimator
 from fpirhc.sensing.state_observer import StateObserver

@@ -18,7 +18,7 @@ from gaps import gone_on
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.step_outcome import FAILED, PATIENCE
+from fpirhc.controllers.gate import FAILED, PATIENCE
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.members import Example, examples

@@ -14,7 +14,7 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidValue
 from fpirhc.simulation.metrics import known_metrics, measuring, with_own_metrics
-from fpirhc.simulation.metrics.columns import columns
+from fpirhc.simulation.metrics.measuring import columns
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout, Signal
 

@@ -20,7 +20,6 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.symbolic import native as module
-from fpirhc.symbolic import private_folder
 from fpirhc.symbolic.driver import SIGNATURE, Driver, with_driver
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import expression, graph
@@ -35,7 +34,7 @@ def cache(tmp_path, monkeypatch):
     """An empty cache, on disk and in memory."""
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(module, "_loaded", {})
-    return tmp_path / "cache" / private_folder.own_name()
+    return tmp_path / "cache" / module.own_name()
 
 
 def model(factor: float, size: int = 3) -> ca.Function:
@@ -364,7 +363,7 @@ def test_library_that_others_may_have_written_is_not_run(cache, monkeypatch, who
         path.symlink_to(hidden)
     else:
         stranger = os.geteuid() + 1
-        monkeypatch.setattr(private_folder, "_is_own", lambda facts: facts.st_uid == stranger)
+        monkeypatch.setattr(module, "_is_own", lambda facts: facts.st_uid == stranger)
     assert not module._is_intact(path)
     result = native(model(7.0))
     np.testing.assert_array_equal(result.function(np.ones(3)).full(), model(7.0)(np.ones(3)).full())
@@ -386,7 +385,7 @@ def test_folder_is_closed_to_others(cache):
 def test_folder_of_another_user_is_not_used(cache, monkeypatch):
     """A temporary folder takes its place."""
     cache.mkdir(parents=True)
-    monkeypatch.setattr(private_folder, "_is_own", lambda facts: False)
+    monkeypatch.setattr(module, "_is_own", lambda facts: False)
     assert module.cache_folder() != cache
 
 
@@ -401,7 +400,7 @@ def test_a_shared_folder_stays_as_it_is(tmp_path, monkeypatch):
     monkeypatch.setenv("FPIRHC_CACHE", str(shared))
     monkeypatch.setattr(module, "_loaded", {})
     assert native(model(9.0)).compiled
-    own = shared / private_folder.own_name()
+    own = shared / module.own_name()
     assert stat.S_IMODE(shared.stat().st_mode) == 0o1777
     assert sorted(shared.iterdir()) == sorted([theirs, own])
     assert (stat.S_IMODE(own.stat().st_mode), len(_libraries(own))) == (0o700, 1)
@@ -415,7 +414,7 @@ def test_a_link_of_a_stranger_is_not_followed(cache, tmp_path, monkeypatch):
     cache.parent.mkdir()
     cache.symlink_to(private)
     link = cache.lstat().st_ino
-    monkeypatch.setattr(private_folder, "_is_own", lambda facts: facts.st_ino != link)
+    monkeypatch.setattr(module, "_is_own", lambda facts: facts.st_ino != link)
     assert module.cache_folder() != cache
     assert stat.S_IMODE(private.stat().st_mode) == 0o755
 

@@ -11,7 +11,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, bounded, closing_blocks, desired_blocks, fed, like
 from fpirhc.controllers.mirror import MEASURED_TIME
-from fpirhc.controllers.online_reference import own_signals
+from fpirhc.controllers.reference_states import own_signals
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion

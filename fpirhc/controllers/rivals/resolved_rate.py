@@ -34,7 +34,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block, like, reference_block
 from fpirhc.controllers.contract import check_derivatives
-from fpirhc.controllers.online_reference import motion_of, own_signals, own_values
+from fpirhc.controllers.reference_states import motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity

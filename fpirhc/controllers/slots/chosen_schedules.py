@@ -17,9 +17,8 @@ import numpy as np
 import scipy.linalg
 
 from fpirhc.controllers.base import error_signal, like
-from fpirhc.controllers.slots.schedules import Schedule, check_stretch
+from fpirhc.controllers.slots.schedules import Mode, Schedule, check_stretch, linear_modes
 from fpirhc.controllers.slots.slot import Channel
-from fpirhc.controllers.slots.slot_modes import Mode, linear_modes
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.horizon.nominal import reference_state

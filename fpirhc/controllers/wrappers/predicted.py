@@ -32,7 +32,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
-from fpirhc.controllers.online_reference import own_signals
+from fpirhc.controllers.reference_states import own_signals
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked

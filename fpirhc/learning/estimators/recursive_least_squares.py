@@ -22,8 +22,16 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.learning.estimators.base import Correct, Seen
-from fpirhc.learning.estimators.uncertain import Learner, Uncertain, between, bounds_of, deviations, forgetting_factor
+from fpirhc.learning.estimators.base import (
+    Correct,
+    Learner,
+    Seen,
+    Uncertain,
+    between,
+    bounds_of,
+    deviations,
+    forgetting_factor,
+)
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 

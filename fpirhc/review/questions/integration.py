@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.plant.stiffness import poles, stiffness
+from fpirhc.plant.integrators import poles, stiffness
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import is_planned

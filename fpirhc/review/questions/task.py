@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.controllers.observed import FreeErrors, free_errors
+from fpirhc.controllers.observed_state import FreeErrors, free_errors
 from fpirhc.errors import NotSupported
 from fpirhc.plant.lie_derivatives import structural_order
 from fpirhc.plant.motion import outside_names

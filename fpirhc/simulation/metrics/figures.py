@@ -14,8 +14,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import followed_units
-from fpirhc.simulation.metrics.base import Better, Metric
-from fpirhc.simulation.metrics.window import measured_cycles
+from fpirhc.simulation.metrics.base import Better, Metric, measured_cycles
 from fpirhc.simulation.pictures.base import Quantity, numbers
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem

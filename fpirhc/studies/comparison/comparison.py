@@ -9,8 +9,8 @@ from typing import Any
 from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.simulation.metrics import Metric, Metrics
-from fpirhc.simulation.metrics.columns import Column as Number
-from fpirhc.simulation.metrics.columns import columns, in_report
+from fpirhc.simulation.metrics.measuring import Column as Number
+from fpirhc.simulation.metrics.measuring import columns, in_report
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.null_test import NullTest

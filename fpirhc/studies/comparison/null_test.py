@@ -24,9 +24,9 @@ import numpy as np
 from fpirhc.by_name import FoundByName
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.units import with_space
-from fpirhc.simulation.common_columns import judged_motion
+from fpirhc.simulation.log import judged_motion
+from fpirhc.simulation.metrics.base import by_name
 from fpirhc.simulation.metrics.entries.commands import at_limit
-from fpirhc.simulation.metrics.window import by_name
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator

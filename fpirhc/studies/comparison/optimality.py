@@ -8,7 +8,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.online_reference import own_signals
+from fpirhc.controllers.reference_states import own_signals
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.horizon.problem import OptimalControl

@@ -10,7 +10,7 @@ from typing import Any
 
 from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
-from fpirhc.simulation.metrics.columns import Column as Number
+from fpirhc.simulation.metrics.measuring import Column as Number
 from fpirhc.studies.scenarios.paired import Record, Summary, noun
 from fpirhc.studies.tuning.objective import Objective
 from fpirhc.studies.view import View, status_shares

@@ -18,7 +18,7 @@ from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
-from fpirhc.simulation.metrics.columns import Column
+from fpirhc.simulation.metrics.measuring import Column
 from fpirhc.studies.comparison.compare import check_gains, select, versions
 from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint, scenario_numbers
 from fpirhc.studies.scenarios.draws import COMPARING

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fpirhc.plant.units import derivative_unit
-from fpirhc.simulation.metrics.base import Metric
-from fpirhc.simulation.metrics.window import by_name, input_unit, measured_cycles
+from fpirhc.simulation.metrics.base import Metric, by_name, input_unit, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
 from fpirhc.symbolic.live import nominal

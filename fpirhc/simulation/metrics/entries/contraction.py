@@ -12,8 +12,7 @@ import numpy as np
 from fpirhc.contraction.gains import predicted_factor
 from fpirhc.contraction.measured import identified_factor, sampled_jacobians
 from fpirhc.contraction.spectrum import Spectrum, spectrum_over_run
-from fpirhc.simulation.metrics.base import Metric
-from fpirhc.simulation.metrics.window import measured_cycles
+from fpirhc.simulation.metrics.base import Metric, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem

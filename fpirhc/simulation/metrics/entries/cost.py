@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from fpirhc.simulation.metrics.base import Metric
-from fpirhc.simulation.metrics.window import by_name, measured_cycles
+from fpirhc.simulation.metrics.base import Metric, by_name, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.simulation.metrics.base import Metric
-from fpirhc.simulation.metrics.window import by_name, coordinate_unit, measured_errors
+from fpirhc.simulation.metrics.base import Metric, by_name, coordinate_unit, measured_errors
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
