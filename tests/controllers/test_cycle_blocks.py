@@ -20,6 +20,8 @@ from fpirhc.controllers.base import (
     compose_controller,
     controller_reads,
     deform_block,
+    embedded,
+    fed,
     invert_block,
     reference_block,
 )
@@ -28,6 +30,7 @@ from fpirhc.controllers.contract import (
     Planner,
     PlantModel,
     Response,
+    check_form,
     checked,
     resolved,
     tracking_law,
@@ -39,8 +42,8 @@ from fpirhc.controllers.scale_selection import command_demand, plan_demand, refe
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import InvalidField, InvalidValue, NotContractive, NotSupported
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.layout import scalar
+from fpirhc.symbolic.block import Block, compose
+from fpirhc.symbolic.layout import Layout, scalar
 
 PERIOD = 0.1
 TIMES = np.linspace(0.0, 10.0, 100001)
@@ -64,7 +67,7 @@ def cycle(block: Block, **signals: Any) -> dict[str, np.ndarray]:
     """What a block writes in one cycle."""
     memory = [block.memory.start()] if block.memory.size else []
     values = [ca.DM(signals.get(s.name, np.zeros(s.size))) for s in block.reads.signals]
-    results = block.function(*memory, *values) if memory else block.function(*values)
+    results = block.function(*values, *memory)
     results = results if isinstance(results, tuple | list) else [results]
     names = block.function.name_out()
     return {name: np.asarray(r.full()).ravel() for name, r in zip(names, results, strict=True)}
@@ -300,7 +303,7 @@ def test_a_controller_that_stands_alone_has_no_facts_of_others():
     assert (model.plant, model.exact, model.parameters(problem.plant).tolist()) == (problem.plant, False, [1.0, 8.0])
     assert Telling().plant_model(problem).parameters(problem.plant).tolist() == [2.0, 8.0]
     assert fp.ExactModel(Telling()).plant_model(problem).parameters(problem.plant).tolist() == [2.0, 4.0]
-    assert alone.response(problem) is None
+    assert (alone.deforms, alone.response(problem)) == ("response", None)
     assert alone.notes(problem) == ()
     assert alone.inner_problem(problem) is problem
     alone.check(problem)
@@ -405,3 +408,87 @@ def test_a_jump_is_that_of_the_slope_between_the_limits():
     reference, limits = fp.Trajectory(lambda t: {"y": 4 * t**2}), fp.Limits(inputs={"u": (1.0, 3.0)})
     problem = fp.Problem(plant, reference, start={"y": 0.0}, period=PERIOD, duration=1.0, limits=limits)
     assert plan_demand(problem).change == pytest.approx(12.0)
+
+
+# What a plan is made for, and steps inside of others
+
+
+def test_a_plan_has_its_own_cost_margins_and_share_of_a_stage():
+    """Plans every 2 of the 5 cycles of a stage; without a horizon there is the cost alone."""
+    cost, margins = fp.Quadratic(states={"a": 3.0}), {"a'": (0.1,) * 4}
+    own, free = replace(PLANNER, cost=cost, margins=margins), masses(cost=fp.Quadratic(states={"a": 1.0}))
+    assert PLANNER.planned(free) is free
+    assert (own.planned(free).cost, own.planned(free).horizon) == (cost, None)
+    often, stage = (replace(free, horizon=fp.Horizon(stages=4, step=0.5, replan=r)) for r in (2, "stage"))
+    planned = own.planned(often).horizon
+    assert planned is not None
+    assert (planned.share, planned.margins, planned.measured) == (2 / 5, margins, ())
+    assert own.planned(often).cost is cost
+    assert PLANNER.planned(stage) is stage
+
+
+@pytest.mark.parametrize(
+    ("adapts", "disturbance", "consistent", "starts"),
+    [
+        (False, "", None, False),
+        (True, "", None, True),
+        (False, "w", None, True),
+        (True, "", False, False),
+        (False, "", True, True),
+    ],
+)
+def test_a_plan_starts_where_the_model_has_the_measured_outputs(adapts, disturbance, consistent, starts):
+    """Where the response is corrected, or it is asked for. Limits of what no output shows then hold for the measured state."""
+    plant = fp.Plant.of_states(
+        states={"angle": "rad", "speed": "rad/s"},
+        inputs={"u": "V"},
+        parameters={"a": fp.Parameter(0.7, 1.0, "1"), "w": fp.Parameter(0.1, 0.2, "rad/s^2")},
+        rates=lambda x, u, p: {"angle": p.a * x.speed, "speed": u.u - x.speed},
+        outputs={"y": fp.Output("rad", lambda x, p: x.angle, response_disturbance=disturbance)},
+    )
+    planner = replace(PLANNER, adapts=adapts, consistent=consistent)
+    assert planner.corrects(plant) == (adapts or bool(disturbance))
+    assert planner.starts_consistent(plant) == starts
+    assert not planner.starts_consistent(masses().plant)
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": 0 * t}),
+        start={"angle": 0.1, "speed": 0.0},
+        period=PERIOD,
+        duration=1.0,
+        horizon=fp.Horizon(stages=4, step=PERIOD),
+        cost=fp.Quadratic(outputs={"y": 1.0}),
+        limits=fp.Limits(states={"angle": (-1.0, 1.0), "speed": (-1.0, 1.0)}),
+    )
+    horizon = planner.planned(problem).horizon
+    assert horizon is not None
+    assert horizon.measured == (("speed",) if starts else ())
+
+
+def test_a_form_with_too_many_dead_times_is_refused():
+    """Two channels, three dead times."""
+    three = fp.ComputedTorque(TRACK, fp.Paired(fp.Affine(gain=-0.5), cycles=(1, 2, 3)))
+    with pytest.raises(NotSupported, match="3"):
+        check_form(masses(), three)
+
+
+def test_a_step_inside_another_one_is_given_other_signals_also_while_it_waits():
+    """The sum m + a + b, and m + 2 a + b while it waits; z in place of a."""
+    reads, memory = Layout((scalar("a"), scalar("b"))), Layout((scalar("m", start=1.0),))
+    waiting = Block("inside", reads, Layout(), lambda s: {"m_next": s.m + 2 * s.a + s.b}, memory)
+    block = Block("inside", reads, Layout(), lambda s: {"m_next": s.m + s.a + s.b}, memory, waits=waiting)
+    outer = embedded("outer", compose("inside", reads, [block]), {"a": scalar("z")})
+    for one in (outer, fed(block, "a", scalar("z"))):
+        assert one.waits is not None
+        assert one.reads.names == one.waits.reads.names == ("z", "b")
+        assert [float(v[0]) for v in cycle(one, z=3.0, b=0.5).values()] == [4.5]
+        assert [float(v[0]) for v in cycle(one.waits, z=3.0, b=0.5).values()] == [7.5]
+    assert fed(block, "d", scalar("z")) is block
+    assert embedded("outer", compose("inside", reads, [waiting]), {}).waits is None
+
+
+def test_a_reference_that_jumps_asks_for_its_largest_change_in_a_cycle():
+    """A set-point of 2 m through a filter of rate 3 and the plant's order: its response jumps by 3^2 x 2 m at once."""
+    aims = fp.Setpoint({"a": 2.0, "b": 0.0}, rate=3.0, order=2, start={"a": 0.0, "b": 0.0})
+    jump = replace(masses(), reference=aims, start={"a": 0.0, "b": 0.0})
+    assert reference_demand(jump).change == pytest.approx(18.0, rel=1e-9)

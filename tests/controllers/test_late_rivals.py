@@ -43,14 +43,6 @@ def left(result: fp.Run) -> float:
     return float(np.linalg.norm(result["estimate"][-1] - EXACT) / np.linalg.norm(FIRST - EXACT))
 
 
-@pytest.mark.parametrize("controller", [AID, NLMS, SLOTINE_LI_FPI], ids=["Lyapunov", "projection", "deformation"])
-def test_a_dead_time_of_zero_changes_no_bit(controller):
-    """Both are the controller without dead time."""
-    runs = [run(controller, late, duration=0.2) for late in (NONE, fp.DeadTime(inputs={"u": 0.0}))]
-    np.testing.assert_array_equal(runs[0]["command"], runs[1]["command"])
-    np.testing.assert_array_equal(runs[0]["estimate"], runs[1]["estimate"])
-
-
 def test_late_samples_teach_what_they_taught_at_once():
     """The learning block alone, given one motion at once and seven cycles late: the same estimates, seven cycles later."""
     late, problem = 7, task(rich, 0.1)

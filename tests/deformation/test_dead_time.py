@@ -99,21 +99,6 @@ SIGMOID = fp.Sigmoid(gain=-0.5, scale=2.0)
 LAW = fp.Exponential(rate=6.0)
 
 
-def test_no_dead_time_changes_no_bit():
-    """Zero delays, zero pairing, and prediction over nothing leave every signal as it is."""
-    plain = fp.simulate(TWO_MASS, fp.ComputedTorque(LAW, SIGMOID), seed=0, compiled=False)
-    zero = replace(TWO_MASS, dead_time=fp.DeadTime(inputs={"Q1": 0.0}, measurement=0.0))
-    others = {
-        "delay of zero": (zero, fp.ComputedTorque(LAW, SIGMOID)),
-        "paired": (TWO_MASS, fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=0))),
-        "predicted": (TWO_MASS, fp.Predicted(fp.ComputedTorque(LAW, SIGMOID), inputs=0.0)),
-    }
-    for name, (problem, controller) in others.items():
-        run = fp.simulate(problem, controller, seed=0, compiled=False)
-        for signal in ("state", "desired", "deformed", "command"):
-            np.testing.assert_array_equal(run[signal], plain[signal], err_msg=f"{name}: {signal}")
-
-
 def test_inputs_arrive_when_they_should():
     """Each input has its own delay; a fraction of a cycle is interpolated; queues begin with zero commands."""
     delayed = replace(TWO_MASS, dead_time=fp.DeadTime(inputs={"Q1": 3.25e-3, "Q2": 2e-3}))

@@ -166,15 +166,6 @@ def test_a_warm_start_is_what_the_plan_foresees_on_the_next_stages(name, replan)
     np.testing.assert_allclose(moved[layout.slice("plan_inputs")], inputs[place].mean(axis=1), atol=2e-3)
 
 
-def test_stages_of_one_length_are_equal_stages():
-    """The same plans, whether the lengths are left out or are all one."""
-    one, other = (
-        fp.simulate(task(horizon=fp.Horizon(STAGES, STEP, lengths=lengths, replan="cycle")), planning(), seed=0)
-        for lengths in ((), (1.0,) * STAGES)
-    )
-    np.testing.assert_allclose(one["command"], other["command"], atol=1e-8)
-
-
 @pytest.mark.parametrize(
     "lengths", [(1.0, 2.0), (2.0,) * STAGES, (1.0, 0.5, 1.0, 1.0, 1.0, 1.0), (1.0,) * 5 + (np.inf,)]
 )

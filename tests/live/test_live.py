@@ -71,13 +71,6 @@ def test_a_changed_loop_is_the_rebuilt_one_bit_by_bit(compiled):
             assert equal_to_rounding(one, other) if compiled else np.array_equal(one, other)
 
 
-def test_the_numbers_of_the_build_give_the_loop_without_live_settings():
-    """Nothing but the place of a number changes."""
-    for controller, paths in ((TORQUE, FOUR), (PLANNED, FIVE)):
-        live, plain = (simulator(PROBLEM, controller, live=p).run(seed=0) for p in (paths, ()))
-        assert equal_to_rounding(live.log, plain.log) if controller is PLANNED else np.array_equal(live.log, plain.log)
-
-
 def equal_to_rounding(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether every column agrees to 1e-12 of its size; the residual of a converged plan is rounding itself."""
     return bool((np.abs(one - other).max(axis=0) <= 1e-12 * np.maximum(np.abs(other).max(axis=0), 1.0)).all())

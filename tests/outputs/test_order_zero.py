@@ -252,16 +252,6 @@ def test_an_output_of_order_zero_may_be_judged_beside_a_controlled_one() -> None
         simulated(planned, fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-3)))
 
 
-def test_computed_torque_of_order_zero_is_the_cascade() -> None:
-    """A chain of length zero leaves the reference alone, so the model-referenced form is the cascade without a lag."""
-    pure = fp.Exponential(rate=1.0, integral=False)
-    run = simulated(heated(element()), fp.ComputedTorque(pure, fp.ModelReferenced(affine(0.4))))
-    cascade = simulated(heated(element()), fp.Cascade(STATIC, affine(0.4)))
-    assert run["command"] == pytest.approx(cascade["command"], rel=1e-9)
-    plain = simulated(heated(element()), fp.ComputedTorque(pure))
-    assert plain["command"] == pytest.approx(simulated(heated(element()), STATIC)["command"], rel=1e-12)
-
-
 def test_the_integral_of_order_zero_removes_a_constant_error() -> None:
     """The law is y^N + rate e_int with measured errors: e_{k+1} = e_k - J rate T e_{k-1}."""
     problem = heated(element(), reference=fp.Trajectory(lambda t: {"power": 200.0 + 0 * t}), start={"theta": 100.0})

@@ -10,7 +10,6 @@ from test_outputs import arm, circle, hill, sedated, simulated
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
-from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem, NotSupported
 
 ON_DEPTH: dict[str, tuple[Controller, float]] = {
@@ -46,16 +45,6 @@ def test_an_increment_by_hand_on_the_hand_of_an_arm() -> None:
     change = run["desired"][k] - run["realised"][k]
     request = respond(x, u, p).full().ravel() + change - problem.period * drift
     assert np.allclose(run["command"][k], plant.equations.inverse(x, request, p).full().ravel(), atol=1e-6)
-
-
-@pytest.mark.parametrize("deformation", [fp.Identity(), fp.Affine(-1.0)])
-def test_one_slot_for_the_whole_run_is_computed_torque(deformation: Deformation) -> None:
-    """A slot follows the measured output, so the model's curve has no part in its error."""
-    problem, law = sedated(hill(5.5), input_before={"u": 1.5}), fp.Exponential(rate=1.0, integral=False)
-    slot = fp.Slot("depth", law, deformation)
-    slots = fp.Slotted((slot,), fp.FixedSchedule([("depth", 0.0, problem.duration)]), blend=0.0)
-    one, other = (simulated(problem, c)["command"] for c in (slots, fp.ComputedTorque(law, deformation)))
-    assert np.allclose(one, other, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["AID", "Slotine-Li"])

@@ -18,8 +18,6 @@ import pytest
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, NotInvertible, NotSupported
-from fpirhc.review.grid import review_grid
-from fpirhc.review.loops import loops_along
 from fpirhc.review.review import predict
 from fpirhc.simulation.loop import close_loop
 
@@ -89,16 +87,6 @@ def by_states() -> fp.Plant:
         rates=rates,
         outputs={"q1": fp.Output("m", lambda x, p: x.q1), "q2": fp.Output("m", lambda x, p: x.q2)},
     )
-
-
-@pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC+FPI"])
-def test_a_plant_that_is_written_by_its_states_is_the_plant(name: str) -> None:
-    start = {"q1": 2.2, "q2": 5.4, "v1": 0.0, "v2": 0.0}
-    states = replace(on_outputs(SHORT), plant=by_states(), start=start)
-    one, other = (simulated(p, TWO_MASS.controllers[name]) for p in (SHORT, states))
-    assert tuple(states.plant.chains.values()) == (2, 2)
-    assert np.abs(one["state"] - other["state"]).max() <= 1e-12
-    assert np.abs(one["command"] - other["command"]).max() <= 1e-8
 
 
 ARM = {"l1": 0.5, "l2": 0.4}  # m
@@ -484,15 +472,6 @@ def test_the_patients_kinetics_conserve_the_drug() -> None:
 
 
 # Reviews
-
-
-def test_the_linear_loop_of_an_output_is_that_of_the_plant_whose_coordinate_it_is() -> None:
-    """Where the plant hardly moves: on the way there poles of a moment depend on the coordinates, because these turn as well."""
-    controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(-0.6))
-    one, other = (loops_along(review_grid(sedated(p), 0.0, 0), controller) for p in (hill(4.0), by_hand(4.0)))
-    assert one.loops
-    assert np.allclose(one.radii[3:], other.radii[3:], atol=1e-4)
-    assert np.allclose(one.radii, other.radii, atol=2e-3)
 
 
 @pytest.mark.parametrize(("gain", "verdict"), [(-1.5, "yes"), (-6.0, "no")])

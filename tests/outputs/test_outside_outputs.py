@@ -45,14 +45,6 @@ def rising(t: Any) -> Any:
     return 293 - 3 * ca.exp(-t / 50)
 
 
-@pytest.mark.parametrize("form", [fp.Identity(), fp.ModelReferenced(fp.Affine(-1.0))])
-def test_a_signal_beside_an_output_that_is_a_coordinate_changes_no_signal(form: Any) -> None:
-    controller = fp.ComputedTorque(fp.Exponential(rate=0.05), form)
-    plants = room(), room(outputs={"T": fp.Output("K", lambda q, p: q.T)})
-    one, other = (fp.simulate(heated(p, "T", rising), controller, seed=0, compiled=False) for p in plants)
-    assert [n for n in one.layout.names if not np.array_equal(one[n], other[n])] == []
-
-
 def test_an_output_of_order_zero_may_depend_on_a_signal() -> None:
     """The loss of heat k (T - ambient) + u / 10: the signal of the cycle is in the response, and no derivative of it."""
     loss = fp.Output("W", lambda q, u, p: p.k * (q.T - p.ambient) + u.u / 10)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_outputs import ARM, SHORT, TRACK, TWO_MASS, arm, circle, curve, hill, on_outputs, planned, sedated, simulated
+from test_outputs import ARM, TRACK, arm, circle, curve, hill, planned, sedated, simulated
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
@@ -95,15 +95,6 @@ def test_the_predicted_response_error_is_that_of_a_run() -> None:
     assert prediction.rms(prediction.without)["depth"] == pytest.approx(rms, rel=0.25)
     assert prediction.helps
     assert "tube" in prediction.reason
-
-
-def test_the_answers_about_outputs_that_are_coordinates_are_those_about_coordinates() -> None:
-    start = {"q1": 2.2, "q2": 5.4, "q1'": 0.6, "q2'": 0.9}
-    plain = replace(SHORT, start=start, cost=None, horizon=None)
-    controller = TWO_MASS.controllers["CTC+FPI (eq 6)"]
-    one, other = (answers(p, controller) for p in (plain, on_outputs(replace(plain, cost=SHORT.cost))))
-    for question in one:
-        assert str(other[question].verdict) == str(one[question].verdict), question
 
 
 def test_the_start_off_the_reference_asks_for_a_fast_map() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -94,20 +93,6 @@ def test_believed_states_have_a_twin():
     right = task(fp.PositionDifference(), sensing=sensing, exact=True)
     one, other = run(right, PLAIN), run(right, referenced(right))
     np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
-
-
-def test_an_output_that_is_a_coordinate_has_the_twin_of_the_coordinate():
-    """Two ways to a twin of the same plant: the same motion, to the order of the period."""
-    inner = replace(arm(), outputs={})
-    settings: dict[str, Any] = {"reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(2 * t)}), "duration": 1.0}
-    named = replace(inner, outputs={"q": fp.Output("rad", lambda q, v, p: q.q)})
-    runs = []
-    for plant in (inner, named):
-        problem = task(fp.PositionDifference(), plant=plant, **settings)
-        runs.append(run(problem, referenced(problem)))
-    assert np.abs(runs[1]["state"] - runs[0]["plant_state"]).max() < 2e-3 * np.abs(runs[0]["plant_state"]).max()
-    both = [np.abs(r["true_error"][500:]).max() for r in runs]
-    assert both[1] == pytest.approx(both[0], rel=0.05)
 
 
 def test_under_a_prediction_the_twin_sees_what_is_measured():

@@ -128,15 +128,6 @@ def test_it_moves_as_scipy_says():
     np.testing.assert_allclose(result["output.bis"], 93 / (1 + (np.array(states)[:, 3] / 4.1) ** 1.36), rtol=2e-6)
 
 
-def test_states_under_other_names_change_nothing():
-    """The model's own equations as reality, with names that the model does not have: the same signals as with its names."""
-    sensing = {"start": {"c": 1.5, "e": 1.4}, "duration": 3.0}
-    same = run(task(reality=fp.Reality(model()), **sensing), PLAN)
-    renamed = run(task(reality=fp.Reality(model("a", "b"), start={"a": 1.5, "b": 1.4}), **sensing), PLAN)
-    for name in set(renamed.layout.names) & set(same.layout.names):
-        np.testing.assert_array_equal(renamed[name], same[name], err_msg=name)
-
-
 def arm() -> fp.Plant:
     """A rigid arm whose output is the angle of its joint."""
     return fp.Plant(

@@ -147,23 +147,6 @@ def test_a_late_measured_state_begins_where_the_reality_does() -> None:
 TWO_MASS = fp.load_problem("two_mass")
 
 
-@pytest.mark.parametrize("name", ["CTC", "CTC+FPI (eq 6)"])
-def test_outputs_that_are_coordinates_and_known_change_no_signal(name: str) -> None:
-    """All states follow from the measured positions: the observer has nothing to add, bit by bit."""
-    problem = replace(
-        TWO_MASS.problem, duration=0.2, measure_from=0.1, horizon=None, cost=None,
-        sensing=fp.Sensing({"q1": fp.Sensor(noise=fp.Noise(1e-6))}, fp.PositionDifference()),
-    )  # fmt: skip
-    same = {"q1": fp.Output("m", lambda q, v, p: q.q1), "q2": fp.Output("m", lambda q, v, p: q.q2)}
-    believed = replace(problem.sensing, measured=["q1", "q2"], observer=fp.ModelStates())
-    outputs = replace(problem, plant=replace(problem.plant, outputs=same), sensing=believed)
-    law = fp.ComputedTorque(fp.Exponential(6.0), fp.Affine(-0.05) if "FPI" in name else fp.Identity())
-    plain, other = (run(p, law, seed=1) for p in (problem, outputs))
-    assert outputs.sensing.known(outputs.plant) == outputs.plant.state.elements
-    for signal in ("state", "realised", "command", "true_error"):
-        assert np.array_equal(plain[signal], other[signal]), signal
-
-
 def test_a_reality_shows_its_output_and_starts_elsewhere_than_the_observer() -> None:
     """The real patient starts with other levels; the filter finds them from the depth, the model alone does not."""
     first = {"C": 2.5, "R": 0.5, "E": 2.5}
