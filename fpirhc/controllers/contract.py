@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 import casadi as ca
@@ -255,12 +255,13 @@ class Controller(Checked, ABC):
 
     def with_defaults(self, problem: Problem) -> Self:
         """Return the controller with the numbers chosen that it leaves to the problem; what it wraps has its own already."""
-        deformation = self.deformation
-        if not automatic(deformation):
-            return self
-        where = problem if self.inner is None else self.inner_problem(problem)
-        demand = reference_demand(where, tracking_law(self)) if self.planner is None else plan_demand(where)
-        return self.with_deformation(deformation.suited(demand))
+        own = self.deformation
+        deformation = _late(own, problem)
+        if automatic(deformation):
+            where = problem if self.inner is None else self.inner_problem(problem)
+            demand = reference_demand(where, tracking_law(self)) if self.planner is None else plan_demand(where)
+            deformation = deformation.suited(demand)
+        return self if deformation is own else self.with_deformation(deformation)
 
     def response(self, problem: Problem) -> Response | None:
         """Return the response that the controller reads as 'realised'; None: that of the plant's controlled coordinates."""
@@ -274,6 +275,35 @@ class Controller(Checked, ABC):
         """Raise if the controller cannot serve the problem."""
         if self.inner is not None:
             self.inner.check(self.inner_problem(problem))
+
+
+def with_lateness(problem: Problem, controller: Controller) -> Controller:
+    """Return the controller whose deformation believes the problem's dead times, and an external plant's lag, where it is open."""
+    own = controller.deformation
+    told = _late(own, problem)
+    return controller if told is own else controller.with_deformation(told)
+
+
+def _late(deformation: Deformation, problem: Problem) -> Deformation:
+    """The deformation with open dead times and lags filled in; inputs that are not one per coordinate have the longest one."""
+    if deformation.inner is not None:
+        inner = _late(deformation.inner, problem)
+        deformation = deformation if inner is deformation.inner else with_inner(deformation, inner)
+    if not is_dataclass(deformation):
+        return deformation
+    lags, inputs = problem.foreign.lag if problem.foreign is not None else {}, tuple(problem.plant.inputs)
+    times = problem.dead_time.inputs
+    known = {
+        "cycles": [nominal(times.get(name, 0.0)) / problem.period for name in inputs],
+        "lag": [lags.get(name, 0.0) for name in inputs],
+    }
+    left_open = [
+        f.name for f in fields(deformation) if f.metadata.get("of_problem") and getattr(deformation, f.name) is None
+    ]
+    square = len(inputs) == len(problem.plant.controlled_names)
+    late = [name for name in left_open if any(known[name])]
+    values = {n: tuple(known[n]) if square and len({*known[n]}) > 1 else max(known[n]) for n in late}
+    return replace(deformation, **values) if values else deformation
 
 
 def resolved(problem: Problem, controller: Controller) -> Controller:

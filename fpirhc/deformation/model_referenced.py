@@ -46,10 +46,10 @@ class ModelReferenced(Wrapper):
     Args:
         map: any deformation that iterates; wrappers that change the gain or the error go inside: ModelReferenced(Filtered(map)).
         cycles: believed dead time d of the inputs, in control cycles beyond the one that every loop has; a tuple gives every
-            input its own, and then input k belongs to controlled coordinate k.
+            input its own, and then input k belongs to controlled coordinate k. None: that of the problem.
         measurement: believed dead time of the measurement, in cycles.
         lag: believed time constant of the actuators, tau u_act' = u - u_act, s; a tuple gives one per input. Too long a lag is
-            nearly harmless, too short a lag is not, and no lag is worst.
+            nearly harmless, too short a lag is not, and no lag is worst. None: what an external plant states, else 0.
         uncertainty: by how many cycles the sum of the dead times may be wrong; None: the default of `Increment`.
         pole: of the leak, in [0, 1); None: from the uncertainty, as in `Increment`.
         longest: longest dead time of the inputs that a run may set, `live=["deformation.cycles"]`; None: twice the dead time.
@@ -58,19 +58,19 @@ class ModelReferenced(Wrapper):
         InvalidValue: a dead time, lag, uncertainty or pole out of range.
     """
 
-    cycles: Cycles = 0.0
+    cycles: Cycles | None = field(default=None, metadata={"of_problem": True})
     measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle
-    lag: float | tuple[float, ...] = 0.0
+    lag: float | tuple[float, ...] | None = field(default=None, metadata={"of_problem": True})
     uncertainty: int | None = None
     pole: float | None = None
     longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
-        check_longest("ModelReferenced", self.longest, self.cycles)
-        check_cycles("ModelReferenced", self.cycles)
+        check_longest("ModelReferenced", self.longest, self._cycles)
+        check_cycles("ModelReferenced", self._cycles)
         check_cycles("ModelReferenced", self.measurement, "measurement")
         check_cycles("ModelReferenced", self._delays)
-        taus = every(self.lag)
+        taus = every(self._lag)
         if not taus or not all(finite_number(t) and t >= 0 for t in taus):
             raise InvalidValue(
                 f"ModelReferenced(lag={self.lag!r}): expected a time constant of at least 0 s, or a tuple with one per input"
@@ -83,23 +83,25 @@ class ModelReferenced(Wrapper):
     @property
     def mirror(self) -> Mirror:
         """The believed dead times and lag between a command and its response."""
-        return Mirror(self.cycles, self.measurement, self.lag, self.longest)
+        return Mirror(self._cycles, self.measurement, self._lag, self.longest)
 
     def opened(self, paths: tuple[str, ...]) -> Self:
         """Return it with queues of twice the dead time where that becomes live and no longest one is stated."""
         live = any(path.startswith("cycles") for path in paths)
-        return replace(self, longest=max(1.0, room(max(every(self.cycles))))) if live and self.longest is None else self
+        return (
+            replace(self, longest=max(1.0, room(max(every(self._cycles))))) if live and self.longest is None else self
+        )
 
     @property
     def iteration(self) -> Iteration:
         """That of the map, on deformations that leak and are paired; the desired response is added after it."""
-        longest, several_channels = max(every(nominal(self._delays))), isinstance(self.cycles, tuple)
+        longest, several_channels = max(every(nominal(self._delays))), isinstance(self._cycles, tuple)
         return replace(
             self.map.iteration,
             slows_desired=False,
             leak=self._leak,
             pairing=Pairing(longest, channels=several(self._delays)) if longest else None,
-            channels=len(every(self.cycles)) if several_channels else self.map.iteration.channels,
+            channels=len(every(self._cycles)) if several_channels else self.map.iteration.channels,
         )
 
     @property
@@ -133,9 +135,16 @@ class ModelReferenced(Wrapper):
 
     @property
     def _delays(self) -> Cycles:
-        if isinstance(self.cycles, tuple):
-            return tuple(c + self.measurement for c in self.cycles)
-        return self.cycles + self.measurement
+        cycles = self._cycles
+        return tuple(c + self.measurement for c in cycles) if isinstance(cycles, tuple) else cycles + self.measurement
+
+    @property
+    def _cycles(self) -> Cycles:
+        return 0.0 if self.cycles is None else self.cycles
+
+    @property
+    def _lag(self) -> float | tuple[float, ...]:
+        return 0.0 if self.lag is None else self.lag
 
     @property
     def _queue(self) -> Queue:

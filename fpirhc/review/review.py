@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from fpirhc.broken import attempted
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, resolved
+from fpirhc.controllers.contract import checked, resolved, with_lateness
 from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -18,6 +18,7 @@ from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, asked, known_questions
 from fpirhc.review.questions.convergence import CONVERGES
 from fpirhc.review.schedule import schedule_stable
+from fpirhc.simulation.model_as_plant import behind_stated_lag
 from fpirhc.task.problem import Problem
 
 
@@ -37,7 +38,8 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
         InvalidProblem: a range that leaves physical bounds.
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    grid = review_grid(problem, mismatch, seed)
+    controllers = {name: with_lateness(problem, one) for name, one in controllers.items()}
+    grid = review_grid(behind_stated_lag(problem), mismatch, seed)
     general = _present(asked(question, grid) for question in known_questions(ProblemQuestion))
     runs = NominalRuns(grid.problem)
     answers = {name: _of(grid, one, general, runs) for name, one in controllers.items()}
@@ -51,7 +53,8 @@ def predict(problem: Problem, controller: Controller) -> Answer:
         NotInvertible: see `review`.
         FpirhcError: every error that the controller raises about the problem.
     """
-    grid = review_grid(problem, 0.0, 0)
+    controller = with_lateness(problem, controller)
+    grid = review_grid(behind_stated_lag(problem), 0.0, 0)
     grid = replace(grid, draws=grid.draws[:1])  # the box does not matter
     ready = resolved(grid.problem, controller)
     general = _present(asked(question, grid) for question in known_questions(ProblemQuestion) if question.doubts)

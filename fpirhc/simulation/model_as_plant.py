@@ -44,8 +44,19 @@ def _with_dead_time(problem: Problem, mirror: Mirror) -> Problem:
     return replace(problem, dead_time=DeadTime(inputs=inputs, measurement=mirror.measurement * problem.period))
 
 
+def behind_stated_lag(problem: Problem) -> Problem:
+    """Return the problem whose reality is the model behind the lags that an external plant states; itself where it states none."""
+    outside = problem.foreign
+    if outside is None or not any(outside.lag.values()):
+        return problem
+    return _behind(problem.of_model, tuple(outside.lag.get(name, 0.0) for name in problem.plant.inputs))
+
+
 def _with_lag(problem: Problem, mirror: Mirror) -> Problem:
-    lags = _each(mirror.lag, len(problem.plant.inputs))
+    return _behind(problem, _each(mirror.lag, len(problem.plant.inputs)))
+
+
+def _behind(problem: Problem, lags: Sequence[float]) -> Problem:
     if not any(lags):
         return problem
     try:

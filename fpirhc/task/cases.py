@@ -154,13 +154,29 @@ class Cases(Checked):
         except FpirhcError as error:
             raise InvalidProblem(f"{self._place(name)}: {error}") from None
 
-    def key(self, name: str) -> tuple[object, ...]:
-        """Return what decides the build of a case; cases with equal keys have one build."""
+    def key(self, name: str, data: Container[str] = ()) -> tuple[object, ...]:
+        """Return what decides the build of a case; cases with equal keys have one build.
+
+        Args:
+            name: of the case.
+            data: paths whose contents are data of the build.
+        """
         return tuple(
             (path, value if isinstance(value, int | float | str) else id(value))
             for path, value in sorted(self.changes[name].items())
-            if path not in (_GROUP, _SEED) and not path.startswith(f"{_EXACT}.")
+            if path not in (_GROUP, _SEED) and path not in data and not path.startswith(f"{_EXACT}.")
         )
+
+    def numbers(self, problem: Problem) -> tuple[str, ...]:
+        """Return the paths of numbers of the problem, or of intervals, that some case changes and that may be live.
+
+        A dead time may where the problem states its longest one.
+        """
+        paths = dict.fromkeys(path for changes in self.changes.values() for path in changes)
+        inside = [path for path in paths if "." in path and _word(path) not in _WORDS]
+        queued = problem.dead_time.longest
+        roomy = [path for path in inside if _word(path) != "dead_time" or path.rpartition(".")[2] in queued]
+        return tuple(path for path in roomy if _finite(_content(problem, path)))
 
     def check(self, problem: Problem, names: Sequence[str] | None = None) -> None:
         """Raise where a path or a number does not fit the problem.
@@ -306,6 +322,17 @@ def _check_name(what: str, name: str, valid: Iterable[str]) -> None:
     names = list(valid)
     if name not in names:
         raise InvalidName(f"{what}, and there is no '{name}'.{nearest(name, names)}")
+
+
+def _content(problem: Problem, path: str) -> object:
+    try:
+        return content_at(problem, path, "the problem")
+    except InvalidName:
+        return None
+
+
+def _finite(content: object) -> bool:
+    return all(map(finite_number, content)) if isinstance(content, tuple) else finite_number(content)
 
 
 def _check_number(value: object, bounds: tuple[float, float] | None = None, unit: str = "") -> None:

@@ -74,6 +74,7 @@ class ExternalPlant(Checked):
         clock: function that returns the wall time, s.
         dead_time: by input, in the model's unit of time: how late the body acts. Controllers and reviews know it as that of the
             problem; the body has it already, so it is not simulated.
+        lag: by input, in the model's unit of time: the time constant with which the body follows a command. As `dead_time`.
         make: function (parameters, seed) -> body, called before every reset with the exact values of `parameters` by name.
         parameters: of the body. Scenarios draw their exact values as those of a plant; a controller knows none of them.
 
@@ -88,6 +89,7 @@ class ExternalPlant(Checked):
     reset_deadline: Positive = 10.0
     clock: Callable[[], float] = field(default=wall.perf_counter, metadata={"setting": False})
     dead_time: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
+    lag: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
 
     make: Make | None = field(default=None, metadata={"setting": False})
     parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
@@ -153,6 +155,9 @@ class ExternalPlant(Checked):
         mistakes = Mistakes("reality")
         units = quantities(model)
         mistakes.unknown("measures: quantity", self.measures, units)
+        mistakes.unknown("lag: input", self.lag, model.inputs)
+        for name in (name for name, tau in self.lag.items() if not (finite_number(tau) and tau >= 0)):
+            mistakes.add(f"lag of {name} is {self.lag[name]!r}; expected a time of at least 0 {model.time_unit}")
         for name in needed:
             if name not in self.measures:
                 mistakes.add(

@@ -230,7 +230,7 @@ def test_scenarios_share_one_loop_for_all_dead_times():
     task = replace(LATE, problem=problem, controllers={name: LATE.controllers[name] for name in names})
     conditions = Conditions(3, COMPARING, 20.0, compiled=False)
     shared, apart = Bench(task, conditions), Bench(task, conditions)
-    apart._shared = dict.fromkeys(names)
+    apart._shared = {(name, None): None for name in names}
     for name in names:
         records = [shared.record(number, name) for number in range(6)]
         assert records == [apart.record(number, name) for number in range(6)]

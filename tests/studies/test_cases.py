@@ -82,9 +82,26 @@ def test_the_run_of_a_case_is_that_of_its_problem(task):
             run = fp.simulate(problem, task.controllers[controller], seed=seed, compiled=False)
             assert record["metrics"]["rms_error"] == fp.measure(problem, run).values["rms_error"]
     loops = {id(one) for (owner, _), one in bench._simulators.items() if owner == "CTC"}
-    assert (
-        len(loops) == len(task.cases.names) - 2
-    )  # 'weak' and 'stiff' have the loop of 'usual': exact parameters are data
+    # 'weak', 'stiff' and 'narrow' have the loop of 'usual': exact parameters and limits are data.
+    assert len(loops) == len(task.cases.names) - 3
+
+
+def test_dead_times_are_data_where_the_longest_is_stated(task):
+    """'late' has the loop of 'usual' then, and the run of its problem."""
+    roomy = fp.DeadTime(measurement=0.0, longest={"measurement": 0.02})
+    task = replace(task, problem=replace(task.problem, dead_time=roomy))
+    bench = Bench(task, Conditions(3, COMPARING, 0.0, compiled=False, named=True))
+    records = {name: bench.record(task.cases.names.index(name), "CTC") for name in ("usual", "late")}
+    assert len({id(one) for one in bench._simulators.values()}) == 1
+    number = task.cases.names.index("late")
+    alone = fp.simulate(
+        task.cases.problem("late", task.problem),
+        task.controllers["CTC"],
+        seed=bench._scenario(number).seed,
+        compiled=False,
+    )
+    assert records["late"]["metrics"]["rms_error"] == fp.measure(task.problem, alone).values["rms_error"]
+    assert records["late"]["metrics"]["rms_error"] != records["usual"]["metrics"]["rms_error"]
 
 
 def test_the_seed_of_a_case_is_its_own_or_the_studys(task):

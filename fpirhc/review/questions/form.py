@@ -89,7 +89,7 @@ def forms_of(problem: Problem, deformation: Deformation) -> dict[str, Deformatio
     return {
         **forms,
         INCREMENT: Increment(map_, cycles=sums),
-        REFERENCED: ModelReferenced(map_, cycles=cycles, measurement=measurement),
+        REFERENCED: ModelReferenced(map_, cycles=cycles or None, measurement=measurement),
     }
 
 

@@ -23,7 +23,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios
+from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
 from fpirhc.task.problem import Problem
 
 FORMAT = 4  # of records
@@ -102,7 +102,7 @@ class Bench:
         self._scenarios = scenarios(task, conditions)
         self._ranges = ranges(task.problem)
         self._simulators: dict[tuple[str, object], Simulator | FpirhcError] = {}
-        self._shared: dict[str, Simulator | None] = {}
+        self._shared: dict[tuple[str, object], Simulator | None] = {}
         self._last: tuple[int, Scenario] | None = None
 
     def record(self, number: int, name: str, settings: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class Bench:
         key = name, scenario.build
         ready = self._simulators.get(key)
         if ready is None or (isinstance(ready, Simulator) and ready.remembers):
-            ready = self._simulators[key] = self._built(name, scenario.built)
+            ready = self._simulators[key] = self._built(name, scenario)
         if isinstance(ready, FpirhcError):
             raise ready
         return ready
@@ -154,31 +154,30 @@ class Bench:
             return True
         return False
 
-    def _built(self, name: str, problem: Problem) -> Simulator | FpirhcError:
+    def _built(self, name: str, scenario: Scenario) -> Simulator | FpirhcError:
         live, compiled = self._live.get(name, ()), self._conditions.compiled
         compile_it = compiled if compiled is not None else bool(live)
         try:
             controller = self._scenarios.automatic(self._task.controllers[name])
-            shared = self._for_all(name, controller, compile_it)
+            shared = self._shared_loop(name, controller, scenario.shared, compile_it) if scenario.shared else None
             if shared is not None:
-                checked(problem, controller)
+                checked(scenario.built, controller)
                 return shared
-            return simulator(problem, controller, compiled=compile_it, live=live)
+            return simulator(scenario.built, controller, compiled=compile_it, live=live)
         except FpirhcError as error:
             return error
 
-    def _for_all(self, name: str, controller: Controller, compile_it: bool) -> Simulator | None:
-        """One loop for all scenarios; None where there is none."""
-        if self._scenarios.for_all is None:
-            return None
-        if name not in self._shared:
-            problem, paths = self._scenarios.for_all
+    def _shared_loop(self, name: str, controller: Controller, shared: Shared, compile_it: bool) -> Simulator | None:
+        """The loop that serves more scenarios; None where it cannot be built with these live settings."""
+        key = name, shared.key
+        if key not in self._shared:
+            live = (*self._live.get(name, ()), *shared.live)
             try:
-                ready = simulator(problem, controller, compiled=compile_it, live=(*self._live.get(name, ()), *paths))
-                self._shared[name] = None if ready.remembers else ready
+                ready = simulator(shared.built, controller, compiled=compile_it, live=live)
+                self._shared[key] = None if ready.remembers else ready
             except FpirhcError:  # what is wrong in every scenario is said by the loops of their own
-                self._shared[name] = None
-        return self._shared[name]
+                self._shared[key] = None
+        return self._shared[key]
 
 
 def scenarios(task: Task, conditions: Conditions) -> Scenarios:

@@ -89,6 +89,7 @@ class Scenario:
         build: what decides the loop; scenarios with equal ones have one.
         built: the problem for which the loop is built.
         problem: the same with the scenario's exact parameters.
+        shared: what decides a loop with live settings that serves more scenarios; None: there is none.
     """
 
     name: str
@@ -98,6 +99,22 @@ class Scenario:
     build: object
     built: Problem
     problem: Problem
+    shared: Shared | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """A loop that serves several scenarios, because numbers in which they differ are live.
+
+    Args:
+        key: scenarios with equal ones have one loop.
+        built: the problem for which it is built.
+        live: paths of its live settings; the scenario's problem has their numbers.
+    """
+
+    key: object
+    built: Problem
+    live: tuple[str, ...]
 
 
 class Scenarios(ABC):
@@ -110,11 +127,6 @@ class Scenarios(ABC):
     def automatic(self, controller: Controller) -> Controller:
         """Return the controller with those settings that it has whatever the scenario is."""
         return controller
-
-    @property
-    def for_all(self) -> tuple[Problem, tuple[str, ...]] | None:
-        """A problem whose loop with these live settings serves every scenario; None where there is none."""
-        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,16 +157,17 @@ class RandomScenarios(Scenarios):
         one = draw(plant, number=number, model=self.of.plant, **facts)  # type: ignore[arg-type]  # of several types
         lateness = one.lateness if self._draws_dead_times else 0
         built = self._late[lateness]
-        return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, built.with_exact(one.exact))
+        problem = built.with_exact(one.exact)
+        return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, problem, self._shared)
 
     def automatic(self, controller: Controller) -> Controller:
         """Return the controller with the automatic settings for the problem's own dead times, whatever the plant's are."""
         return resolved(self.of, controller) if self._draws_dead_times else controller
 
     @cached_property
-    def for_all(self) -> tuple[Problem, tuple[str, ...]] | None:
-        """The problem with live dead times, where they are drawn."""
-        return (self._late[0], live_paths(self._late[0])) if self._draws_dead_times else None
+    def _shared(self) -> Shared | None:
+        """The loop with live dead times, where they are drawn."""
+        return Shared(None, self._late[0], live_paths(self._late[0])) if self._draws_dead_times else None
 
     @cached_property
     def _draws_dead_times(self) -> bool:
@@ -184,6 +197,7 @@ class NamedCases(Scenarios):
     of: Problem
     seed: int
     _built: dict[object, Problem] = field(default_factory=dict, init=False)
+    _shared_builds: dict[object, Problem] = field(default_factory=dict, init=False)
 
     def __getitem__(self, number: int) -> Scenario:
         """Return the case at a place."""
@@ -197,4 +211,14 @@ class NamedCases(Scenarios):
         moved = problem.moved
         exact = np.array([one.exact for one in moved.parameters.values()])
         mismatch = _mismatch(problem.plant, moved, exact)
-        return Scenario(name, self.cases.group(name), seed if own is None else own, mismatch, key, built, problem)
+        group, seed = self.cases.group(name), seed if own is None else own
+        return Scenario(name, group, seed, mismatch, key, built, problem, self._shared(name, built))
+
+    def _shared(self, name: str, built: Problem) -> Shared | None:
+        """The loop in which the numbers that cases change are live."""
+        key = self.cases.key(name, self._live)
+        return Shared(key, self._shared_builds.setdefault(key, built), self._live) if self._live else None
+
+    @cached_property
+    def _live(self) -> tuple[str, ...]:
+        return self.cases.numbers(self.of)
