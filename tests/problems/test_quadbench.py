@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
-from importlib.machinery import SourceFileLoader
 from pathlib import Path
+from runpy import run_path
 
 import numpy as np
 import pytest
@@ -115,11 +115,11 @@ THEIRS |= {"force 0": 0.04961751, "force 1": 0.0371662, "force 2": 0.12900266}
 def test_incremental_inversion_here_is_the_benchmarks(task, beside, case):
     """Within 12 %: a tenth is what other motor noise does to it."""
     del beside
-    table = SourceFileLoader("quadbench_table", str(ROOT / "benchmarks" / "quadbench.py")).load_module()
+    table = run_path(str(ROOT / "benchmarks" / "quadbench.py"))
     problem = task.cases.problem(case, task.problem)
     told = {name: one.exact for name, one in problem.reality.parameters.items()}
     errors = [
-        np.sqrt(np.mean(table.Rival(told).distances(table.motion(problem), problem.cycles, seed) ** 2))
+        np.sqrt(np.mean(table["Rival"](told).distances(table["motion"](problem), problem.cycles, seed) ** 2))
         for seed in (0, 1)
     ]
     assert np.mean(errors) == pytest.approx(THEIRS[case], rel=0.12)
