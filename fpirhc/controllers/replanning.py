@@ -30,6 +30,7 @@ from fpirhc.plant.integrators import USUAL, motion_of
 from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -242,7 +243,9 @@ _LATEST: Latest[np.ndarray] = Latest(8)
 def built_first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
     """Return `first_memory` with the numbers of the build; the data are those of this horizon at this start."""
     start = problem.start_state.tobytes(), np.asarray(problem.inputs_before, dtype=float).tobytes()
-    memory = _LATEST.of((ocp, optimiser), start, lambda: first_memory(problem, optimiser, ocp, data_of))
+    memory = _LATEST.of(
+        (ocp, optimiser), (*start, plans_are_compiled()), lambda: first_memory(problem, optimiser, ocp, data_of)
+    )
     return memory.copy()
 
 

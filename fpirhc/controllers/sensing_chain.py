@@ -25,6 +25,7 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block, Composite, bridged
+from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.latest import Latest
@@ -43,7 +44,7 @@ def compose_seeing(problem: Problem, controller: Controller) -> Composite:
         problem: that the controller is composed for.
         controller: checked here against the problem.
     """
-    return _LATEST.of((problem, controller), (), lambda: _composed(problem, controller))
+    return _LATEST.of((problem, controller), (plans_are_compiled(),), lambda: _composed(problem, controller))
 
 
 def _composed(problem: Problem, controller: Controller) -> Composite:

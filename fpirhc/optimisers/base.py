@@ -26,6 +26,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.status import Status
+from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.expression import FINITE, Matrix, is_finite
 from fpirhc.symbolic.layout import Layout
 
@@ -134,7 +135,7 @@ _REMEDIES = {
 
 def built(optimiser: Optimiser, ocp: OptimalControl, form: Literal["step", "converging"]) -> ca.Function:
     """Return the Function `step` or `converging`, built once: horizons that differ in numbers of settings only share it."""
-    key = form, _Same(optimiser)
+    key = form, plans_are_compiled(), _Same(optimiser)
     if key not in ocp.functions:
         ocp.functions[key] = getattr(optimiser, form)(ocp.opened())
     return ocp.functions[key]

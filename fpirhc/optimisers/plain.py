@@ -28,11 +28,12 @@ from fpirhc.optimisers.search import (
     first_gamma,
 )
 from fpirhc.status import Status
-from fpirhc.symbolic.driver import Driver, with_driver
+from fpirhc.symbolic.driver import Driver, plans_are_compiled, registered, with_driver
 from fpirhc.symbolic.expression import FINITE, is_finite
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import LiveNumber, Number
+from fpirhc.symbolic.native import native
 
 MOST = 100  # iterations of one converging call
 _MOST_PLAIN = 30  # plain steps after which a converging call gives up
@@ -77,7 +78,18 @@ def plain_memory(ocp: OptimalControl) -> Layout:
 def plain_step(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:
     """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
     name = "fpirhc_fixed_point_converging" if settings.converging else "fpirhc_fixed_point"
-    return with_driver(name, plain_driver(ocp, settings), lambda unique: plain_graph(ocp, settings, unique))
+    driver = plain_driver(ocp, settings)
+    library = native(_outline(ocp, registered(name, driver))) if plans_are_compiled() else None
+    if library is not None and library.compiled:
+        return library.function
+    return with_driver(name, driver, lambda unique: plain_graph(ocp, settings, unique))
+
+
+def _outline(ocp: OptimalControl, name: str) -> ca.Function:
+    """A Function with the arguments and results of `plain_graph` and without its graph, for a library of the driver alone."""
+    arguments, memory = call_symbols(ocp)
+    sizes = (ocp.input.size, ocp.stages), (5, 1), memory.shape
+    return ca.Function(name, [*arguments, memory], [ca.MX.zeros(*size) for size in sizes])
 
 
 def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:

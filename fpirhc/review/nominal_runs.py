@@ -22,10 +22,12 @@ from fpirhc.simulation.error_pair import ErrorPair
 from fpirhc.simulation.model_as_plant import shortened, with_believed_way
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
+from fpirhc.simulation.trials import Trials
 from fpirhc.task.exogenous import as_known
 from fpirhc.task.problem import Problem
 
 CYCLES = 2000  # of a run
+TRIED = 1000  # cycles of a run that tries a form or a gain
 _ROUNDING = 1e-9  # of the reference's size
 
 Kept = TypeVar("Kept")
@@ -61,6 +63,19 @@ class NominalRuns:
         """
         bare = without_deformation(resolved(self.problem, controller))
         return self._once(("bare", identity(bare)), lambda: _run(self.problem, null_problem(self.problem, bare), bare))
+
+    def trials(self, problem: Problem, controller: Controller) -> Trials:
+        """Return runs of deformations beside the controller without its own, of at most `TRIED` cycles each.
+
+        Args:
+            problem: of the review, with its reality.
+            controller: resolved.
+
+        Raises:
+            FpirhcError: every error that the controller raises about the problem.
+        """
+        bare = without_deformation(controller)
+        return self._once(("trials", identity(bare)), lambda: Trials(problem, bare, cycles=TRIED, goes_on=True))
 
     def _once(self, name: Hashable, make: Callable[[], Kept]) -> Kept:
         """Return what `make` returns, made when this name is first asked for."""

@@ -37,9 +37,12 @@ from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
+
+_CALL = 25  # cycles of the recursion in one call
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,14 +140,22 @@ _ERRORS: Latest[ResponseErrors] = Latest(8)  # several questions ask for the sam
 
 
 def _errors(nominal: NominalRun, deformation: Deformation, exact: np.ndarray) -> ResponseErrors:
-    made = identity(deformation), nominal.cycles, nominal.believed.tobytes()
+    made = identity(deformation), nominal.believed.tobytes()
     step, run = _RECURSIONS.of((nominal.problem,), made, lambda: _recursion(nominal, deformation))
     reads, start = (nominal.states[:-1], nominal.desired, nominal.states[1:]), step.memory.start()
     if exact.size:  # an empty signal has one entry
         start[step.memory.slice("_exact")] = exact
-    log = np.asarray(run(start, *(rows.T for rows in reads))[1].full()).T
+    log = np.empty((-(-nominal.cycles // _CALL) * _CALL, step.trace.size))
+    run.arguments[0][:] = start
+    for at in range(0, nominal.cycles, _CALL):
+        for argument, rows in zip(run.arguments[1:], reads, strict=True):
+            some = rows[at : at + _CALL]
+            argument.reshape(_CALL, -1)[: len(some)] = some
+        run.redirect(1, log[at : at + _CALL])
+        run.evaluate()
+        run.arguments[0][:] = run.results[0].reshape(_CALL, -1)[-1]
     columns = ("response_error", "response_force", "command")
-    return ResponseErrors(*(log[:, step.trace.slice(name)] for name in columns))
+    return ResponseErrors(*(log[: nominal.cycles, step.trace.slice(name)] for name in columns))
 
 
 def errors_without_adaptation(nominal: NominalRun) -> ResponseErrors:
@@ -152,8 +163,8 @@ def errors_without_adaptation(nominal: NominalRun) -> ResponseErrors:
     return response_errors(nominal, deformation=Identity())
 
 
-def _recursion(nominal: NominalRun, deformation: Deformation) -> tuple[Composite, Any]:
-    """One cycle, (memory, state, desired, next state) -> (memory, trace), and all cycles; exact parameters are in the memory."""
+def _recursion(nominal: NominalRun, deformation: Deformation) -> tuple[Composite, Evaluator]:
+    """One cycle, (memory, state, desired, next state) -> (memory, trace), and `_CALL` of them."""
     plant = nominal.problem.plant
     closing, delays = closing_blocks(nominal.problem, deformation)
     reads = Layout((plant.state, plant.response_signal("desired"), like(plant.state, "_state_after")))
@@ -165,10 +176,12 @@ def _recursion(nominal: NominalRun, deformation: Deformation) -> tuple[Composite
     ]
     blocks = with_measured_state(plant, [_answer_block(plant), *closing, _judge_block(plant)])
     step = compose("prediction", reads, blocks, [*delays, *held])
-    return step, step.function.mapaccum(f"{step.function.name()}_run", nominal.cycles)
+    return step, Evaluator(step.function.mapaccum(f"{step.function.name()}_run", _CALL, {"base": 5}))
 
 
-_RECURSIONS: Latest[tuple[Composite, Any]] = Latest(8)  # with the exact parameters and with those of a right model
+_RECURSIONS: Latest[tuple[Composite, Evaluator]] = Latest(
+    8
+)  # with the exact parameters and with those of a right model
 
 
 def _answer_block(plant: Plant) -> Block:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pkgutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -19,7 +19,6 @@ import numpy as np
 from fpirhc.broken import attempted
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.review import questions
@@ -30,13 +29,12 @@ from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.prediction import NominalRun
 from fpirhc.review.spectra import spectrum_near
 from fpirhc.simulation.error_pair import ErrorPair
-from fpirhc.simulation.trials import Trials, harm_in
+from fpirhc.simulation.trials import harm_in
 from fpirhc.task.problem import Problem
 
 GROUP = "fpirhc.questions"  # of entry points
 
 Kind = TypeVar("Kind", "ProblemQuestion", "ControllerQuestion")
-TRIED = 1000  # cycles of a run that tries a form or a gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,20 +83,6 @@ class Case:
         return loops_by_gain(self.grid, self.controller, self.loops)
 
     @cached_property
-    def _trials(self) -> Trials:
-        return Trials(self.grid.real or self.problem, without_deformation(self.controller), cycles=TRIED)
-
-    @cached_property
-    def _later(self) -> Trials | None:
-        """Runs that go on where errors count; None where the short ones do."""
-        problem = self.grid.real or self.problem
-        if 2 * problem.measure_from <= TRIED * problem.period:
-            return None
-        end = min(problem.duration, problem.measure_from + TRIED * problem.period)
-        problem = replace(problem, duration=end)
-        return Trials(problem, without_deformation(self.controller), cycles=problem.cycles)
-
-    @cached_property
     def _tried(self) -> dict[str, tuple[ErrorPair | None, ErrorPair] | str]:
         return {}
 
@@ -108,10 +92,8 @@ class Case:
         if name not in self._tried:
             try:
                 controller = self.controller.with_deformation(deformation)
-                found = self._trials.errors(controller)
-                if found[0] is not None and not found[0].passes and self._later:  # may be an error of the start alone
-                    found = self._later.on_plant(controller), found[1]
-                self._tried[name] = found
+                trials = self.runs.trials(self.grid.real or self.problem, self.controller)
+                self._tried[name] = trials.errors(controller)
             except FpirhcError as error:
                 self._tried[name] = f"it cannot be tried ({error})"
         return self._tried[name]

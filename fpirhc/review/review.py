@@ -19,6 +19,7 @@ from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, as
 from fpirhc.review.questions.convergence import CONVERGES
 from fpirhc.review.schedule import schedule_stable
 from fpirhc.simulation.model_as_plant import behind_stated_lag
+from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.task.problem import Problem
 
 
@@ -42,7 +43,8 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     grid = review_grid(behind_stated_lag(problem), mismatch, seed)
     general = _present(asked(question, grid) for question in known_questions(ProblemQuestion))
     runs = NominalRuns(grid.problem)
-    answers = {name: _of(grid, one, general, runs) for name, one in controllers.items()}
+    with compiled_plans():
+        answers = {name: _of(grid, one, general, runs) for name, one in controllers.items()}
     return Review(general, answers, mismatch)
 
 

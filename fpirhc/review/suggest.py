@@ -25,7 +25,7 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, 
 from fpirhc.fields.checked import checked_call
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.question import TRIED
+from fpirhc.review.nominal_runs import TRIED
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.trials import Trials, harm_in

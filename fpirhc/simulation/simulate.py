@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
@@ -30,10 +31,11 @@ from fpirhc.simulation.set_points import Setpoints, set_point_record, set_point_
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.native import native
+from fpirhc.symbolic.native import Native, native
 from fpirhc.task.problem import Problem
 
 CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C
+SHORT, _CHAIN = 25, 5  # cycles per call of the virtual machine, for which a longer chain takes longer than it saves
 Progress = Callable[[int, int], None]
 SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
 
@@ -48,7 +50,7 @@ class Simulator:
         problem: the task.
         controller: with its automatic settings chosen.
         loop: the closed loop as one step.
-        evaluator: of the loop over `CHUNK` cycles.
+        evaluator: of the loop over `CHUNK` cycles, or fewer that divide it.
         compiled: whether the loop is compiled C.
         why_not_compiled: reason where it is not; empty where it is.
         live: the settings that a run may change.
@@ -159,13 +161,18 @@ def simulator(
     settings = live_settings(problem, controller, live)
     ready = settings.controller
     loop = close_loop(problem, ready, settings if live else None)
-    chunked = loop.function  # a foreign reality is called in every cycle
-    if problem.foreign is None:
-        chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
-    backend = native(chunked, flags, required=bool(live)) if compiled else None
-    evaluator = Evaluator(backend.function if backend else chunked)
-    reason = backend.reason if backend else SWITCHED_OFF
-    return Simulator(problem, ready, loop, evaluator, bool(backend and backend.compiled), reason, settings)
+    backend = Native(loop.function, False, SWITCHED_OFF)
+    if compiled:
+        backend = native(_chained(problem, loop, CHUNK), flags, required=bool(live))
+    function = backend.function if backend.compiled else _chained(problem, loop, SHORT)
+    return Simulator(problem, ready, loop, Evaluator(function), backend.compiled, backend.reason, settings)
+
+
+def _chained(problem: Problem, loop: Composite, cycles: int) -> ca.Function:
+    """The loop over so many cycles; over one beside a foreign reality, which is called in every cycle."""
+    if problem.foreign is not None:
+        return loop.function
+    return loop.function.mapaccum(f"{loop.function.name()}_run", cycles, {} if cycles == CHUNK else {"base": _CHAIN})
 
 
 @checked_call
@@ -286,20 +293,21 @@ def _run_chunks(
     setpoints: Setpoints | None,
 ) -> tuple[np.ndarray, str | None]:
     cycles, trace, dropped, patches = problem.cycles, loop.trace, Dropped(loop), force.patches
+    count = evaluator.results[1].size // trace.size  # a call
     padded = (-(-cycles // CHUNK) + (1 if patches else 0)) * CHUNK
     tables = run_tables(problem, seed, padded, disturbed=disturbed, setpoints=setpoints, later=force.later)
     log, ranges = np.empty((padded, trace.size)), ranges_of(problem, trace)
     evaluator.arguments[0][:] = start
-    for at, end in _pieces(cycles, [cycle for cycle, _, _ in patches]):
+    for at, end in _pieces(cycles, count, [cycle for cycle, _, _ in patches]):
         for cycle, places, values in patches:
             if cycle == at:
                 evaluator.arguments[0][places] = values
         for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
-            argument.reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
-        evaluator.redirect(1, log[at : at + CHUNK])
+            argument.reshape(count, -1)[:] = table[at : at + count]
+        evaluator.redirect(1, log[at : at + count])
         why = evaluator.failure()
         if why:
-            return log[:at].copy(), _failed(at, problem, why)
+            return log[:at].copy(), _failed(at, count, problem, why)
         rows = log[at:end]
         bad = dropped.first_bad(rows, log[at - 1] if at else None)
         if bad is not None:
@@ -309,18 +317,18 @@ def _run_chunks(
         if outside is not None:
             row, what = outside
             return log[: at + row].copy(), stopped(problem, at + row, what)
-        evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, start.size)[end - at - 1]
+        evaluator.arguments[0][:] = evaluator.results[0].reshape(count, start.size)[end - at - 1]
         if progress:
             progress(at + rows.shape[0], cycles)
     return log[:cycles], None
 
 
-def _pieces(cycles: int, cuts: Sequence[int]) -> list[tuple[int, int]]:
-    """(first cycle, end) of the calls that make up a run: at most a chunk each, and none goes beyond a change."""
+def _pieces(cycles: int, most: int, cuts: Sequence[int]) -> list[tuple[int, int]]:
+    """(first cycle, end) of the calls that make up a run: so many cycles at most, and none goes beyond a change."""
     pieces, at, ends = [], 0, sorted({c for c in cuts if 0 < c < cycles} | {cycles})
     for end in ends:
         while at < end:
-            pieces.append((at, min(at + CHUNK, end)))
+            pieces.append((at, min(at + most, end)))
             at = pieces[-1][1]
     return pieces
 
@@ -340,9 +348,9 @@ def _run_foreign(
     return run_foreign(problem, start, loop, evaluator, seed, tables, progress, force.patches)
 
 
-def _failed(at: int, problem: Problem, why: str) -> str:
+def _failed(at: int, count: int, problem: Problem, why: str) -> str:
     return (
-        f"a solver failed within {CHUNK} cycles after t = {at * problem.period:g} {problem.time_unit}: {why}; the run keeps the "
+        f"a solver failed within {count} cycles after t = {at * problem.period:g} {problem.time_unit}: {why}; the run keeps the "
         "cycles before them"
     )
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import casadi as ca
@@ -78,10 +80,37 @@ class Driver:
 
 def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
     """Return `build(unique name)` with this driver as its body in C; the same body has the same Function."""
+    unique = registered(name, driver)
+    return _LATEST.of((), (unique,), lambda: build(unique))
+
+
+def registered(name: str, driver: Driver) -> str:
+    """Return the unique name of a driver: a Function of this name has it as its body in C."""
     source = driver.source()
     unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     _drivers[unique] = source
-    return _LATEST.of((), (unique,), lambda: build(unique))
+    return unique
+
+
+@contextmanager
+def compiled_plans() -> Iterator[None]:
+    """Within it a loop of the virtual machine calls the compiled plan: a short run is not worth a compiler, its plans are.
+
+    What is composed within calls a library, so it cannot be compiled as a whole.
+    """
+    token = _COMPILED.set(True)
+    try:
+        yield
+    finally:
+        _COMPILED.reset(token)
+
+
+def plans_are_compiled() -> bool:
+    """Whether plans are called as libraries here; what keeps a composed loop keeps it by this too."""
+    return _COMPILED.get()
+
+
+_COMPILED = ContextVar("fpirhc_compiled_plans", default=False)
 
 
 def of_type(source: str) -> str:

@@ -12,7 +12,7 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidProblem
-from fpirhc.simulation.simulate import CHUNK, simulator
+from fpirhc.simulation.simulate import SHORT, simulator
 from fpirhc.symbolic.evaluate import Evaluator
 
 TRACK = fp.Exponential(rate=6.0)
@@ -193,7 +193,7 @@ def test_run_stops_where_a_solver_fails(fails, monkeypatch):
     if fails != "raises":
         monkeypatch.setattr(Evaluator, "failed", property(lambda self: len(calls) > 2))
     run = ready.run(seed=0)
-    assert run.cycles == 2 * CHUNK
+    assert run.cycles == 2 * SHORT
     assert run.stop is not None
     assert ("OSQP failed" if fails == "raises" else "compiled code failed") in run.stop
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.nominal_runs import null_runs
+from fpirhc.review.nominal_runs import TRIED, null_runs
 from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, response_errors
-from fpirhc.review.question import TRIED, Case, ControllerQuestion
+from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.form import form_of, forms_of
 from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
 from fpirhc.simulation.model_as_plant import with_believed_way

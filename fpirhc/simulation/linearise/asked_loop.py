@@ -24,6 +24,7 @@ from fpirhc.simulation.linearise.linear_map import GAIN
 from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.symbolic.block import Composite
+from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.task.disturbance import Step as Jump
 from fpirhc.task.problem import Problem
 
@@ -64,7 +65,7 @@ class AskedLoop:
         if problem.foreign is not None:
             raise NotSupported("the step of a loop with a foreign reality cannot be evaluated twice at one point")
         self.problem, self.controller = _calm(problem), resolved(problem, controller)
-        with any_gain():  # one that a run refuses has poles too
+        with any_gain(), compiled_plans():  # one that a run refuses has poles too
             self.loop: Composite = close_loop(self.problem, self.controller)
         self._step = Step(self.loop)
         names = self.loop.trace.names
