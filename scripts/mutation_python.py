@@ -44,23 +44,31 @@ class ModuleFault:
 
 
 def faults(path: Path) -> list[ModuleFault]:
-    """Every fault that the tool knows for a module, but for those of type hints, which nothing reads at run time."""
+    """Every fault that the tool knows for a module, but for those of parts that change no result, see `_without_effect`."""
     with tempfile.TemporaryDirectory() as folder, use_db(str(Path(folder, "faults.sqlite"))) as database:
         init([path], database, {})
         items = database.work_items
-    hints = list(_hints(ast.parse(path.read_text(encoding="utf-8"))))
+    unread = list(_without_effect(ast.parse(path.read_text(encoding="utf-8"))))
     read = [
-        i for i in items if not any(a <= i.mutations[0].start_pos and i.mutations[0].end_pos <= b for a, b in hints)
+        i for i in items if not any(a <= i.mutations[0].start_pos and i.mutations[0].end_pos <= b for a, b in unread)
     ]
     return [
         ModuleFault(i) for i in sorted(read, key=lambda i: (i.mutations[0].operator_name, i.mutations[0].occurrence))
     ]
 
 
-def _hints(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """Begin and end of annotations and of what stands under `if TYPE_CHECKING`."""
+def _without_effect(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Begin and end of annotations, of what stands under `if TYPE_CHECKING`, and of values that no result depends on.
+
+    These are EXAMPLES, whose numbers the laws do not need, `order=`, which sorts columns, and `strict=` of equal lengths.
+    """
     for node in ast.walk(tree):
-        for part in (getattr(node, "annotation", None), getattr(node, "returns", None)):
+        parts = [getattr(node, "annotation", None), getattr(node, "returns", None)]
+        if isinstance(node, ast.keyword) and node.arg in ("order", "strict"):
+            parts.append(node.value)
+        if isinstance(node, ast.Assign) and [getattr(t, "id", "") for t in node.targets] == ["EXAMPLES"]:
+            parts.append(node.value)
+        for part in parts:
             if part is not None:
                 yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
         if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":

@@ -358,6 +358,8 @@ def test_a_tracking_law_asks_for_the_basin_of_its_largest_error():
     assert reference_demand(masses(), TRACK).recovery == pytest.approx(
         step_for_basin(largest, 3, 2.0, PERIOD), rel=1e-4
     )
+    no_gains = fp.Fractional(rate=2.0, order=0.8, memory=1.0)
+    assert reference_demand(masses(), no_gains).recovery == 0.0
 
 
 def test_a_plan_asks_for_a_jump_between_the_limits():

@@ -168,7 +168,8 @@ def test_settling_counts_the_size_of_the_first_error():
 
 def test_settling_of_a_small_motion():
     """A millimetre: the band is 0.02 mm. The floor of the band is there for a reference that rests and an error of zero."""
-    small = np.linspace(0.0, 1e-3, CYCLES)
+    small, still = np.linspace(0.0, 1e-3, CYCLES), np.zeros(CYCLES)
+    assert fp.measure(problem(), run(step(0.0, 1e-15, 30), reference=still)).settling["y"] == 0.0
     assert fp.measure(problem(), run(step(5e-4, 1.9e-5, 30), reference=small)).settling["y"] == pytest.approx(3.0)
     assert np.isnan(fp.measure(problem(), run(step(5e-4, 2.1e-5, 30), reference=small)).settling["y"])
 
