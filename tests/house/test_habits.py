@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -41,3 +42,13 @@ def test_the_quick_lane_leaves_out_tests_that_exist():
     places = [line.split()[1].split("::") for line in LANES if line[:1].isdigit()]
     there = cache(lambda file: text(f"tests/{file}") if (ROOT / "tests" / file).exists() else "")
     assert ["::".join(place) for place in places if f"def {place[-1]}(" not in there(place[0])] == []
+
+
+def test_faults_are_made_in_modules_that_exist_and_in_each_once():
+    """A module that was renamed would silently have no score."""
+    targets = tomllib.loads(text("scripts/mutation.toml"))["target"]
+    modules = [module for target in targets for module in target["modules"]]
+    assert [module for module in modules if not list(ROOT.glob(module))] == []
+    assert len(modules) == len(set(modules))
+    tests = [test.partition("::")[0] for target in targets for test in target["tests"]]
+    assert [test for test in tests if not (ROOT / test).exists()] == []
