@@ -19,7 +19,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import ceil, larger
 from fpirhc.symbolic.gap import straightened
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
@@ -134,7 +134,7 @@ class ResponsePairs:
     @property
     def _commands(self) -> Queue:
         cycles = self._cycles(self.dead_time)
-        return Queue(cycles, longest=max(self._cycles(nominal(self.dead_time).at_longest)) if is_live(cycles) else None)
+        return Queue.up_to(cycles, max(self._cycles(nominal(self.dead_time).at_longest)))
 
     def _cycles(self, late: DeadTime) -> tuple[float, ...]:
         waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)

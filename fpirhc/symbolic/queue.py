@@ -39,6 +39,11 @@ class Queue:
     width: int = 0
     longest: float | None = None
 
+    @classmethod
+    def up_to(cls, cycles: Cycles, longest: float) -> Queue:
+        """Return the queue with room for the longest delay where one is live, and else for the delays themselves."""
+        return cls(cycles, longest=longest if is_live(cycles) else None)
+
     @property
     def length(self) -> int:
         """Number of cycles that are remembered, the newest included.

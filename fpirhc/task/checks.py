@@ -25,13 +25,14 @@ from fpirhc.sensing.positions import StepDifference
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.live import nominal
+from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
 
 
 def settled_maps(
     plant: Plant,
-    reality: Reality | None,
+    reality: Reality | ExternalPlant | None,
     period: float,
     integrator: Integrator,
     horizon: Horizon | None,
@@ -53,8 +54,7 @@ def settled_maps(
     try:
         settled["plant"] = over(plant, period)
         if reality is not None:
-            real = over(reality.plant, period)
-            settled["reality"] = reality if real is reality.plant else replace(reality, plant=real)
+            settled["reality"] = reality.over(period)
     except InvalidValue as error:
         mistakes.add(str(error))
         return {}
@@ -70,15 +70,12 @@ def settled_maps(
     return settled
 
 
-def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes: Mistakes) -> None:
+def check_maps(model: Plant, reality: Reality | ExternalPlant | None, sensing: Sensing, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
     instant = _instant(model)
     at_once = bool(instant) and set(instant) == set(model.controlled or model.chains)  # no derivative is looked for
-    if reality is not None and reality.plant.step is not None and model.step is None and not at_once:
-        mistakes.add(
-            "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write the "
-            "model as a map with the same step"
-        )
+    if reality is not None:
+        reality.check_steps(model, mistakes, at_once=at_once)
     if model.step is None:
         return
     if instant and not at_once:
@@ -95,12 +92,6 @@ def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes
         mistakes.add(
             "sensing: believed states are not covered where an output of a map has an order above 1, because its next values are "
             "predicted from measured states; leave measured and observer out"
-        )
-    later = [name for name, order in model.chains.items() if order > 1]
-    if later and reality is not None and reality.plant.step is None:
-        mistakes.add(
-            f"reality: '{later[0]}' has the order {model.chains[later[0]]} in the model's steps, and the reality has differential "
-            "equations, in which every input shows within one cycle; write a model in which it does too"
         )
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import queue
 import threading
 import time as wall
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, TypeVar
@@ -25,6 +25,7 @@ import numpy.typing as npt
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Positive, finite_number
+from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.parameter import check_parameters, with_exact_values
 from fpirhc.plant.plant import Parameter, Plant
 
@@ -142,12 +143,41 @@ class ExternalPlant(Checked):
             )
         return replace(self, parameters=with_exact_values(self.parameters, exact))
 
-    def check(self, model: Plant, needed: tuple[str, ...]) -> None:
+    @property
+    def drawn(self) -> ExternalPlant:
+        """Whose exact parameters studies draw."""
+        return self
+
+    @property
+    def fact(self) -> str:
+        """What tables call it."""
+        return f"{self.name}, outside"
+
+    def disturbable(self, model: Plant) -> tuple[str, ...]:  # noqa: ARG002
+        """Return the names beside the inputs that disturbances may have: none, because nothing reaches into it."""
+        return ()
+
+    def over(self, cycle: float) -> ExternalPlant:  # noqa: ARG002
+        """Return itself: it is called once in every cycle, whatever that is."""
+        return self
+
+    def shows(self, name: str) -> bool:
+        """Whether it measures a coordinate or an output of the model."""
+        return name in self.measures
+
+    def check_steps(self, model: Plant, mistakes: Mistakes, *, at_once: bool) -> None:
+        """Nothing: what it has inside is not known."""
+
+    def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
+        """Nothing: what it has inside is not known."""
+
+    def check(self, model: Plant, needed: Collection[str], measured: Collection[str]) -> None:  # noqa: ARG002
         """Raise if it does not measure what the model's sensing needs.
 
         Args:
             model: the model.
-            needed: names of the quantities that sensors and estimator use.
+            needed: names of coordinates and outputs that a plant of equations would need.
+            measured: names of the quantities that sensors and estimator use.
 
         Raises:
             InvalidProblem: all mistakes together.
@@ -158,7 +188,7 @@ class ExternalPlant(Checked):
         mistakes.unknown("lag: input", self.lag, model.inputs)
         for name in (name for name, tau in self.lag.items() if not (finite_number(tau) and tau >= 0)):
             mistakes.add(f"lag of {name} is {self.lag[name]!r}; expected a time of at least 0 {model.time_unit}")
-        for name in needed:
+        for name in measured:
             if name not in self.measures:
                 mistakes.add(
                     f"it does not measure {name} ({units[name]}), which the sensing of the problem needs; add it to measures, or "

@@ -101,18 +101,18 @@ class Problem(Checked):
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
-        known = self.plant, self.symbolic_reality, self.period, self.integrator, self.horizon, self.sensing
+        known = self.plant, self.reality, self.period, self.integrator, self.horizon, self.sensing
         for name, value in settled_maps(*known, mistakes).items():
             object.__setattr__(self, name, value)
-        if self.foreign is not None and self.foreign.dead_time:
-            object.__setattr__(self, "dead_time", _stated_once(self.dead_time, self.foreign.dead_time, mistakes))
+        if self.moves.dead_time:
+            object.__setattr__(self, "dead_time", _stated_once(self.dead_time, self.moves.dead_time, mistakes))
         mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
         plant = self.plant
         _check_input_before(self, mistakes)
         mistakes.unknown(f"judged: {followed(plant)}", self.judged or (), followed_units(plant))
-        disturbed = [*plant.inputs, *(() if self.foreign else (*self.real_plant.coordinates, *plant.outputs))]
+        disturbed = [*plant.inputs, *self.moves.disturbable(plant)]
         what = "input, coordinate or output" if plant.outputs else "input or coordinate"
         mistakes.unknown(f"disturbances: {what}", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
@@ -125,8 +125,7 @@ class Problem(Checked):
             lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
-            lambda: self.symbolic_reality.check(plant, self._needed) if self.symbolic_reality else None,
-            lambda: self.foreign.check(plant, needed_measurements(plant, self.sensing)) if self.foreign else None,
+            lambda: self.reality.check(plant, *self._needed) if self.reality else None,
         )
         for check in checks:
             try:
@@ -134,15 +133,15 @@ class Problem(Checked):
             except FpirhcError as error:
                 mistakes.add(str(error))
         mistakes.raise_if_any()
-        check_maps(plant, self.symbolic_reality, self.sensing, mistakes)
+        check_maps(plant, self.reality, self.sensing, mistakes)
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
         mistakes.raise_if_any()
         _check_outputs(self, mistakes)
         mistakes.raise_if_any()
-        if self.symbolic_reality is not None:
-            self.symbolic_reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
+        if self.reality is not None:
+            self.reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
 
     def __repr__(self) -> str:
         return line(self, *problem_facts(self))
@@ -177,9 +176,7 @@ class Problem(Checked):
 
     def _shows(self, name: str) -> bool:
         """Whether the plant that moves has a coordinate or an output of the model."""
-        if self.foreign is not None:
-            return name in needed_measurements(self.plant, self.sensing)
-        return self.truth.shows(name)
+        return self.moves.shows(name)
 
     @property
     def sees_plant(self) -> bool:
@@ -196,9 +193,14 @@ class Problem(Checked):
         """The reality where it is an object outside."""
         return self.reality.foreign if self.reality is not None else None
 
+    @property
+    def moves(self) -> Reality | ExternalPlant:
+        """What a run moves: the reality, or the model itself with its exact parameters."""
+        return self.reality or self.truth
+
     @cached_property
     def truth(self) -> Reality:
-        """What a run moves, in the terms of the model: the reality, or the model itself with its exact parameters."""
+        """What a run moves, where its equations are known; else the model itself."""
         return self.symbolic_reality or Reality(self.plant)
 
     @property
@@ -209,7 +211,7 @@ class Problem(Checked):
     @property
     def moved(self) -> Plant | ExternalPlant:
         """What a run moves, and whose exact parameters studies draw."""
-        return self.foreign or self.real_plant
+        return self.moves.drawn
 
     @cached_property
     def disturbed_outputs(self) -> Mapping[str, int]:
@@ -283,9 +285,9 @@ class Problem(Checked):
             self.disturbances[name].derivative(instants, 1)
 
     @property
-    def _needed(self) -> frozenset[str]:
-        """Names of the model's coordinates and outputs that what moves must have."""
-        return needed_names(self.plant, self.sensing, self.judged)
+    def _needed(self) -> tuple[frozenset[str], tuple[str, ...]]:
+        """Names of the model's coordinates and outputs that what moves must have, and of the quantities that are measured."""
+        return needed_names(self.plant, self.sensing, self.judged), needed_measurements(self.plant, self.sensing)
 
     @property
     def _plants(self) -> tuple[Plant, ...]:
@@ -558,10 +560,8 @@ def _other_rows(problem: Problem) -> list[tuple[str, str]]:
     if late.measurement:
         rows.append(("dead time of the measurement", f"{late.measurement:g} {unit}"))
     rows += [(f"disturbance of {name}", type(one).__name__) for name, one in problem.disturbances.items()]
-    if problem.symbolic_reality is not None:
-        rows.append(("reality", "; ".join(plant_facts(problem.real_plant))))
-    if problem.foreign is not None:
-        rows.append(("reality", f"{problem.foreign.name}, outside"))
+    if problem.reality is not None:
+        rows.append(("reality", problem.reality.fact))
     if not problem.sensing.ideal:
         rows.append(("sensing", "with sensors or an estimator"))
     believed = problem.sensing.believed(problem.plant)

@@ -23,8 +23,9 @@ from fpirhc.fields.checked import Checked
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
 from fpirhc.plant.integrators import Integrator, stiffness
 from fpirhc.plant.lie_derivatives import output_order, structural_order
+from fpirhc.plant.maps import over
 from fpirhc.plant.motion import followed_units, with_exact_parameters
-from fpirhc.plant.plant import Plant
+from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
 
 
@@ -68,13 +69,64 @@ class Reality(Checked):
         """
         return replace(self, plant=with_exact_parameters(self.plant, exact))
 
-    def check(self, model: Plant, needed: Collection[str] | None = None) -> None:
+    @property
+    def dead_time(self) -> Mapping[str, float]:
+        """That of its inputs: none, because it is the problem's."""
+        return {}
+
+    @property
+    def drawn(self) -> Plant:
+        """Whose exact parameters studies draw."""
+        return self.plant
+
+    @property
+    def fact(self) -> str:
+        """What tables call it."""
+        return "; ".join(plant_facts(self.plant))
+
+    def disturbable(self, model: Plant) -> tuple[str, ...]:
+        """Return the names beside the inputs that disturbances may have: its coordinates, and outputs of the model."""
+        return (*self.plant.coordinates, *model.outputs)
+
+    def over(self, cycle: float) -> Reality:
+        """Return it as a controller with this cycle sees it; see `fpirhc.plant.maps.over`.
+
+        Raises:
+            InvalidValue: the cycle is no whole number of a map's steps.
+        """
+        plant = over(self.plant, cycle)
+        return self if plant is self.plant else replace(self, plant=plant)
+
+    def check_steps(self, model: Plant, mistakes: Mistakes, *, at_once: bool) -> None:
+        """Add to `mistakes` where one of model and reality steps and the other does not, and a response needs both alike.
+
+        Args:
+            model: of the problem.
+            mistakes: of the problem.
+            at_once: whether the command moves everything controlled at once, so that no derivative is looked for.
+        """
+        if (self.plant.step is None) == (model.step is None):
+            return
+        later = [name for name, order in model.chains.items() if order > 1]
+        if model.step is None and not at_once:
+            mistakes.add(
+                "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write "
+                "the model as a map with the same step"
+            )
+        elif model.step is not None and later:
+            mistakes.add(
+                f"reality: '{later[0]}' has the order {model.chains[later[0]]} in the model's steps, and the reality has "
+                "differential equations, in which every input shows within one cycle; write a model in which it does too"
+            )
+
+    def check(self, model: Plant, needed: Collection[str] | None = None, measured: Collection[str] = ()) -> None:  # noqa: ARG002
         """Raise if the reality cannot stand for what the model describes.
 
         Args:
             model: of the problem.
             needed: names of the model's coordinates that it must have; None: all. What else it has under the same name has the same
                 unit.
+            measured: names of what the sensing uses, which follows from the coordinates.
 
         Raises:
             InvalidProblem: all mistakes together.

@@ -40,7 +40,7 @@ from fpirhc.symbolic.block import Block, Composite, Delay
 from fpirhc.symbolic.expression import Signals, expression, is_finite, kind
 from fpirhc.symbolic.functions import largest
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import MOST, Queue, every
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
@@ -217,7 +217,7 @@ class ThroughModel(Checked):
         cycles = self._late(late) / problem.period
         if (now := nominal(cycles)) > MOST:
             raise InvalidValue(f"{self!r}: {now:g} cycles of dead time, more than {MOST}")
-        return Queue(cycles, longest=self._late(nominal(late).at_longest) / problem.period if is_live(cycles) else None)
+        return Queue.up_to(cycles, self._late(nominal(late).at_longest) / problem.period)
 
     def memory(self, problem: Problem) -> tuple[Signal, ...]:
         """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start."""
