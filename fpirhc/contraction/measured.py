@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction.gains import predicted_factor
-from fpirhc.contraction.spectrum import Array
+from fpirhc.contraction.spectrum import Array, response_jacobians
 from fpirhc.errors import InvalidShape
 from fpirhc.plant.motion import sampling
 from fpirhc.sensing.base import response_names
@@ -108,6 +108,15 @@ def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tu
         outputs = outputs_of(states[order - 1], *held)
         entries.append(outputs[model.output.elements.index(name)] / sampling(model) ** order)
     return ca.vertcat(*entries)
+
+
+def jacobians_along(
+    problem: Problem, real: Array, states: Array, deformed: Array, believed: Array, exact: Array
+) -> Array:
+    """Return J of every row: over a cycle with a reality, and else at an instant; see `sampled_jacobians`."""
+    if problem.reality is None:
+        return response_jacobians(problem.plant, states, deformed, exact, believed)
+    return sampled_jacobians(problem, real, states, deformed, believed, exact)
 
 
 def sampled_jacobians(

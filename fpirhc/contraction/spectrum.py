@@ -142,35 +142,11 @@ def spectrum_over_box(
     return _spectrum(plant, states[rows], deformed[rows], parameters, None)
 
 
-def contraction_along(
-    plant: Plant, states: Array, deformed: Array, effective_gain: float, *, approximate: Array | None = None
-) -> Array:
+def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:
     """Return the predicted factor max|1 - a lambda| of every cycle of a run, shape (cycles,); every entry is a number.
 
     Long runs are evaluated at `LARGEST_SAMPLE` cycles, and in between the last value holds. Where J is singular or not
     finite nothing contracts, and the factor is 1.
-
-    Args:
-        plant: that ran.
-        states: state of every cycle, shape (cycles, nx).
-        deformed: request of every cycle, shape (cycles, n).
-        effective_gain: a of the deformation.
-        approximate: parameters of the model, shape (np,); None: the plant's own.
-
-    Raises:
-        InvalidShape: arrays that do not fit the plant or each other.
-    """
-    states, deformed = _checked_rows(plant, states, deformed)
-
-    def jacobians_at(rows: Array) -> Array:
-        exact = np.repeat(plant.exact[None, :], len(rows), axis=0)
-        return response_jacobians(plant, states[rows], deformed[rows], exact, approximate)
-
-    return factors_along(len(states), jacobians_at, effective_gain)
-
-
-def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:
-    """Return max|1 - a lambda| of every cycle from Jacobians at some cycles; see `contraction_along`.
 
     Args:
         cycles: number of cycles of the run.

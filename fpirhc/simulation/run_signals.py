@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.broken import attempted
-from fpirhc.contraction.measured import identified_factor, sampled_jacobians
-from fpirhc.contraction.spectrum import contraction_along, factors_along, response_jacobians
+from fpirhc.contraction.measured import identified_factor, jacobians_along
+from fpirhc.contraction.spectrum import factors_along
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.reference_states import own_signals
 from fpirhc.horizon.problem import OptimalControl
@@ -54,43 +54,29 @@ def judgements(
 def _contraction(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:
     """Return the factor of every cycle: of the Jacobian at an instant, with a reality of the one over a cycle.
 
-    With a foreign reality it is the factor that the run shows, the same in every cycle, or NaN.
+    Plant and model have the signals from outside of the cycle. With a foreign reality it is the factor that the run shows, the same
+    in every cycle, or NaN.
     """
     states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
     gain, model = controller.deformation.effective_gain(), controller.plant_model(problem)
-    plant, believed = model.plant, model.parameters(model.plant)
     if problem.foreign is not None:
         shown = (
             np.nan if problem.response_delay else identified_factor(deformed, log[:, layout.slice("realised")], gain)
         )
         return np.full(len(log), shown)
-    if problem.signals:
-        return _contraction_outside(problem, controller, layout, log)
-    if problem.symbolic_reality is None:
-        return contraction_along(plant, states, deformed, gain, approximate=believed)
-    real, modelled = log[:, layout.slice(REALITY_STATE)], replace(problem, plant=plant)
-    return factors_along(
-        len(log), lambda rows: sampled_jacobians(modelled, real[rows], states[rows], deformed[rows], believed), gain
-    )
-
-
-def _contraction_outside(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:
-    """The factor of every cycle with signals from outside: plant and model have those of the cycle."""
-    states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
-    plant, model = problem.real_plant, controller.plant_model(problem)
     own = model.plant
+    plant, real = (
+        (own, states) if problem.reality is None else (problem.real_plant, log[:, layout.slice(REALITY_STATE)])
+    )
     times = log[:, layout.slice("time")].ravel() + problem.period / 2
-    real = rows_of(real_values(plant, problem.signals), times, plant.exact)
+    exact = rows_of(real_values(plant, problem.signals), times, plant.exact)
     believed = rows_of(model_values(own, model.signals), times, model.parameters(own))
     modelled = problem if own is problem.plant else replace(problem, plant=own)
 
     def jacobians(rows: np.ndarray) -> np.ndarray:
-        if problem.symbolic_reality is None:
-            return response_jacobians(own, states[rows], deformed[rows], real[rows], believed[rows])
-        real_states = log[rows][:, layout.slice(REALITY_STATE)]
-        return sampled_jacobians(modelled, real_states, states[rows], deformed[rows], believed[rows], real[rows])
+        return jacobians_along(modelled, real[rows], states[rows], deformed[rows], believed[rows], exact[rows])
 
-    return factors_along(len(log), jacobians, controller.deformation.effective_gain())
+    return factors_along(len(log), jacobians, gain)
 
 
 def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:

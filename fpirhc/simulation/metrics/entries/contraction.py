@@ -23,14 +23,14 @@ _SAMPLES = 200  # cycles of a run whose eigenvalues are computed
 
 def predicted(problem: Problem, run: Run) -> float | None:
     """Return the largest max|1 - a lambda| in sampled cycles of the run; None for a foreign reality. See `fpirhc.contraction`."""
-    if not _adapts(run) or problem.foreign is not None:
+    if not _differentiable(problem, run):
         return None
     return predicted_factor(sampled_spectrum(problem, run).eigenvalues, _gain(run))
 
 
 def growing(problem: Problem, run: Run) -> float | None:
     """Return the share of the sampled cycles with max|1 - a lambda| >= 1, in which small errors do not shrink."""
-    if not _adapts(run) or problem.foreign is not None:
+    if not _differentiable(problem, run):
         return None
     factors = np.abs(1 - _gain(run) * sampled_spectrum(problem, run).eigenvalues).max(axis=1)
     return float(np.mean(factors >= 1))
@@ -67,6 +67,11 @@ def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
     modelled = replace(problem, plant=problem.real_plant) if run.settings["model is reality"] else problem
     jacobians = sampled_jacobians(modelled, run["reality_state"][rows], states, deformed, approximate)
     return Spectrum(np.linalg.eigvals(jacobians[np.isfinite(jacobians).all(axis=(1, 2))]))
+
+
+def _differentiable(problem: Problem, run: Run) -> bool:
+    """Whether its factors follow from equations."""
+    return _adapts(run) and problem.foreign is None
 
 
 def _adapts(run: Run) -> bool:
