@@ -125,7 +125,7 @@ def _pair(draw: Draw, label: str, names: Sequence[str], entries: tuple[Entry, En
             draw_changes(axis, entry.run)
             axis.set_xlabel(time_label(entry.run))
             axis.set_ylabel(label)
-        axis.set_title(literal(entry.name), fontsize=10)
+        axis.set_title(literal(entry.name), fontsize=10, y=1.0)
         draw_legend(axis)
     _share_axes(axes)
     return figure
@@ -236,7 +236,7 @@ def contraction_figure(comparison: Comparison) -> Drawing | None:
         last.semilogy(cycles, np.maximum(size, 1e-12), color=colours[entry.name], label=literal(entry.name), lw=1)
     last.set_xlabel("control cycle")
     last.set_ylabel("|realised - desired|, response units")
-    last.set_title("The response error in the first cycles", fontsize=10)
+    last.set_title("The response error in the first cycles", fontsize=10, y=1.0)
     draw_legend(last)
     return figure
 
@@ -296,7 +296,7 @@ def _draw_factor(axis: Axes, name: str, scale: float, entries: Sequence[Entry], 
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))
     axis.set_xlabel(literal(name))
     axis.set_ylabel("contraction factor max|1 - a lambda|")
-    axis.set_title("Predicted factor; o predicted, x measured", fontsize=10)
+    axis.set_title("Predicted factor; o predicted, x measured", fontsize=10, y=1.0)
     axis.grid(visible=True, alpha=0.25)
     draw_legend(axis)
 
