@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 LANES = Path(__file__).with_name("lanes.txt")
-LONGEST = 0.3  # s, of all parameters of a test together, in the quick lane
+LONGEST = 0.2  # s, of all parameters of a test together, in the quick lane
 _seconds = pytest.StashKey[dict[str, float]]()
 
 
