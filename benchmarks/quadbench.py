@@ -214,6 +214,8 @@ def _circled(task: Task, name: str, controller: fp.Controller | None, told: Mapp
     problem = replace(
         task.problem, reference=round_it, reality=outside, start={"x": 2.0, "y": 0.0, "z": 0.0}, duration=8.0
     )
+    if controller is None and told.get("late_thrust"):
+        return np.nan  # they command motors, and have no thrust vector that could be late
     if controller is None:
         return float(RIVALS[name](numbers, first, speed).distances(motion(problem), problem.cycles, 0)[300:].mean())
     run = fp.simulate(problem, controller, seed=0, compiled=False)

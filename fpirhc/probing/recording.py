@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
     Raises:
         InvalidValue: missing columns, other times than those of the period, entries that are no numbers; all mistakes together.
     """
-    columns = _columns(path)
+    columns = columns_of(path)
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
     responses = response_names(plant)
     lower = {name: name[:-1] for name in responses}
@@ -40,9 +41,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
         if name not in columns and lower[name] not in columns:
             mistakes.add(f"it has no column '{name}', nor '{lower[name]}' to take the difference of")
     mistakes.raise_if_any()
-    steps = np.diff(columns["time"])
-    if not len(steps) or np.abs(steps - period).max() > _EVEN * period:
-        mistakes.add(f"its times are not {period:g} {plant.time_unit} apart, the period of the problem")
+    check_times(columns, problem, mistakes)
     mistakes.raise_if_any()
     states = np.column_stack([columns[e] for e in plant.state.elements])
     commands = np.column_stack([columns[n] for n in plant.inputs])
@@ -56,7 +55,22 @@ def read_recording(path: Path, problem: Problem) -> Record:
     return Record(measured, modelled, usable)
 
 
-def _columns(path: Path) -> dict[str, np.ndarray]:
+def check_times(columns: Mapping[str, np.ndarray], problem: Problem, mistakes: Mistakes) -> None:
+    """Add a mistake where the times are missing, or are not a period apart."""
+    if "time" not in columns:
+        mistakes.add(f"it has no column 'time'; its columns are {', '.join(columns)}")
+        return
+    steps = np.diff(columns["time"])
+    if not len(steps) or not np.all(np.abs(steps - problem.period) <= _EVEN * problem.period):
+        mistakes.add(f"its times are not {problem.period:g} {problem.time_unit} apart, the period of the problem")
+
+
+def columns_of(path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a CSV file by name; an empty entry is NaN.
+
+    Raises:
+        InvalidValue: it cannot be read, or is not made of numbers.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             head, *rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]

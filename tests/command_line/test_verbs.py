@@ -267,6 +267,12 @@ def stale() -> None:
     edited("rate=6.0", "rate=7.0")
 
 
+def recorded() -> None:
+    period = fp.load_problem("line.py").problem.period
+    rows = "".join(f"{k * period},0.5,0.0,0.0\n" for k in range(5))
+    Path("run.csv").write_text("time,y,y',y''\n" + rows)
+
+
 # name of the command: (what to do before, its words, the exit code), one after the other
 JOURNEYS: dict[str, Any] = {
     "list": [(None, "", 0), (None, "--alll", 2)],
@@ -275,6 +281,11 @@ JOURNEYS: dict[str, Any] = {
         (None, "line.py --cycles 80 --no-trials", 0),
         (None, "line.py --cycles 10", 2),
         (too_weak, "line.py --cycles 80", 1),
+    ],
+    "replay": [
+        (recorded, "line.py CTC run.csv", 0),
+        (None, "line.py CTC nowhere.csv", 2),
+        (recorded, "line.py CTC run.csv --out nowhere/commands.csv", 3),
     ],
     "solve": [
         (None, "line.py", 2),

@@ -1,0 +1,144 @@
+"""A recording replayed: the controller that made it gives its commands, bit by bit; every wrong file is named."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.cli.main import main
+from fpirhc.cli.verb import ExitCode
+from fpirhc.probing.replay import replay
+
+TASK = fp.load_problem("two_mass")
+
+
+def recorded(
+    path: Path, *, name: str = "RHC+FPI", without: tuple[str, ...] = (), rows: int = 60
+) -> dict[str, np.ndarray]:
+    """Write what a controller was given and sent in its first cycles, and return it."""
+    problem, controller = TASK.problem, TASK.controllers[name]
+    stepper = fp.Stepper(problem, controller, compiled=False)
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    state, realised = run["state"][:rows], run["realised"][:rows]
+    values = np.column_stack([np.arange(rows) * problem.period, state, realised, run["command"][:rows]])
+    names = ("time", *stepper.measures, *problem.plant.inputs)
+    columns = {n: values[:, k] for k, n in enumerate(names) if n not in without}
+    write(path, columns)
+    return columns
+
+
+def write(path: Path, columns: dict[str, np.ndarray]) -> None:
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(columns)
+        table.writerows(
+            ["" if np.isnan(v) else repr(float(v)) for v in row] for row in zip(*columns.values(), strict=True)
+        )
+
+
+@pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC+FPI", "RHC+FPI, model-referenced"])
+def test_its_own_record_gives_its_own_commands(tmp_path, name):
+    """To rounding, with its deformation, plan and integral."""
+    columns = recorded(tmp_path / "run.csv", name=name)
+    answer = replay(TASK.problem, TASK.controllers[name], tmp_path / "run.csv")
+    sent = np.column_stack([columns[n] for n in TASK.problem.plant.inputs])
+    assert answer.commands == pytest.approx(sent, rel=1e-9, abs=1e-9)
+    assert all(rms < 1e-8 for rms, _, _ in answer.differences().values())
+    assert sum(answer.statuses.values()) == 60
+
+
+def test_a_model_referenced_form_answers_to_the_commands_that_were_sent(tmp_path):
+    """On a record of another controller its deformation is bounded by the model's error, and does not wind up."""
+    columns = recorded(tmp_path / "run.csv", name="RHC", rows=200)
+    form = TASK.controllers["RHC+FPI, model-referenced"]
+    told = replay(TASK.problem, form, tmp_path / "run.csv")
+    write(tmp_path / "blind.csv", {n: c for n, c in columns.items() if n not in TASK.problem.plant.inputs})
+    blind = replay(TASK.problem, form, tmp_path / "blind.csv")
+    assert blind.recorded is None
+    assert blind.differences() == {}
+    sent = np.column_stack([columns[n] for n in TASK.problem.plant.inputs])
+    assert np.abs(told.commands - sent).max() < np.abs(blind.commands - sent).max()
+
+
+def test_a_lost_sample_skips_its_cycle(tmp_path):
+    columns = recorded(tmp_path / "run.csv")
+    columns["q1"][20] = np.nan
+    write(tmp_path / "run.csv", columns)
+    answer = replay(TASK.problem, TASK.controllers["RHC+FPI"], tmp_path / "run.csv")
+    assert answer.statuses["BAD_SAMPLE"] == 1
+    assert np.isfinite(answer.commands).all()
+
+
+def test_a_response_without_a_column_is_a_difference(tmp_path):
+    """That of the velocity; the first cycle has none."""
+    columns = recorded(tmp_path / "run.csv", without=("q1''", "q2''"))
+    assert "q1''" not in columns
+    answer = replay(TASK.problem, TASK.controllers["RHC+FPI"], tmp_path / "run.csv")
+    assert np.isfinite(answer.commands).all()
+
+
+def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    recorded(tmp_path / "run.csv", name="RHC")
+    assert main(["replay", "two_mass", "RHC+FPI", "run.csv", "--out", "commands.csv"]) == ExitCode.FINISHED
+    shown = capsys.readouterr().out
+    assert "60 cycles" in shown
+    assert "rms difference" in shown
+    head, *rows = list(csv.reader(Path("commands.csv").read_text().splitlines()))
+    assert head == ["time", *TASK.problem.plant.inputs]
+    assert len(rows) == 60
+
+
+TIMES = np.arange(5) * TASK.problem.period
+GOOD = {n: np.zeros(5) for n in ("q1", "q2", "q1'", "q2'", "q1''", "q2''")}
+INPUT = next(iter(TASK.problem.plant.inputs))
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"time": TIMES}, "it has no column 'q1', which the controller is given; its columns are time"),
+        ({"time": TIMES, **{n: c for n, c in GOOD.items() if "1" in n}}, "no column 'q2'"),
+        (GOOD, "it has no column 'time'"),
+        ({"time": 2 * TIMES, **GOOD}, "its times are not"),
+        ({"time": TIMES[:1], **{n: c[:1] for n, c in GOOD.items()}}, "its times are not"),
+        ({"time": TIMES[::-1], **GOOD}, "its times are not"),
+        ({"time": np.where(TIMES > 0, TIMES, np.nan), **GOOD}, "its times are not"),
+        ({"time": TIMES, **GOOD, INPUT: np.zeros(5)}, f"it has the commands of {INPUT} alone; expected those of"),
+    ],
+)
+def test_a_wrong_table_is_named(tmp_path, columns, words):
+    """All mistakes of a file together, each with what was expected."""
+    write(tmp_path / "run.csv", columns)
+    with pytest.raises(fp.FpirhcError) as error:
+        replay(TASK.problem, TASK.controllers["RHC"], tmp_path / "run.csv")
+    assert words in str(error.value)
+    assert "recording run.csv" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "cannot be read as a CSV file"),
+        ("", "cannot be read as a CSV file"),
+        ("time,q1\n0,one\n", "row 2 is not made of numbers: 0, one"),
+        ("time,q1\n0\n", "row 2 has 1 entries, the first one 2"),
+    ],
+)
+def test_a_file_that_is_no_table_is_named(tmp_path, text, words):
+    if text is not None:
+        (tmp_path / "run.csv").write_text(text)
+    with pytest.raises(fp.FpirhcError) as error:
+        replay(TASK.problem, TASK.controllers["RHC"], tmp_path / "run.csv")
+    assert words in str(error.value)
+
+
+def test_an_unknown_controller_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    recorded(tmp_path / "run.csv", name="RHC", rows=5)
+    assert main(["replay", "two_mass", "RHC+FPY", "run.csv"]) == ExitCode.BAD_INPUT
+    assert "RHC+FPI" in capsys.readouterr().err
