@@ -162,6 +162,7 @@ def test_settling_counts_the_size_of_the_first_error():
     """From 5 m below the band is 0.1 m as well; a later and larger error does not widen it."""
     still = np.zeros(CYCLES)
     assert fp.measure(problem(), run(step(-5.0, 0.099, 20), reference=still)).settling["y"] == pytest.approx(2.0)
+    assert fp.measure(problem(), run(step(-5.0, 0.1, 20), reference=still)).settling["y"] == pytest.approx(2.0)
     error = np.where(np.arange(CYCLES) == 1, 50.0, step(5.0, 0.101, 20))
     assert np.isnan(fp.measure(problem(), run(error, reference=still)).settling["y"])
 

@@ -63,7 +63,9 @@ def test_at_limit_is_where_a_command_stands_and_of_the_measured_part():
     assert share(-1.0) == share(2.0 - 2e-9) == 1.0
     assert share(2.0 - 4e-9) == pytest.approx(0.4)  # 1e-9 of the range of 3 N is at the limit
     assert share(2.0, problem()) == 0.0  # nothing limits it
-    assert share(0.0, problem(limits=fp.Limits(inputs={"u": (0.0, float("inf"))}))) == pytest.approx(0.6)
+    pump = problem(limits=fp.Limits(inputs={"u": (0.0, float("inf"))}))
+    assert share(0.0, pump) == share(0.9e-9, pump) == pytest.approx(0.6)
+    assert share(1.5e-9, pump) == 0.0  # a billionth of 1 N where a limit is open
 
 
 def test_total_variation_is_movement_per_second():
