@@ -26,9 +26,13 @@ from fpirhc.plant.motion import followed, followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Signal
 
 Steps = float | Sequence[Sequence[float]]  # one set-point, or pairs (time, set-point)
+
+
+_FUNCTIONS: Latest[ca.Function] = Latest(16)
 
 
 class Reference(Checked, ABC):
@@ -52,6 +56,9 @@ class Reference(Checked, ABC):
         Raises:
             InvalidProblem: a coordinate is missing, unknown, or not a scalar.
         """
+        return _FUNCTIONS.of((self, plant.equations), (), lambda: self._function(plant))
+
+    def _function(self, plant: Plant) -> ca.Function:
         matrix, what = kind(self.opaque), followed(plant)
         t = matrix.sym("t")
         motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
