@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 from fpirhc.task.dead_time import MEASUREMENT
 from fpirhc.task.problem import Problem
 
 _WHOLE = 1e-9  # of a cycle
-
-
-def shifted(problem: Problem, cycles: Mapping[str, int]) -> Problem:
-    """Return the problem with the dead time of these inputs longer by some cycles, or shorter."""
-    times = problem.dead_time.inputs
-    changed = {name: max(0.0, times.get(name, 0.0) + m * problem.period) for name, m in cycles.items()}
-    return replace(problem, dead_time=replace(problem.dead_time, inputs={**times, **changed}))
 
 
 def scaled(problem: Problem, percent: float) -> Problem:

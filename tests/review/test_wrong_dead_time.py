@@ -16,6 +16,8 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation import Deformation
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import loops_at
 from fpirhc.review.questions.convergence import box_converges
 from fpirhc.review.questions.dead_time import bears_wrong_dead_time, pays_when_late
 from fpirhc.review.review import predict
@@ -83,6 +85,26 @@ def test_a_pairing_that_is_wrong_by_a_cycle(form, borne):
     assert grows(mass(20), controller) is False
     assert grows(mass(21), controller) == (not borne)
     assert grows(mass(19), controller) == (not borne)
+
+
+@pytest.mark.parametrize("cycles", [-5, -1, 1, 3])
+def test_a_loop_with_another_dead_time_is_the_one_that_is_built_with_it(cycles):
+    """A queue more, or commands that arrive sooner: the poles of the loop that is composed with that dead time."""
+    controller = told(fp.Increment(MAP, cycles=20, uncertainty=5))
+    [loop] = loops_at(review_grid(mass(20), 0.0, 0), controller, [10])
+    [built] = loops_at(review_grid(mass(20 + cycles), 0.0, 0), controller, [10])
+    assert loop.delayed([0], cycles).radius == pytest.approx(built.radius, abs=1e-7)
+
+
+def test_plans_with_another_dead_time_are_those_that_are_built_with_it():
+    """Over the ten cycles from plan to plan, with both inputs later and with one of them."""
+    task = fp.load_problem("two_mass")
+    controller, names = task.controllers["RHC"], tuple(task.problem.plant.inputs)
+    [loop] = loops_at(review_grid(task.problem, 0.0, 0), controller, [10])
+    for late in ([0, 1], [1]):
+        times = fp.DeadTime(inputs={names[k]: 2 * task.problem.period for k in late})
+        [built] = loops_at(review_grid(replace(task.problem, dead_time=times), 0.0, 0), controller, [10])
+        assert loop.delayed(late, 2).radius == pytest.approx(built.radius, rel=1e-4)
 
 
 def test_what_survives_is_ready_and_what_grows_is_not():

@@ -6,16 +6,13 @@ dead time is made longer and shorter by 1, 2, 5, ... cycles, for all inputs toge
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.late import is_late, scaled, shifted
-from fpirhc.review.loops import loops_at
+from fpirhc.review.late import is_late, scaled
 from fpirhc.review.nominal_runs import CYCLES
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.margins import margins
@@ -42,10 +39,7 @@ def bears_wrong_dead_time(case: Case) -> Answer | None:
     if radius >= 1:
         text = f"with the dead time as it is the slowest mode is multiplied by {radius:.6g} per cycle"
         return Answer(WRONG_DEAD_TIME, Verdict.UNKNOWN, text, "See the convergence.", {"radius": radius})
-    try:
-        borne, beyond = _borne(case)
-    except FpirhcError as error:
-        return Answer(WRONG_DEAD_TIME, Verdict.UNKNOWN, str(error))
+    borne, beyond = _borne(case)
     if borne:
         more = (
             "or more"
@@ -67,33 +61,25 @@ def _borne(case: Case) -> tuple[int, tuple[int, float] | None]:
     for step in _STEPS:
         if step > max(1.0, longest / case.problem.period):
             break
-        radius = max(_radius(case, problem) for problem in _wrong(case.problem, step))
+        radius = max(_radius(case, *change) for change in _wrong(case.problem, step))
         if radius >= 1:
             return borne, (step, radius)
         borne = step
     return borne, None
 
 
-def _wrong(problem: Problem, step: int) -> list[Problem]:
-    """Problems whose dead time is longer and shorter by a step."""
-    inputs = tuple(problem.plant.inputs)
-    groups = [inputs]
-    if len({problem.dead_time.inputs.get(name, 0.0) for name in inputs}) > 1:
-        groups += [(name,) for name in inputs]
-    changes = [dict.fromkeys(group, sign * step) for group in groups for sign in (1, -1)]
-    return [shifted(problem, c) for c in changes if _possible(problem, c)]
+def _wrong(problem: Problem, step: int) -> list[tuple[list[int], int]]:
+    """Numbers of inputs, all together and where they differ each alone, with the cycles by which they are later or earlier."""
+    late = [problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs]
+    groups = [list(range(len(late))), *([[k] for k in range(len(late))] if len(set(late)) > 1 else [])]
+    earlier = [group for group in groups if all(late[k] - step > -1e-9 for k in group)]
+    return [*((group, step) for group in groups), *((group, -step) for group in earlier)]
 
 
-def _possible(problem: Problem, change: dict[str, int]) -> bool:
-    times = problem.dead_time.inputs
-    return all(times.get(name, 0.0) / problem.period + cycles > -1e-9 for name, cycles in change.items())
-
-
-def _radius(case: Case, problem: Problem) -> float:
+def _radius(case: Case, inputs: list[int], cycles: int) -> float:
     """Largest |pole| where the loop is slowest with the true dead time, and at the first point."""
-    places = {case.loops.places[0], case.loops.places[int(np.argmax(case.loops.radii))]}
-    grid = replace(case.grid, problem=problem)
-    return max(loop.radius for loop in loops_at(grid, case.controller, sorted(places)))
+    places = {0, int(np.argmax(case.loops.radii))}
+    return max(case.loops.loops[k].delayed(inputs, cycles).radius for k in places)
 
 
 def _margin_below_one(case: Case) -> float:

@@ -6,7 +6,8 @@ judged errors. A loop that repeats itself after n cycles only has n such matrice
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -79,6 +80,31 @@ class LinearLoop:
         )
         return (neutral & no_error) | (lasting & nothing)
 
+    def delayed(self, inputs: Sequence[int], cycles: int) -> LinearLoop:
+        """Return the loop some of whose commands arrive later by so many cycles, or earlier where the number is negative.
+
+        Later they wait in a queue behind the one of the loop. Earlier they are what will arrive then, C F^m z, which is known as
+        long as the loop delays them by m cycles.
+        """
+        count, some = len(self.cycles), list(inputs)
+        if cycles < 0:
+            ahead = [self._arriving_after(k, -cycles)[some] for k in range(count)]
+            return replace(self, cycles=tuple(_fed(one, some, v) for one, v in zip(self.cycles, ahead, strict=True)))
+        width = cycles * len(some)
+        return replace(
+            self,
+            cycles=tuple(_queued(one, some, width) for one in self.cycles),
+            errors=np.pad(self.errors, ((0, 0), (0, width))),
+            placed=np.pad(self.placed, ((0, width), (0, 0))),
+        )
+
+    def _arriving_after(self, first: int, cycles: int) -> np.ndarray:
+        """Commands (nu, n) that arrive some cycles after one of the period, of z at that one."""
+        count, moved = len(self.cycles), np.eye(self.cycles[first].dynamics.shape[1])
+        for k in range(first, first + cycles):
+            moved = self.cycles[k % count].dynamics @ moved
+        return self.cycles[(first + cycles) % count].arriving @ moved
+
     def carried(self, deviation: np.ndarray, cycles: int) -> tuple[np.ndarray, np.ndarray]:
         """Return states (cycles, nx, ...) and arriving commands (cycles, nu, ...) after a deviation z (n, ...) at the start."""
         z, states, commands = deviation, [], []
@@ -135,6 +161,29 @@ class LinearLoop:
             rows.append(one.arriving @ moved)
             moved = one.dynamics @ moved
         return np.vstack(rows)
+
+
+def _fed(one: LinearCycle, some: list[int], arriving: np.ndarray) -> LinearCycle:
+    """The cycle with other commands (some, n) in place of those that arrive."""
+    changed = one.arriving.copy()
+    changed[some] = arriving
+    return replace(one, dynamics=one.dynamics + one.entry @ (changed - one.arriving), arriving=changed)
+
+
+def _queued(one: LinearCycle, some: list[int], width: int) -> LinearCycle:
+    """The cycle with a queue of that width between some of the commands and the plant."""
+    after, size = one.dynamics.shape
+    wider = replace(
+        one,
+        dynamics=np.zeros((after + width, size + width)),
+        entry=np.pad(one.entry, ((0, width), (0, 0))),
+        arriving=np.pad(one.arriving, ((0, 0), (0, width))),
+        state=np.pad(one.state, ((0, 0), (0, width))),
+    )
+    wider.dynamics[:after, :size] = one.dynamics
+    wider.dynamics[after : after + len(some), :size] = one.arriving[some]
+    wider.dynamics[after + len(some) :, size : size + width - len(some)] = np.eye(width - len(some))
+    return _fed(wider, some, np.eye(size + width)[size + width - len(some) :])
 
 
 def _seen(rows: np.ndarray, vectors: np.ndarray) -> np.ndarray:
