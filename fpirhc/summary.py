@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 _LEAST_SHARE = 1e-5
 _WITH_POWER = re.compile(r"(?P<before>= ?|(?<![\w.]))(?P<number>[-+]?\d+(?:\.\d+)?e[+-]\d+)(?!\w)")
+_ROUNDING = 1e-9  # share of its scale, below which an error has no meaning
 _LONGEST = 1e6  # from which a number is written with a power of ten
 
 
@@ -119,6 +120,11 @@ def number(value: float) -> str:
 def in_percent(share: float) -> str:
     """Return a share in percent, in three digits; what is below a thousandth of a percent is said to be so."""
     return "less than 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{100 * share:.3g} %"
+
+
+def beside(value: float, scale: float) -> str:
+    """Return an error in three digits; what is rounding beside its scale is said to be so."""
+    return "0 to rounding" if 0 < value <= _ROUNDING * scale else f"{value:.3g}"
 
 
 def written_out(value: float, digits: int = 3) -> str:

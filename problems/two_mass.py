@@ -80,7 +80,7 @@ controllers = {
     "RHC, stiff": fp.RecedingHorizon(optimiser, cost=stiff),
     "RHC+FPI, stiff, small S": fp.RecedingHorizon(optimiser, fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), cost=stiff),
 }
-headline = ("RHC", "RHC+FPI, model-referenced")
+headline = ("RHC", "RHC+FPI")  # the published form
 tuning = {
     "CTC": {"tracking.rate": fp.LogSpan(2.0, 20.0)},  # 1/s
     "CTC+FPI (eq 6)": {"tracking.rate": fp.LogSpan(2.0, 20.0), "deformation.gain": fp.LogSpan(-1.5, -0.05)},

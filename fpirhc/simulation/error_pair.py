@@ -12,6 +12,7 @@ from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.metrics.base import measured_errors
 from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.run import Run
+from fpirhc.summary import beside
 from fpirhc.task.problem import Problem
 
 WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
@@ -50,10 +51,11 @@ class ErrorPair:
     def text(self) -> str:
         """Both errors of the worst coordinate in a sentence."""
         name = self.worst
-        return (
-            f"run on its own model, rms error of {name} {self.without[name]:.3g} without adaptation and {self.adapted[name]:.3g} "
-            f"with it, {100 * self.added(name):+.2g} % of its range"
-        )
+        before, after = (beside(e[name], self.ranges[name]) for e in (self.without, self.adapted))
+        if before == after == beside(0.5 * _ROUNDING, 1.0):
+            return f"run on its own model, rms error of {name} {before} without adaptation and with it"
+        share = f"{100 * self.added(name):+.2g} % of its range"
+        return f"run on its own model, rms error of {name} {before} without adaptation and {after} with it, {share}"
 
     @property
     def sentence(self) -> str:
@@ -106,4 +108,5 @@ def _ranges(problem: Problem, run: Run) -> dict[str, float]:
     places = [problem.plant.output.elements.index(name) for name in problem.judged_names]
     spans = np.ptp(errors + motion[:, places], axis=0)
     largest = np.abs(measured_errors(problem, run)).max(axis=0)
-    return {n: float(max(a, b)) for n, a, b in zip(problem.judged_names, spans, largest, strict=True)}
+    rounding = _ROUNDING * np.abs(motion[:, places]).max(axis=0)  # of a set-point that is held without an error
+    return {n: float(max(sizes)) for n, *sizes in zip(problem.judged_names, spans, largest, rounding, strict=True)}

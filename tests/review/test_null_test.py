@@ -13,6 +13,7 @@ from test_review_laws import moving
 
 import fpirhc as fp
 from fpirhc.deformation import Deformation
+from fpirhc.review.answer import Verdict
 from fpirhc.review.questions.form import forms_of, map_inside
 
 POLE = 86.7  # 1/s
@@ -117,3 +118,20 @@ def test_forms_are_around_the_map_itself():
         "model-referenced": fp.ModelReferenced(inner, cycles=2.0, measurement=1.0),
     }
     assert list(forms_of(drifting(0.005), inner)) == ["plain", "increment", "model-referenced"]
+
+
+def test_errors_of_rounding_are_called_so():
+    """A motor held at its speed with a right model: 4e-15 without adaptation and 4e-14 with it are no errors."""
+    task = fp.load_problem("noisy_motor")
+    found = answer(task.problem, task.controllers["RHC+FPI"], "right model alone")
+    assert found.verdict == Verdict.YES
+    assert found.evidence == "run on its own model, rms error of speed 0 to rounding without adaptation and with it"
+
+
+def test_targets_that_cure_more_than_they_spoil_do_no_harm():
+    """A heat exchanger: on a right model .135 K after .037, with the wrong one .066 after .69; no other form can be tried."""
+    task = fp.load_problem("heat_exchanger")
+    found = answer(task.problem, task.controllers["Cascade, last target"], "right model alone")
+    assert found.verdict == Verdict.UNKNOWN
+    assert found.evidence.endswith("+4.1 % of its range, less than what the wrong model costs without it")
+    assert found.change == "Change the gain, or leave the deformation out."

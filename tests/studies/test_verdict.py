@@ -249,6 +249,22 @@ def test_how_much_to_raise_the_scale_is_twice_what_is_needed():
     assert "raise its scale" not in judged(replace(deformation, scale=1.25 * needed * 1e-3)).verdict[0]
 
 
+def test_steps_of_a_plan_are_followed_until_the_next_plan():
+    """Two masses, a plan every 10 cycles: the scale that the sentence asks for is enough, and half of it is too."""
+    task = fp.load_problem("two_mass")
+    names = "RHC, stiff", "RHC+FPI, stiff, small S"
+    text = compare(task, seed=0, controllers=list(names), compiled=False).verdict[0]
+    desired = fp.simulate(task.problem, task.controllers[names[0]], seed=0, compiled=False)["desired"]
+    largest = np.linalg.norm(desired[10:] - desired[:-10], axis=1).max() / 10
+    more = 2 * largest / task.controllers[names[1]].deformation.largest_step()
+    assert f"changes by up to {largest:.3g} per cycle from plan to plan" in text
+    assert f"raise its scale S at least {more:.2g} times" in text
+    for scale in (more, 0.5 * more):
+        adaptive = task.controllers[names[0]].with_deformation(fp.Sigmoid(gain=-0.5, shift=0.3, scale=scale))
+        errors = fp.measure(task.problem, fp.simulate(task.problem, adaptive, seed=0, compiled=False)).rms_error
+        assert max(errors.values()) < 3e-4  # m; with the small one 5.8, without adaptation .02
+
+
 def test_without_a_pair_the_smallest_error_is_named(pair):
     """By the worst coordinate of each."""
     alone = [replace(entry(e, y=v), pair=None) for e, v in zip(pair, (0.25, 0.75), strict=True)]

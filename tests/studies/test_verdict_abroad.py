@@ -126,7 +126,7 @@ def test_a_filter_that_is_too_fast_for_a_wrong_model_is_named_by_review_and_verd
     comparison = compare(replace(task, problem=problem, controllers=rows, headline=None), seed=0, compiled=False)
     [worse] = [text for text in comparison.verdict if "does worse" in text]
     assert worse.startswith(
-        "fast does worse than RHC, whose model does not change (0.275): its relative error is 0.907 (3.3 times"
+        "fast does worse than RHC, whose model does not change (0.022 m): it has an rms error of h2 of 0.0725 m (3.3 times"
     )
     answers = fp.review(problem, {"fast": fast, "slow": slow}, mismatch=0.0, seed=0).controllers
     margin = {name: next(a for a in group if "margin" in a.question) for name, group in answers.items()}
@@ -140,7 +140,7 @@ def test_an_exact_model_that_is_beaten_is_no_bound():
     task = fp.load_problem("tumour")
     found = compare(task, seed=0, controllers=["RHC", "RHC+FPI", "RHC exact model"])
     [text] = [t for t in found.verdict if "no bound" in t]
-    assert text.startswith("RHC exact model is no bound here: its relative error is")
+    assert text.startswith("RHC exact model is no bound here: it has an rms error of size of")
     assert "its model does not hold the disturbance of dose; it plans every 20 cycles" in text
 
 

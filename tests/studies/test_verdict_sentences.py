@@ -29,9 +29,11 @@ EFFORT = (
 
 
 def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, errors=None, **changes: Any) -> Entry:
-    """An entry with these errors of y [m], z [rad]; `changes` are stop, desired, settings, planning, factor, facts, measured."""
+    """An entry with these errors of y [m], z [rad]; `changes` are its other fields and what its run holds."""
     signals = [Signal("error", ("y", "z"), ("m", "rad")), Signal("desired", ("y", "z"), ("m/s2", "rad/s2"))]
     values = [np.zeros((CYCLES, 2)), np.broadcast_to(changes.get("desired", 0.0), (CYCLES, 2))]
+    signals.append(Signal("command", ("u",), ("N",)))
+    values.append(np.asarray(changes.get("command", np.arange(CYCLES) % 2), dtype=float)[:, None])
     if changes.get("planning"):
         signals, values = [*signals, Signal("solve", SOLVE)], [*values, np.zeros((CYCLES, len(SOLVE)))]
     log = np.hstack(values)[: changes.get("cycles", CYCLES)]
@@ -299,10 +301,10 @@ def test_an_angle_that_is_held_is_lost_beyond_a_quarter_turn():
     assert [one.text.partition(" leaves ")[0] for one in left] == ["RHC"]
 
 
-def moving(before: float, after: float) -> Finding:
+def moving(before: float, after: float, **changes: Any) -> Finding:
     """The verdict on half the error, with these movements of the command."""
     facts = [{"total_variation": {"u": v}, "effort": {"u": 1.0}} for v in (before, after)]
-    return first(entry("RHC", measured=facts[0]), entry("FPI", "RHC", errors={"y": 0.5}, measured=facts[1]))
+    return first(entry("RHC", measured=facts[0]), entry("FPI", "RHC", errors={"y": 0.5}, measured=facts[1], **changes))
 
 
 def test_movement_of_the_command_is_stated_and_chatter_is_a_reason():
@@ -318,6 +320,8 @@ def test_movement_of_the_command_is_stated_and_chatter_is_a_reason():
         "FPI: its command moves 80 times as much as that of RHC (u 12 against 0.15): it chatters, or carries the noise. "
         + lower
     )
+    settles = moving(0.15, 12.0, command=np.linspace(0.0, 1.0, CYCLES))  # once, by its span
+    assert settles.text == f"{lower} Its command moves 80 times as much as that of RHC (u 12 against 0.15)."
     assert "moves and not that of RHC (u 0.2 against 0)" in moving(0.0, 0.2).text
     assert moving(0.0, 1e-10).text == lower
 
@@ -340,14 +344,21 @@ def test_a_far_better_row_is_named():
     """From a factor of two on, counted from the better of the pair; a row with the exact model is no rival."""
     pair = entry("RHC"), entry("FPI", "RHC", errors={"y": 2.0})
     assert said(*pair, entry("learner", errors={"y": 1 / 32001}))[1] == (
-        "learner is far better than this pair: its relative error is 3.12e-5 (RHC 1 and FPI 2), 32 000 times smaller than that of "
-        "RHC."
+        "learner is far better than this pair: it has an rms error of y of 3.12e-5 m (RHC 1 m and FPI 2 m), 32 000 times "
+        "smaller than that of RHC."
     )
     assert len(said(*pair, entry("learner", errors={"y": 0.51}))) == 1
     assert len(said(*pair, entry("exact", errors={"y": 1e-6}, facts={"exact": True}))) == 1
     assert said(*(entry(e.name, e.pair, stop="x") for e in pair), entry("learner"))[1] == (
-        "learner finishes its run, with a relative error of 1."
+        "learner finishes its run, with an rms error of y of 1 m."
     )
+
+
+def test_errors_of_several_coordinates_are_compared_over_their_ranges():
+    """Their root mean square: of .3 and .4 it is .3536."""
+    pair = entry("RHC", errors={"y": 1.0, "z": 1.0}), entry("FPI", "RHC", errors={"y": 1.0, "z": 1.0})
+    text = said(*pair, entry("learner", errors={"y": 0.3, "z": 0.4}))[1]
+    assert "it has a relative error, rms over range, of 0.354 (RHC 1 and FPI 1), 2.83 times smaller" in text
 
 
 def test_an_exact_model_that_is_worse_is_no_bound():
@@ -355,8 +366,8 @@ def test_an_exact_model_that_is_worse_is_no_bound():
     pair = entry("RHC"), entry("FPI", "RHC", errors={"y": 0.01})
     exact = {"exact": True, "no_bound": ("it plans every 10 cycles", "its model does not hold the wind")}
     assert said(*pair, entry("exact", errors={"y": 0.1}, facts=exact))[1] == (
-        "exact is no bound here: its relative error is 0.1, that of FPI 0.01. Why: it plans every 10 cycles; its model does not "
-        "hold the wind."
+        "exact is no bound here: it has an rms error of y of 0.1 m, FPI 0.01 m. Why: it plans every 10 cycles; its model "
+        "does not hold the wind."
     )
     assert len(said(*pair, entry("exact", errors={"y": 0.0105}, facts=exact))) == 1
 
@@ -366,11 +377,12 @@ def test_a_learner_that_does_worse_than_its_fixed_model_is_named():
     fixed: dict[str, Any] = {"facts": {"learns": True, "fixed": "RHC"}}
     both = [entry("RHC"), entry("FPI", "RHC")]
     assert said(*both, entry("RLS", errors={"y": 3.3}, **fixed))[1] == (
-        "RLS does worse than RHC, whose model does not change (1): its relative error is 3.3 (3.3 times more). Let it learn more "
-        "slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
+        "RLS does worse than RHC, whose model does not change (1 m): it has an rms error of y of 3.3 m (3.3 times more). Let it "
+        "learn more slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
     )
     assert (
-        " RHC, whose model does not change (1): it does not finish." in said(*both, entry("RLS", stop=STOP, **fixed))[1]
+        " RHC, whose model does not change (1 m): it does not finish."
+        in said(*both, entry("RLS", stop=STOP, **fixed))[1]
     )
     for errors in (1.0, 0.8):
         assert len(said(*both, entry("RLS", errors={"y": errors}, **fixed))) == 1

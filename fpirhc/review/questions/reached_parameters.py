@@ -9,13 +9,17 @@ it counts is the change of the response,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, each
+from fpirhc.review.inner import inner_places
 from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.task.problem import Problem
 
 REACHED = "Does the deformation reach the wrong parameters?"
 
@@ -24,7 +28,7 @@ def reaches_parameters(case: Case) -> Answer:
     """Return which wrong parameters are in the controlled response, and which are not."""
     plant = case.problem.plant
     names = plant.parameter.elements
-    wrong = [k for k, (believed, exact) in enumerate(zip(case.believed, plant.exact, strict=True)) if believed != exact]
+    wrong = _wrong(plant, case.believed)
     if not wrong and case.grid.elsewhere:
         return Answer(
             REACHED, Verdict.UNKNOWN, "what differs is the reality, and no parameter of the model's own plant"
@@ -36,7 +40,7 @@ def reaches_parameters(case: Case) -> Answer:
     sizes = {names[k]: _effect(case.grid, case.believed, k) for k in wrong if present[k]}
     numbers = {"wrong": float(len(wrong)), "reached": float(len(reached))}
     numbers |= {f"effect_{name}": size for name, size in sizes.items()}
-    idle = _without_task(case.grid, missed)
+    idle = _without_task(plant, case.grid.inner, missed)
     text = "; ".join([*_reached(sizes), *_missed(missed, idle)])
     if reached and not set(missed) - set(idle):
         return Answer(REACHED, Verdict.YES, text, "", numbers)
@@ -44,6 +48,27 @@ def reaches_parameters(case: Case) -> Answer:
     if reached:
         return Answer(REACHED, Verdict.UNKNOWN, text, change, numbers)
     return Answer(REACHED, Verdict.NO, text, f"{change} A deformation has nothing to correct.", numbers)
+
+
+def not_reached(problem: Problem, believed: np.ndarray) -> str:
+    """Return a sentence on the wrong parameters that no adaptation corrects; empty where it reaches all, or beside a reality."""
+    if problem.reality is not None:
+        return ""
+    plant = problem.plant
+    present = _present(plant)
+    missed = [plant.parameter.elements[k] for k in _wrong(plant, believed) if not present[k]]
+    idle = _without_task(plant, inner_places(problem), missed)
+    names = [name for name in missed if name not in idle]
+    if not names:
+        return ""
+    words = ", ".join(names)
+    return (
+        f"The controlled response does not depend on {words}, which the model has wrong and adaptation cannot correct."
+    )
+
+
+def _wrong(plant: Plant, believed: np.ndarray) -> list[int]:
+    return [k for k, (value, exact) in enumerate(zip(believed, plant.exact, strict=True)) if value != exact]
 
 
 def _reached(sizes: dict[str, float]) -> list[str]:
@@ -58,16 +83,15 @@ def _missed(names: list[str], idle: list[str]) -> list[str]:
     return [f"the response does not depend on {', '.join(names)}{note}"]
 
 
-def _without_task(grid: ReviewGrid, names: list[str]) -> list[str]:
+def _without_task(plant: Plant, inner: Sequence[int], names: list[str]) -> list[str]:
     """Those of the parameters that are in the responses of simulated states alone, see `fpirhc.review.inner`."""
-    plant = grid.problem.plant
     pattern = np.asarray(ca.DM(plant.equations.response.jac_sparsity(0, 2), 1).full()) != 0
-    inner = {plant.state.elements[k].rstrip("'") for k in grid.inner}
+    simulated = {plant.state.elements[k].rstrip("'") for k in inner}
     of = {
         name: {c for c, row in zip(plant.names, pattern, strict=True) if row[k]}
         for k, name in enumerate(plant.parameter.elements)
     }
-    return [name for name in names if of[name] and of[name] <= inner]
+    return [name for name in names if of[name] and of[name] <= simulated]
 
 
 def _present(plant: Plant) -> list[bool]:

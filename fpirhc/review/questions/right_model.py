@@ -13,6 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from fpirhc.errors import FpirhcError
+from fpirhc.plant.chain import response_units
+from fpirhc.plant.units import with_space
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.nominal_runs import TRIED, null_runs
 from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, response_errors
@@ -20,6 +22,7 @@ from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.form import form_of, forms_of
 from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
 from fpirhc.simulation.model_as_plant import with_believed_way
+from fpirhc.summary import beside
 
 PAYS = "Does adaptation lower the response error?"
 _HARM = 0.5  # share of the error without adaptation that adaptation may make of a model that is right
@@ -35,7 +38,8 @@ def pays(case: Case) -> Answer:
     without = rms(nominal, errors_without_adaptation(nominal))
     adapted = rms(nominal, response_errors(nominal))
     null = rms(nominal, response_errors(nominal, exact=nominal.believed))
-    text = f"predicted rms response error: {without:.3g} without adaptation, {adapted:.3g} with it, {null:.3g} with a right model"
+    sizes = [f"{beside(e, nominal_size(nominal))}{_unit(case)}" for e in (without, adapted, null)]
+    text = f"predicted rms response error: {sizes[0]} without adaptation, {sizes[1]} with it, {sizes[2]} with a right model"
     numbers = {"without": without, "with": adapted, "null": null}
     if case.loops.loops and case.loops.radii.min() >= 1 and not case.loops.learns:
         change = "The prediction leaves the outer loop out, and this one does not converge: see the convergence."
@@ -77,6 +81,13 @@ def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer
     return Answer(PAYS, Verdict.NO, text, change, numbers)
 
 
+def _unit(case: Case) -> str:
+    """The unit of the response errors with a space, where all controlled responses have one and the same."""
+    plant = case.problem.plant
+    units = {u for n, u in zip(plant.chains, response_units(plant), strict=True) if n in plant.controlled_names}
+    return with_space(units.pop()) if len(units) == 1 else ""
+
+
 def rms(nominal: NominalRun, errors: ResponseErrors) -> float:
     """Return the rms response error over all coordinates, from `measure_from` on; infinite where the errors do not stay finite."""
     first = min(round(nominal.problem.measure_from / nominal.problem.period), nominal.cycles - 1)
@@ -105,7 +116,8 @@ def leaves_right_model_alone(case: Case) -> Answer:
     numbers, text = {}, ""
     if nominal is not None and predicted is not None:
         numbers = {"response_without": 0.0, "response_with": predicted}
-        text = f"predicted rms response error on a right model {predicted:.3g}, without adaptation 0; "
+        size = f"{beside(predicted, nominal_size(nominal))}{_unit(case)}"
+        text = f"predicted rms response error on a right model {size}, without adaptation 0; "
         if predicted <= ROUNDING * nominal_size(nominal):
             return Answer(NULL_TEST, Verdict.YES, f"{text}the request stays the desired response", "", numbers)
     ideal = case.loops.ideal
@@ -121,7 +133,7 @@ def leaves_right_model_alone(case: Case) -> Answer:
     text += runs.text
     if runs.passes:
         return Answer(NULL_TEST, Verdict.YES, text, "", numbers)
-    harmful = runs.fails and not case.controller.learns and not _cures_more(nominal, predicted)
+    harmful = runs.fails and not case.controller.learns and not _cures_more(case, runs, nominal, predicted)
     if runs.fails and not harmful:
         text += ", less than what the wrong model costs without it" if not case.controller.learns else ""
     verdict = Verdict.NO if harmful else Verdict.UNKNOWN
@@ -129,19 +141,26 @@ def leaves_right_model_alone(case: Case) -> Answer:
     return Answer(NULL_TEST, verdict, text, change, numbers | more)
 
 
-def _cures_more(nominal: NominalRun | None, predicted: float | None) -> bool:
-    """Whether the wrong model makes a larger response error without adaptation than adaptation makes of a right model."""
-    return (
-        nominal is not None and predicted is not None and predicted < rms(nominal, errors_without_adaptation(nominal))
-    )
+def _cures_more(case: Case, runs: ErrorPair, nominal: NominalRun | None, predicted: float | None) -> bool:
+    """Whether the wrong model makes a larger error without adaptation than adaptation makes of a right model.
+
+    By the prediction; of a deformation of targets, which nothing predicts, by a run on the plant.
+    """
+    if nominal is not None and predicted is not None:
+        return predicted < rms(nominal, errors_without_adaptation(nominal))
+    trial = case.trial(case.controller.deformation) if case.controller.deforms == "target" else ""
+    real = None if isinstance(trial, str) else trial[0]
+    return real is not None and real.lowers and runs.adapted[runs.worst] < real.without[runs.worst]
 
 
 def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, dict[str, float]]:
     """Which form passes, by a run, and which period would do, by the prediction."""
     sentences, numbers = [], {}
     used = form_of(case.controller.deformation)
+    others = 0
     for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
         trial = case.trial(form) if name != used else "it is in use"
+        others += not isinstance(trial, str)
         if not isinstance(trial, str) and not case.harm(form):
             null = trial[1]
             sentences.append(f"The {name} form passes: rms error of {null.worst} {null.adapted[null.worst]:.3g}.")
@@ -151,12 +170,16 @@ def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, 
     period = None if predicted is None or grows else _period(case, runs, predicted)
     if period is not None and period < case.problem.period:
         shorter = case.problem.period / period
-        text = f"The form in use needs a period about {shorter:.2g} times shorter, {period:.2g}."
+        text = (
+            f"The form in use needs a period about {shorter:.2g} times shorter, {period:.2g} {case.problem.time_unit}."
+        )
         sentences.append(text if shorter <= _PRACTICAL else "No practical period would do for the form in use.")
         numbers["period"] = period
     if not sentences:
         sentences.append(
             "No form does better than none: leave the deformation out, or choose other controlled coordinates."
+            if others
+            else "Change the gain, or leave the deformation out."
         )
     return " ".join(sentences), numbers
 

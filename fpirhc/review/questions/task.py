@@ -49,7 +49,7 @@ def well_posed(grid: ReviewGrid) -> Answer:
     return Answer(
         WELL_POSED,
         Verdict.YES,
-        f"finite at {len(grid.times)} points with {len(grid.draws)} parameter draws{_simulated(grid)}",
+        f"finite at {len(grid.times)} points with {len(grid.draws)} parameter draw{'s' * (len(grid.draws) > 1)}{_simulated(grid)}",
         "",
         numbers,
     )

@@ -1,8 +1,8 @@
 """Known reasons why adaptation does not help in a run, in sentences.
 
 They stand in the order in which they act: a cost that weighs absolute effort, plans that did not converge or stay in a local
-optimum, a gain that is too large
-by the response Jacobian's eigenvalues or too small by the review, a step limit below the slew of the desired response, commands
+optimum, wrong parameters that are in no controlled response, a gain that is too large by the response Jacobian's eigenvalues or
+too small by the review, a step limit below the slew of the desired response, commands
 that stand at their limits, and commands that move far more than those of the pair. What is a fact of the runs alone is stated where
 the share of the cycles is no start or single event. Where the gain is the cause, limits that are reached are its effect.
 """
@@ -38,6 +38,7 @@ def causes(plain: Entry, adaptive: Entry) -> str:
         effort_cause(adaptive),
         plan_cause(plain, adaptive),
         stuck_cause(adaptive),
+        adaptive.not_reached,
         gain,
         _slew_cause(plain, adaptive),
         "" if gain else limit_cause(plain, adaptive),
@@ -61,18 +62,25 @@ def grows(entry: Entry) -> bool:
 
 
 def _slew_cause(plain: Entry, adaptive: Entry) -> str:
-    """The step limit is compared with the desired response of the same controller without adaptation, which does not diverge."""
-    limit = adaptive.run.settings["step_limit"]
-    if not isinstance(limit, float) or plain.run.cycles < MANY_CYCLES:
+    """The step limit is compared with the desired response of the same controller without adaptation, which does not diverge.
+
+    A plan moves it in a step, which the map follows until the next plan.
+    """
+    limit, every = adaptive.run.settings["step_limit"], plain.plan_every
+    if not isinstance(limit, float) or plain.run.cycles < MANY_CYCLES * every:
         return ""
-    largest = float(np.linalg.norm(np.diff(plain.run["desired"], axis=0), axis=1).max())
+    desired = plain.run["desired"]
+    largest = float(np.linalg.norm(desired[every:] - desired[:-every], axis=1).max()) / every
     if largest < limit:
         return ""
     more = f"at least {SPARE * largest / limit:.2g} times"
     change = f"raise its scale S {more}, or leave S out to have it chosen"
     if "scale" in adaptive.automatic:
         change = f"the scale S that was chosen automatically did not foresee this, so state one that is {more} as large"
-    fact = f"The desired response changes by up to {largest:.3g} in one cycle, more than the map's largest step of {limit:.3g}"
+    span = "in one cycle" if every == 1 else "per cycle from plan to plan"
+    fact = (
+        f"The desired response changes by up to {largest:.3g} {span}, more than the map's largest step of {limit:.3g}"
+    )
     return f"{fact}: {change}."
 
 
@@ -119,17 +127,22 @@ def limit_cause(plain: Entry, adaptive: Entry) -> str:
 
 
 def chatter_cause(plain: Entry, adaptive: Entry) -> str:
-    """Return a sentence where the command moves far more than that of the pair; else nothing."""
+    """Return a sentence where the command moves far more than that of the pair, to and fro; else nothing."""
     more = _movement(plain, adaptive)
-    return (
-        f"{more}: it chatters, or carries the noise." if more and _times_moved(plain, adaptive)[0] >= _CHATTER else ""
-    )
+    return f"{more}: it chatters, or carries the noise." if more and _chatters(plain, adaptive) else ""
 
 
 def movement(plain: Entry, adaptive: Entry) -> str:
     """Return a sentence on how much more the command moves, where it is more and no chatter; else nothing."""
     more = _movement(plain, adaptive)
-    return f"{more}." if more and _times_moved(plain, adaptive)[0] < _CHATTER else ""
+    return f"{more}." if more and not _chatters(plain, adaptive) else ""
+
+
+def _chatters(plain: Entry, adaptive: Entry) -> bool:
+    """Whether it moves ten times as much, and ten times its own span: a command that settles once moves by its span."""
+    ratio, name = _times_moved(plain, adaptive)
+    command = adaptive.run[f"command.{name}"] if ratio >= _CHATTER else np.zeros(1)
+    return float(np.abs(np.diff(command)).sum()) >= _CHATTER * float(np.ptp(command)) > 0
 
 
 def _movement(plain: Entry, adaptive: Entry) -> str:

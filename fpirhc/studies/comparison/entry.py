@@ -60,6 +60,7 @@ class Entry:
         information: what it measures and when it acts; None: not asked.
         automatic: settings of its deformation that were chosen automatically.
         reviewed_gain: what a review says of a gain that is too large or too small; empty where it is neither, or was not asked.
+        not_reached: what a review says of wrong parameters that adaptation does not correct; empty likewise.
     """
 
     name: str
@@ -83,3 +84,4 @@ class Entry:
     information: Information | None = None
     automatic: tuple[str, ...] = ()
     reviewed_gain: str = ""
+    not_reached: str = ""

@@ -7,12 +7,10 @@ and so a comparison judges a row whose pair is no row. A plant outside is not ru
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.errors import FpirhcError
-from fpirhc.review.slow_gain import reviewed_gain
 from fpirhc.simulation.metrics import Metric, measure
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
@@ -22,6 +20,7 @@ from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.null_test import null_test
 from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.side_by_side import with_causes
 from fpirhc.studies.comparison.verdict import judge
 from fpirhc.task.problem import Problem
 
@@ -74,8 +73,7 @@ def _harm(
         yardstick = yardstick_of(problem, seed=seed)
         finding = judge(plain, adaptive, yardstick)
         if finding.outcome is Outcome.WORSE:
-            said = reviewed_gain(problem, loops[1].controller, grows=False)  # nothing predicts a contraction here
-            finding = judge(plain, replace(adaptive, reviewed_gain=said), yardstick)
+            finding = judge(plain, with_causes(problem, adaptive, loops[1].controller), yardstick)
         losses, cured = [finding.text] * (finding.outcome is Outcome.WORSE), plain.metrics.rms_error
     test = null_test(model, loops, pair, sizes, counted, cured=cured)
     return (*losses, *([test.text] if test.harmful else []))

@@ -10,9 +10,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from fpirhc.plant.units import with_space
 from fpirhc.review.questions.margins import SLOWER
 from fpirhc.studies.comparison.changes import HELPS, HURTS, ROUNDING, times
 from fpirhc.studies.comparison.outcome import Finding
+from fpirhc.summary import written_out
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.entry import Entry
@@ -34,11 +36,29 @@ def remarks(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scales: 
 def relative_error(entry: Entry, scales: Mapping[str, float], weighed: frozenset[str] | None) -> float:
     """The relative error of an entry; infinite for a run that ended early."""
     errors = entry.metrics.rms_error
-    names = [n for n in errors if weighed is None or n in weighed] or list(errors)
-    shares = [errors[n] / scales.get(n, 1.0) for n in names]
+    shares = [errors[n] / scales.get(n, 1.0) for n in _counted(entry, weighed)]
     if entry.run.stop is not None or not shares or not all(map(math.isfinite, shares)):
         return math.inf
     return math.sqrt(math.fsum(s * s for s in shares) / len(shares))
+
+
+def _said(entry: Entry, scales: Mapping[str, float], weighed: frozenset[str] | None) -> str:
+    """The error by which rows are compared, with its name: that of one coordinate in its unit, of several over their ranges."""
+    names = _counted(entry, weighed)
+    noun = f"an rms error of {names[0]} of" if len(names) == 1 else "a relative error, rms over range, of"
+    return f"{noun} {_size(entry, scales, weighed)}"
+
+
+def _size(entry: Entry, scales: Mapping[str, float], weighed: frozenset[str] | None) -> str:
+    names = _counted(entry, weighed)
+    if len(names) > 1:
+        return written_out(relative_error(entry, scales, weighed))
+    return f"{written_out(entry.metrics.rms_error[names[0]])}{with_space(entry.run.unit(f'error.{names[0]}'))}"
+
+
+def _counted(entry: Entry, weighed: frozenset[str] | None) -> list[str]:
+    errors = entry.metrics.rms_error
+    return [n for n in errors if weighed is None or n in weighed] or list(errors)
 
 
 def _far_better(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scales: Mapping[str, float]) -> list[str]:
@@ -52,13 +72,13 @@ def _far_better(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scal
     if best is None or not math.isfinite(error[best.name]) or error[ahead.name] < ROUNDING:
         return []
     if math.isinf(error[ahead.name]):
-        return [f"{best.name} finishes its run, with a relative error of {error[best.name]:.3g}."]
+        return [f"{best.name} finishes its run, with {_said(best, scales, weighed)}."]
     ratio = error[ahead.name] / max(error[best.name], ROUNDING)
     if ratio < FAR:
         return []
-    both = " and ".join(f"{e.name} {error[e.name]:.3g}" for e in pair)
+    both = " and ".join(f"{e.name} {_size(e, scales, weighed)}" for e in pair)
     return [
-        f"{best.name} is far better than this pair: its relative error is {error[best.name]:.3g} ({both}), {times(ratio)} "
+        f"{best.name} is far better than this pair: it has {_said(best, scales, weighed)} ({both}), {times(ratio)} "
         f"smaller than that of {ahead.name}."
     ]
 
@@ -73,10 +93,11 @@ def _worse_learners(entries: Sequence[Entry], scales: Mapping[str, float]) -> li
         error, before = (relative_error(e, scales, one.weighed) for e in (one, fixed))
         if error <= HURTS * before or error < ROUNDING:
             continue
-        much = f"{error:.3g} ({times(error / before)} more)" if before > 0 and math.isfinite(error) else "no number"
-        end = "it does not finish" if one.run.stop is not None else f"its relative error is {much}"
+        more = f" ({times(error / before)} more)" if before > 0 and math.isfinite(error) else ""
+        end = "it does not finish" if one.run.stop is not None else f"it has {_said(one, scales, one.weighed)}{more}"
+        much = _size(fixed, scales, one.weighed)
         sentences.append(
-            f"{one.name} does worse than {fixed.name}, whose model does not change ({before:.3g}): {end}. {SLOWER}"
+            f"{one.name} does worse than {fixed.name}, whose model does not change ({much}): {end}. {SLOWER}"
         )
     return sentences
 
@@ -96,10 +117,10 @@ def _no_bound(entries: Sequence[Entry], scales: Mapping[str, float]) -> list[str
         name = beaten_by(exact, entries, scales)
         if name is None:
             continue
-        bound, less = (relative_error(e, scales, exact.weighed) for e in (exact, by_name[name]))
         why = "; ".join(exact.no_bound) or "not known"
         sentences.append(
-            f"{exact.name} is no bound here: its relative error is {bound:.3g}, that of {name} {less:.3g}. Why: {why}."
+            f"{exact.name} is no bound here: it has {_said(exact, scales, exact.weighed)}, {name} "
+            f"{_size(by_name[name], scales, exact.weighed)}. Why: {why}."
         )
     return sentences
 

@@ -9,7 +9,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from fpirhc.broken import attempted
+from fpirhc.controllers.base import Controller
+from fpirhc.review.questions.reached_parameters import not_reached
 from fpirhc.review.slow_gain import reviewed_gain
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator
@@ -53,10 +57,10 @@ def beside_each_other(
     return shown
 
 
-def with_reviewed_gains(
+def with_reviewed_causes(
     problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], judged: Sequence[Finding]
 ) -> list[Entry]:
-    """Return the entries with what a review says of their gain, where a pair's verdict is not plainly positive.
+    """Return the entries with what a review says of gain and wrong parameters, where a pair's verdict is not plainly positive.
 
     Args:
         problem: of the comparison.
@@ -65,12 +69,20 @@ def with_reviewed_gains(
         judged: the verdict so far.
     """
     asked = {finding.pair[1] for finding in judged if finding.pair and finding.outcome is not Outcome.BETTER}
-    return [
-        replace(e, reviewed_gain=reviewed_gain(problem, built[e.name].loop.controller, grows=grows(e)))
-        if e.name in asked
-        else e
-        for e in entries
-    ]
+    return [with_causes(problem, e, built[e.name].loop.controller) if e.name in asked else e for e in entries]
+
+
+def with_causes(problem: Problem, entry: Entry, controller: Controller) -> Entry:
+    """Return an entry with what a review says of the gain and of wrong parameters.
+
+    Args:
+        problem: of the comparison.
+        entry: of an adaptive controller.
+        controller: resolved.
+    """
+    believed = controller.plant_model(problem).parameters(problem.plant)
+    missed = not_reached(problem, np.asarray(believed))
+    return replace(entry, reviewed_gain=reviewed_gain(problem, controller, grows=grows(entry)), not_reached=missed)
 
 
 def null_tests(
