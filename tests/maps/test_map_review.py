@@ -94,7 +94,9 @@ def test_questions_about_time_are_not_asked() -> None:
     assert not any("integrator" in q or "discretisation" in q or "small lag" in q for q in asked), asked
     assert [a.question for a in answers if a.verdict.name == "NO"] == []
     [null] = [a for a in answers if "right model alone" in a.question]
-    assert "predicted rms response error on a right model 0," in null.evidence or "e-1" in null.evidence, null.evidence
+    assert null.evidence.startswith(
+        ("predicted rms response error on a right model 0 ", "predicted rms response error on a right model 0,")
+    )
 
 
 def test_zero_dynamics_have_the_zeros_of_the_sampled_plant() -> None:

@@ -38,7 +38,7 @@ def pays(case: Case) -> Answer:
     without = rms(nominal, errors_without_adaptation(nominal))
     adapted = rms(nominal, response_errors(nominal))
     null = rms(nominal, response_errors(nominal, exact=nominal.believed))
-    sizes = [f"{beside(e, nominal_size(nominal))}{_unit(case)}" for e in (without, adapted, null)]
+    sizes = [_with_unit(case, e, nominal_size(nominal)) for e in (without, adapted, null)]
     text = f"predicted rms response error: {sizes[0]} without adaptation, {sizes[1]} with it, {sizes[2]} with a right model"
     numbers = {"without": without, "with": adapted, "null": null}
     if case.loops.loops and case.loops.radii.min() >= 1 and not case.loops.learns:
@@ -81,11 +81,12 @@ def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer
     return Answer(PAYS, Verdict.NO, text, change, numbers)
 
 
-def _unit(case: Case) -> str:
-    """The unit of the response errors with a space, where all controlled responses have one and the same."""
+def _with_unit(case: Case, error: float, scale: float) -> str:
+    """A response error in its unit, where all controlled responses have one and the same."""
     plant = case.problem.plant
     units = {u for n, u in zip(plant.chains, response_units(plant), strict=True) if n in plant.controlled_names}
-    return with_space(units.pop()) if len(units) == 1 else ""
+    size = beside(error, scale)
+    return f"{size}{with_space(units.pop())}" if len(units) == 1 and size == f"{error:.3g}" else size
 
 
 def rms(nominal: NominalRun, errors: ResponseErrors) -> float:
@@ -116,7 +117,7 @@ def leaves_right_model_alone(case: Case) -> Answer:
     numbers, text = {}, ""
     if nominal is not None and predicted is not None:
         numbers = {"response_without": 0.0, "response_with": predicted}
-        size = f"{beside(predicted, nominal_size(nominal))}{_unit(case)}"
+        size = _with_unit(case, predicted, nominal_size(nominal))
         text = f"predicted rms response error on a right model {size}, without adaptation 0; "
         if predicted <= ROUNDING * nominal_size(nominal):
             return Answer(NULL_TEST, Verdict.YES, f"{text}the request stays the desired response", "", numbers)
