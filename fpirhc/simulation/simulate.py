@@ -38,6 +38,8 @@ CHUNK = 500  # cycles per call: long enough to hide Python, short enough for pro
 SHORT, _CHAIN = 25, 5  # cycles per call of the virtual machine, for which a longer chain takes longer than it saves
 Progress = Callable[[int, int], None]
 SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
+_TOO_SHORT = "compiled=None was given, and the run is short"
+_SHORT_RUN = 100_000  # cycles times stages, below which a compiler takes longer than the virtual machine
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +141,7 @@ def simulator(
     problem: Problem,
     controller: Controller,
     *,
-    compiled: bool = True,
+    compiled: bool | None = True,
     flags: Sequence[str] = (),
     live: Sequence[str] = (),
 ) -> Simulator:
@@ -148,7 +150,7 @@ def simulator(
     Args:
         problem: the task.
         controller: its automatic settings are chosen here.
-        compiled: whether the loop is compiled to C where there is a compiler.
+        compiled: whether the loop is compiled to C where there is a compiler; None: unless the run is short.
         flags: for the compiler, after its usual ones.
         live: paths of settings that a run may change without another build: 'deformation.gain', 'cost.states.q1',
             'limits.inputs.Q1'.
@@ -161,8 +163,9 @@ def simulator(
     settings = live_settings(problem, controller, live)
     ready = settings.controller
     loop = close_loop(problem, ready, settings if live else None)
-    backend = Native(loop.function, False, SWITCHED_OFF)
-    if compiled:
+    long = problem.cycles * (problem.horizon.stages if problem.horizon is not None else 1) > _SHORT_RUN
+    backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
+    if compiled or (compiled is None and long):
         backend = native(_chained(problem, loop, CHUNK), flags, required=bool(live))
     function = backend.function if backend.compiled else _chained(problem, loop, SHORT)
     return Simulator(problem, ready, loop, Evaluator(function), backend.compiled, backend.reason, settings)
@@ -182,7 +185,7 @@ def simulate(
     *,
     seed: Seed,
     name: str = "",
-    compiled: bool = True,
+    compiled: bool | None = True,
     flags: Sequence[str] = (),
     progress: Progress | None = None,
     settings: Numbers | None = None,
@@ -199,7 +202,7 @@ def simulate(
         controller: its automatic settings are chosen here.
         seed: of the noise of disturbances and sensors.
         name: of the controller in the results; '': its name in the task from which it comes, else the name of its class.
-        compiled: whether the loop is compiled to C where there is a compiler.
+        compiled: whether the loop is compiled to C where there is a compiler; None: unless the run is short.
         flags: for the compiler, after its usual ones.
         progress: called with (cycles done, cycles in all).
         settings: numbers of settings by path, in place of those of the controller and the problem.
