@@ -237,12 +237,6 @@ def receding() -> None:
     edited("controllers = {\n", PLANNERS)
 
 
-def tight() -> None:
-    """Limits that the first state violates."""
-    receding()
-    edited('limits=fp.Limits(inputs={"u": (-30.0, 30.0)})', TIGHT)
-
-
 def tunable() -> None:
     edited("controllers = {", 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}\ncontrollers = {')
 

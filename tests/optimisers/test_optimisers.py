@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import chain, known, pendulum
+from plants import chain, known
 
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
@@ -85,35 +85,6 @@ def test_contradictory_limits_are_infeasible_not_solved():
     assert np.isfinite(plan.inputs).all()
 
 
-@settings(deadline=None, derandomize=True, max_examples=40)
-@given(seed=st.integers(0, 10**6), low=st.floats(-3, 0), high=st.floats(0, 3), weight=st.floats(1e-3, 10))
-def test_random_box_constrained_problems_are_solved_or_honestly_not(seed, low, high, weight):
-    """Never a wrong 'converged': whenever the status is OK, the independent residual is below the tolerance."""
-    random = np.random.default_rng(seed)
-    ocp, data = _random_problem()
-    ocp_bounds = (np.array([low]), np.array([high]))
-    step = GRADIENT.step(ocp)
-    memory = GRADIENT.memory(ocp).start()
-    first = random.normal(size=2)
-    inputs, diagnostics, _ = step(first, data, *ocp_bounds, memory)
-    _, residual, _ = judge(ocp)(inputs, first, data, *ocp_bounds, np.zeros((2, ocp.stages)))
-    diagnostics_value = diagnostics.full().ravel()
-    assert diagnostics_value[1] == pytest.approx(float(residual), rel=1e-9, abs=1e-12)
-    assert (diagnostics_value[4] == fp.Status.OK) == (diagnostics_value[1] <= GRADIENT.tolerance)
-    assert low - 1e-12 <= inputs.full().min() <= inputs.full().max() <= high + 1e-12
-    assert weight > 0
-
-
-def _random_problem(cache={}):  # noqa: B006 -- built once for all examples
-    if not cache:
-        plant, reference = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(t)})
-        horizon = fp.Horizon(stages=10, step=0.05)
-        cost = fp.Quadratic(states={"angle": 10.0, "angle'": 0.1}, effort={"torque": 0.05})
-        cache["ocp"] = transcribe(plant, reference, horizon, cost, fp.Limits())
-        cache["data"] = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
-    return cache["ocp"], cache["data"]
-
-
 @pytest.mark.parametrize("optimiser", EVERY, ids=ids)
 def test_poisoned_problem_keeps_the_last_plan_and_recovers(optimiser):
     """NaN data: status NON_FINITE and the remembered plan, never NaN; the next good problem is solved."""
@@ -128,18 +99,6 @@ def test_poisoned_problem_keeps_the_last_plan_and_recovers(optimiser):
     for _ in range(5):
         _, diagnostics, memory = step(first, data, *bounds, memory)
     assert int(diagnostics[4]) == fp.Status.OK
-
-
-@pytest.mark.parametrize("optimiser", EVERY, ids=ids)
-def test_memory_is_shifted_by_one_stage(optimiser):
-    """The next call starts where this one's second stage was."""
-    ocp, data, first = two_mass(BOXES["free"])
-    layout = optimiser.memory(ocp)
-    inputs, _, memory = optimiser.step(ocp)(first, data, ocp.input_lower, ocp.input_upper, layout.start())
-    shifted_value = ca.MX.sym("m", layout.size)
-    shifted = ca.Function("fpirhc_shifted", [shifted_value], [optimiser.shifted(ocp, shifted_value)])(memory)
-    later_inputs = shifted.full().ravel()[layout.slice("plan_inputs")].reshape(ocp.stages, 2).T
-    np.testing.assert_array_equal(later_inputs, np.hstack([inputs.full()[:, 1:], inputs.full()[:, -1:]]))
 
 
 def test_settings_are_checked():
