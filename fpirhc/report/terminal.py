@@ -6,6 +6,7 @@ the rows.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -41,6 +42,7 @@ STYLES = {
     Outcome.NOT_COMPARABLE: "dim",
     None: "",  # a remark
 }
+_IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\d{3}\b)"), "\ue000"  # thousands, and what no line breaks at in their place
 _MOST_STEPS = 6  # of the set-points of one coordinate in a text
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
@@ -49,8 +51,11 @@ _EDGES = 2  # columns left and right of a table
 
 def say(text: str, style: str = "", more: str = "", *, wrap: bool = True) -> None:
     """Print text in which nothing is markup, and more of it without the style; without `wrap` it stays on one line."""
-    line = Text.assemble((printable(text), style), printable(more))
-    Console().print(line, highlight=False, soft_wrap=not wrap)
+    console, whole = Console(), Text.assemble((printable(text), style), printable(more))
+    whole.plain = _IN_NUMBER.sub(_HELD, whole.plain)
+    for line in whole.wrap(console, console.width) if wrap else [whole]:
+        line.plain = line.plain.replace(_HELD, " ")
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def show(view: View, report: Path) -> None:

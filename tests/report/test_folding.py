@@ -8,7 +8,7 @@ import re
 import pytest
 from rich.console import Console
 
-from fpirhc.report.terminal import show_table
+from fpirhc.report.terminal import say, show_table
 from fpirhc.summary import Column, Table
 
 HEADS = ("controller", "rms concentration [mg/l]", "max error [mg/l]", "clipped", "factor", "cycle us", "status")
@@ -70,3 +70,14 @@ def test_texts_are_literal():
     text = console.file.getvalue()
     for literal in ("[bold]t[/bold]", "[red]head", "[i]name\\x1b[31m", ":bomb:"):
         assert literal in text
+
+
+@pytest.mark.parametrize("width", range(20, 70, 5))
+def test_no_line_breaks_inside_a_number(width, capsys, monkeypatch):
+    """Thousands stay together at every width, with an ordinary space between them; everything else breaks as before."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    say("- lowers the rms error of T from 12 345 678 to 0.00232 N (1 880 times less)", "green")
+    lines = capsys.readouterr().out.splitlines()
+    assert all(len(line.rstrip()) <= width for line in lines)
+    assert sum("12 345 678" in line for line in lines) == sum("1 880" in line for line in lines) == 1
+    assert " ".join("".join(f"{line} " for line in lines).split()).endswith("0.00232 N (1 880 times less)")
