@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
@@ -98,26 +99,35 @@ class Device:
     @cached_property
     def sources(self) -> tuple[str, ...]:
         """The C files of the Function, for every compiler: its own, and the loops that it calls."""
-        texts, files = self._generated, []
-        for text in texts:
-            entry = re.match(r"#define ENTRY (\w+)\n", text)
-            visible = entry[1] if entry else _RAW
-            text = re.sub(r"\bENTRY\b", visible, text[entry.end() :]) if entry else text
-            own = portable(text, visible)
-            files.append(_DRIVER.sub(rf"{self.name}_\1", re.sub(rf"\b{_RAW}\b", f"{self.name}_raw", own)))
-        return tuple(files)
+        return self._generated[0]
 
     @cached_property
     def sizes(self) -> dict[str, int]:
         """Numbers of pointers, whole numbers and numbers that the Function needs to work: arg, res, iw, w."""
-        return {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", self._generated[0])}
+        return self._generated[1]
 
     @cached_property
-    def _generated(self) -> tuple[str, ...]:
-        return generate(self.stepper.function)
+    def _generated(self) -> tuple[tuple[str, ...], dict[str, int]]:
+        return c_of(self.stepper.function, self.name)
 
     def _read(self, wanted: Callable[[str], bool]) -> Layout:
         return Layout(tuple(s for s in self.stepper.reads.signals if wanted(s.name)))
+
+
+def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, int]]:
+    """Return the C files of a Function, whose name in C is NAME_raw, and the sizes of its work: arg, res, iw, w.
+
+    Raises:
+        NotSupported: a part of it cannot be written as C.
+    """
+    texts, files = generate(function), []
+    for text in texts:
+        entry = re.match(r"#define ENTRY (\w+)\n", text)
+        visible = entry[1] if entry else _RAW
+        own = portable(re.sub(r"\bENTRY\b", visible, text[entry.end() :]) if entry else text, visible)
+        files.append(_DRIVER.sub(rf"{name}_\1", re.sub(rf"\b{_RAW}\b", f"{name}_raw", own)))
+    sizes = {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", texts[0])}
+    return tuple(files), sizes
 
 
 def identifiers(names: Sequence[str]) -> list[str]:

@@ -17,6 +17,7 @@ import pytest
 from plants import chain, linear
 
 import fpirhc as fp
+from fpirhc.export.lab.lab import make_lab, write_lab
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import write_report, write_scenarios
 from fpirhc.studies.comparison.compare import compare
@@ -263,3 +264,37 @@ def test_nothing_is_loaded_from_anywhere(name, reports, visit):
     assert one.page.evaluate("window.intruder") is None
     elsewhere = [r for r in one.requests if not r.startswith("file:")]
     assert {one.refusals[r] for r in elsewhere} == {"csp"}  # a network that fails would say so in other words
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+def test_a_lab_runs_anew_while_a_slider_moves(width, scheme, visit, pictures, tmp_path):
+    """The sentence follows the slider and comes back with it, nothing is fetched or complained about, and memory does not grow."""
+    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
+    task = fp.load_problem("two_mass")
+    chosen = {name: task.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")}
+    path = tmp_path / "lab.html"
+    write_lab(make_lab(task.name, task.title, "two_mass", task.problem, chosen), path)
+    opened = visit(path, width, scheme)
+    page = opened.page
+
+    def moved(factor: float) -> str:
+        number = page.evaluate("window.shownNumber || 0")
+        place = "DATA.sliders.findIndex((s) => s.path === 'exact.m1')"
+        page.evaluate(f"set({place}, {factor} * DATA.sliders[{place}].value)")
+        page.wait_for_timeout(20)
+        while page.evaluate("window.shownNumber || 0") == number or page.evaluate("busy"):
+            page.wait_for_timeout(20)
+        return str(page.inner_text("#sentence"))
+
+    first, second = moved(1.0), moved(2.0)
+    assert "rms error of q1, q2: CTC " in first
+    assert first != second
+    assert moved(1.0) == first
+    size = page.evaluate("performance.memory.usedJSHeapSize")
+    for k in range(40):
+        moved(1 + k / 40)
+    assert page.evaluate("performance.memory.usedJSHeapSize") < 2 * size + 2e7
+    page.screenshot(path=pictures / f"lab-{width}-{scheme}.png", full_page=True)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert not opened.complaints
+    assert not [address for address in opened.requests if not address.startswith(("file:", "blob:"))]

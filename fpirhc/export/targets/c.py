@@ -42,8 +42,14 @@ def sources(device: Device) -> dict[str, str]:
     files = {f"{name}.h": _header(device), f"{name}.c": _controller(device), **steps}
     if device.libm == "system":
         return files
+    return with_own_math(files, name)
+
+
+def with_own_math(files: Mapping[str, str], name: str) -> dict[str, str]:
+    """Return C files that call the project's own exp, log and the like, and the files of these, which begin with the name."""
     own = {file: text.replace("#include <math.h>", f'#include "{name}_math.h"') for file, text in files.items()}
-    return {**own, f"{name}_math.h": filled(device, "math.h"), f"{name}_math.c": filled(device, "math.c")}
+    words = {"name": name, "NAME": name.upper()}
+    return {**own, **{f"{name}_{file}": template(file, words) for file in ("math.h", "math.c")}}
 
 
 def _files(device: Device) -> Mapping[str, str | bytes]:
@@ -60,10 +66,14 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
 TARGET = Target("c", "C99 without heap, files and globals: header, controller, layout, replay, CMake file", _files)
 
 
-def filled(device: Device, template: str, **more: str) -> str:
+def filled(device: Device, file: str, **more: str) -> str:
     """Return a template of this folder with its words between @ filled in."""
-    text = resources.files("fpirhc.export.targets").joinpath(template).read_text(encoding="utf-8")
-    words = {"name": device.name, "NAME": device.name.upper(), "title": device.title, **more}
+    return template(file, {"name": device.name, "NAME": device.name.upper(), "title": device.title, **more})
+
+
+def template(file: str, words: Mapping[str, str], package: str = "fpirhc.export.targets") -> str:
+    """Return a template of a package with its words between @ filled in."""
+    text = resources.files(package).joinpath(file).read_text(encoding="utf-8")
     return re.sub(r"@(\w+)@", lambda m: words[m[1]], text)
 
 

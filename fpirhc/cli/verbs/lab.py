@@ -1,0 +1,55 @@
+"""`fpirhc lab PROBLEM --out FILE.html`: a page in which the problem's loops run while sliders move."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fpirhc.cli.options import add_problem
+from fpirhc.cli.verb import ExitCode, Verb
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    add_problem(parser)
+    text = "names of controllers (default: the pair of the headline)"
+    parser.add_argument("--controllers", nargs="+", metavar="NAME", help=text)
+    text = "settings with a slider (default: gain, rate, limits of inputs); parameters always have one"
+    parser.add_argument("--live", nargs="+", default=[], metavar="PATH", help=text)
+    parser.add_argument("--out", metavar="FILE", help="the page (default: results/NAME-lab.html)")
+
+
+def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.export.lab.lab import make_lab, write_lab
+    from fpirhc.problem_files.problem_file import load_problem
+    from fpirhc.studies.comparison.compare import select
+
+    task = load_problem(options.problem)
+    names = options.controllers or list(task.headline or list(task.controllers)[:2])
+    chosen = select(task, names)
+    lab = make_lab(
+        task.name, task.title, options.problem, task.problem, {name: chosen[name] for name in names}, options.live
+    )
+    path = Path(options.out or f"results/{task.name}-lab.html")
+    write_lab(lab, path)
+    print(f"{len(lab.sliders)} sliders for {', '.join(names)}")
+    for number, why in lab.without.items():
+        print(f"no slider for {number}: {why}")
+    print(f"wrote {path}")
+    return ExitCode.FINISHED
+
+
+VERB = Verb(
+    name="lab",
+    summary="write a page in which the loops run while sliders move",
+    add=_add,
+    run=_run,
+    codes={ExitCode.NOT_WRITABLE: "the page cannot be written"},
+    examples=(
+        ("fpirhc lab two_mass", "RHC and RHC+FPI, with sliders for parameters, gain and limits"),
+        ('fpirhc lab two_mass --controllers "CTC" "CTC+FPI (eq 6)" --live deformation.gain tracking.rate', "others"),
+    ),
+    notes="""
+The page is one file, opens offline, and loads nothing: the loops are in it as WebAssembly (zig compiles them: pip install
+'fpirhc[compiler]'). A slider is left out where Python would have to compute something that follows from its number.
+""",
+)

@@ -1,0 +1,391 @@
+"""A page with sliders: the closed loops of a problem as WebAssembly, run anew in the browser while a slider moves.
+
+Sliders write numbers into the loop's first memory, where parameters and live settings are. One whose number changes anything else
+there, which Python would have to compute, is left out, and the page says why. Automatic settings and scales of plans stay those of
+the build, as in a controller that is deployed.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import FpirhcError, NotSupported, package
+from fpirhc.export.binaries import web_module
+from fpirhc.export.device import c_of
+from fpirhc.export.targets.c import template, with_own_math
+from fpirhc.report.html import asset
+from fpirhc.simulation.common_columns import judged_motion
+from fpirhc.simulation.drawing import PALETTE
+from fpirhc.simulation.loop import start_memory
+from fpirhc.simulation.simulate import Simulator, run_tables, simulator
+from fpirhc.symbolic.driver import SIGNATURE
+from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.paths import paths_to
+from fpirhc.task.problem import Problem
+from fpirhc.whole_file import write_whole
+
+_POINTS = 2000  # of a curve
+_SPAN = 4.0  # a slider goes from a fourth to four times its number
+_SETTINGS = ("gain", "rate")  # sliders where nobody asks for others, beside the limits of inputs
+
+
+@dataclass(frozen=True)
+class Slider:
+    """A number that is moved in the page.
+
+    Args:
+        path: of a live setting, or exact.NAME and approximate.NAME of a parameter.
+        unit: of it.
+        value: number of the build.
+        low: smallest number.
+        high: largest number.
+        places: entries of the loops' memories, by the number of the loop.
+    """
+
+    path: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    places: dict[int, list[int]]
+
+
+@dataclass(frozen=True, eq=False)
+class LabLoop:
+    """A closed loop that a page runs.
+
+    Args:
+        name: of the controller.
+        ready: the loop with its live settings.
+    """
+
+    name: str
+    ready: Simulator
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """The first memory."""
+        return self.started(self.ready.problem, {})
+
+    def started(self, problem: Problem, numbers: dict[str, float]) -> np.ndarray:
+        """Return the first memory with other parameters and settings."""
+        if not self.ready.live.paths:
+            return start_memory(self.ready.loop, problem, self.ready.controller)
+        changed, controller, values = self.ready.live.changed(numbers)
+        return start_memory(self.ready.loop, replace(changed, plant=problem.plant), controller, values)
+
+    @cached_property
+    def shown(self) -> list[str]:
+        """Columns that the page draws."""
+        trace = self.ready.loop.trace
+        groups = ("time", "reference", judged_motion(trace), "command", self.error)
+        return [column for name in groups for column in trace[name].columns]
+
+    @property
+    def error(self) -> str:
+        """The signal of the error that counts: the plant's own where sensors show another."""
+        return "true_error" if "true_error" in self.ready.loop.trace else "error"
+
+    @cached_property
+    def module(self) -> bytes:
+        """The loop as WebAssembly."""
+        problem, loop = self.ready.problem, self.ready.loop
+        own, sizes = c_of(loop.function, "lab")
+        places = {name: k for k, name in enumerate(loop.trace.columns)}
+        errors = loop.trace[self.error].columns
+        count = [table.shape[1] for table in self.tables]
+        words = {
+            **{key: str(size + 4) for key, size in sizes.items()},
+            "declaration": f"int lab_raw{SIGNATURE};".replace("casadi_real", "double").replace(
+                "casadi_int", "long long"
+            ),
+            "memory": str(loop.memory.size),
+            "trace": str(loop.trace.size),
+            "cycles": str(problem.cycles),
+            "every": str(self.every),
+            "shown": str(len(self.shown)),
+            "errors": str(len(errors)),
+            "first": str(int(np.ceil(problem.measure_from / problem.period - 1e-9))),
+            "places": ", ".join(str(places[name]) for name in self.shown),
+            "error_places": ", ".join(str(places[name]) for name in errors),
+            "tables": "\n".join(
+                f'static double table_{k}[CYCLES * {size}];\nEXPORT("table_{k}") void* at_{k}(void) {{ return table_{k}; }}'
+                for k, size in enumerate(count)
+            ),
+            "arguments": "\n".join(f"    arg[{k + 1}] = table_{k} + k * {size};" for k, size in enumerate(count)),
+        }
+        files = {"lab_run.c": template("loop.c", words, __package__)}
+        files |= {f"lab_step{k}.c": text for k, text in enumerate(own)}
+        return web_module(with_own_math(files, "lab"))
+
+    @property
+    def every(self) -> int:
+        """A curve has one point per so many cycles."""
+        return max(1, self.ready.problem.cycles // _POINTS)
+
+    @cached_property
+    def tables(self) -> list[np.ndarray]:
+        """Disturbances, the sensors' noise and set-points of the run with seed 0, one row per cycle."""
+        return run_tables(self.ready.problem, 0, self.ready.problem.cycles)
+
+
+@dataclass(frozen=True, eq=False)
+class Lab:
+    """Loops and sliders of a page.
+
+    Args:
+        title: of the problem.
+        about: its description.
+        file: by which `fpirhc.load_problem` finds it.
+        loops: of the controllers.
+        sliders: numbers to be moved.
+        without: reasons why a number has no slider, by path.
+    """
+
+    title: str
+    about: str
+    file: str
+    loops: tuple[LabLoop, ...]
+    sliders: tuple[Slider, ...]
+    without: dict[str, str]
+
+
+def make_lab(
+    title: str, about: str, file: str, problem: Problem, controllers: dict[str, Controller], live: Sequence[str] = ()
+) -> Lab:
+    """Return the loops of some controllers with their sliders.
+
+    Args:
+        title: of the page.
+        about: what the problem is.
+        file: name or path of the problem file.
+        problem: the task; its equations run in the page, so a reality outside cannot.
+        controllers: by name.
+        live: paths of settings with a slider; none: gains, rates, and the limits of inputs.
+
+    Raises:
+        NotSupported: a plant outside, zig is not installed, or a controller that needs a solver's own library.
+        InvalidName: a setting that no controller has.
+    """
+    if problem.foreign is not None:
+        raise NotSupported("a lab runs the plant's equations in the page; a plant outside Python's equations has none")
+    package("ziglang", "compiler", "a lab")
+    loops, without = [], dict[str, str]()
+    for name, controller in controllers.items():
+        wanted = list(live) or _usual(problem, controller)
+        loops.append(LabLoop(name, _with_live(problem, controller, wanted, without)))
+    lost = [path for path in live if not any(_is_live(loop, path) for loop in loops)]
+    if lost:
+        raise NotSupported(
+            f"no controller of the lab can have '{lost[0]}' live: {without.get(lost[0], 'it is not there')}"
+        )
+    sliders = [*_settings(loops, without), *_parameters(problem, loops, without)]
+    return Lab(title, about, file, tuple(loops), tuple(sliders), without)
+
+
+def _usual(problem: Problem, controller: Controller) -> list[str]:
+    """The first gain and the first rate of a controller, and the limits of inputs that are finite."""
+    found = [path for name in _SETTINGS for path in paths_to(name, controller) if not path.startswith("optimiser.")]
+    return [
+        *found,
+        *(f"limits.inputs.{name}" for name, ends in problem.limits.inputs.items() if np.isfinite(ends).any()),
+    ]
+
+
+def _with_live(problem: Problem, controller: Controller, wanted: list[str], without: dict[str, str]) -> Simulator:
+    """The loop with those of the settings that it can keep open; reasons for the others."""
+    kept: list[str] = []
+    ready = simulator(problem, controller, compiled=False)
+    for path in wanted:
+        try:
+            ready = simulator(problem, controller, compiled=False, live=[*kept, path])
+            kept.append(path)
+        except FpirhcError as error:
+            without[path] = str(error)  # of the last controller, which adapts where only one does
+    return ready
+
+
+def _is_live(loop: LabLoop, path: str) -> bool:
+    return any(one in (path, f"{path}.0", f"{path}.1") for one in loop.ready.live.paths)
+
+
+def _parameters(problem: Problem, loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:
+    """Sliders of the plant's parameters: those of the plant, and those that the controllers believe."""
+    sliders = []
+    for name, parameter in problem.plant.parameters.items():
+        for side, value in (("exact", parameter.exact), ("approximate", parameter.approximate)):
+            other = with_parameter(problem, name, side, value * (1 + 2**-10))
+            path = f"{side}.{name}"
+            if not value:
+                without[path] = "it is zero: nothing says how far a slider would go"
+                continue
+            places = _places(loops, lambda loop, other=other: loop.started(other, {}), path, without)  # type: ignore[misc]
+            if places:
+                low, high = sorted((value / _SPAN, value * _SPAN))
+                sliders.append(Slider(path, parameter.unit, float(value), low, high, places))
+    return sliders
+
+
+def with_parameter(problem: Problem, name: str, side: str, value: float) -> Problem:
+    """Return a problem with another parameter, "exact" or "approximate"."""
+    parameter = problem.plant.parameters[name]
+    changed = replace(parameter, exact=value) if side == "exact" else replace(parameter, approximate=value)
+    return replace(problem, plant=replace(problem.plant, parameters={**problem.plant.parameters, name: changed}))
+
+
+def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:
+    """Sliders of the live settings, within the bounds that each of them has."""
+    sliders = []
+    for path in dict.fromkeys(path for loop in loops for path in loop.ready.live.paths):
+        having = [loop for loop in loops if path in loop.ready.live.paths]
+        value = having[0].ready.live.start[path]
+        low, high = (
+            max(ends) if which == 0 else min(ends)
+            for which, ends in enumerate(zip(*(loop.ready.live.bounds(path) for loop in having), strict=True))
+        )
+        size = max(abs(value), 1e-3)
+        low, high = (
+            max(low, min(value / _SPAN, value * _SPAN, value - size)),
+            min(high, max(value / _SPAN, value * _SPAN)),
+        )
+        step = value + 1e-4 * ((high - value) or (low - value))
+        if step == value:
+            without[path] = "its bounds leave no room"
+            continue
+
+        def started(loop: LabLoop, path: str = path, step: float = step) -> np.ndarray:
+            return loop.started(loop.ready.problem, {path: step} if path in loop.ready.live.paths else {})
+
+        places = _places(loops, started, path, without)
+        if places:
+            unit = having[0].ready.live.signals[PREFIX + path].entry_units[0]
+            sliders.append(Slider(path, unit, value, low, high, places))
+    return sliders
+
+
+def _places(
+    loops: Sequence[LabLoop], started: Callable[[LabLoop], np.ndarray], path: str, without: dict[str, str]
+) -> dict[int, list[int]]:
+    """Where a number stands in each loop's memory; nothing where it moves more than itself."""
+    places: dict[int, list[int]] = {}
+    for number, loop in enumerate(loops):
+        try:
+            moved = np.flatnonzero(started(loop) != loop.start)
+        except FpirhcError as error:
+            without[path] = str(error)
+            return {}
+        columns = [loop.ready.loop.memory.columns[k] for k in moved]
+        also = [name for name in columns if not _is_the_number(name, path)]
+        if also:
+            without[path] = f"'{also[0]}' in the memory of {loop.name} follows from it, and only Python computes that"
+            return {}
+        if len(moved):
+            places[number] = moved.tolist()
+    return places
+
+
+def _is_the_number(column: str, path: str) -> bool:
+    side, _, name = path.partition(".")
+    owner = {"exact": ("_exact", "parameters"), "approximate": ("parameters",)}.get(side)
+    return column == PREFIX + path if owner is None else column in {f"{one}.{name}" for one in owner}
+
+
+# The page
+
+
+def write_lab(lab: Lab, path: Path) -> None:
+    """Write the page, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+        CompileError: a loop cannot be compiled.
+    """
+    write_whole(page(lab), path, "lab")
+
+
+def page(lab: Lab) -> str:
+    """Return the page's text: it loads nothing, and runs its own scripts and WebAssembly alone."""
+    problem = lab.loops[0].ready.problem
+    data = {
+        "title": lab.title,
+        "file": lab.file,
+        "timeUnit": problem.time_unit,
+        "period": problem.period,
+        "cycles": problem.cycles,
+        "measured": problem.measure_from,
+        "worker": _own("worker.js"),
+        "colors": list(PALETTE),
+        "loops": [_loop_data(loop) for loop in lab.loops],
+        "sliders": [{**vars(s), "places": [s.places.get(k, []) for k in range(len(lab.loops))]} for s in lab.sliders],
+        "without": lab.without,
+        "charts": _charts(lab),
+    }
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    scripts = (asset("uPlot.iife.min.js"), f"const DATA={text};\n{_own('lab.js')}")
+    hashes = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in scripts)
+    policy = (
+        f"default-src 'none'; script-src {hashes} 'wasm-unsafe-eval'; worker-src blob:; style-src 'unsafe-inline'; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
+    )
+    words = {
+        "title": html.escape(lab.title),
+        "about": html.escape(" ".join(lab.about.split())),
+        "policy": policy,
+        "styles": asset("uPlot.min.css") + asset("report.css") + _own("lab.css"),
+        "scripts": "\n".join(f"<script>{one}</script>" for one in scripts),
+    }
+    return template("page.html", words, __package__)
+
+
+def _own(name: str) -> str:
+    return template(name, {}, __package__)
+
+
+def _loop_data(loop: LabLoop) -> dict[str, Any]:
+    return {
+        "name": loop.name,
+        "module": base64.b64encode(loop.module).decode(),
+        "start": loop.start.tolist(),
+        "tables": [base64.b64encode(np.ascontiguousarray(t, dtype="<f8").tobytes()).decode() for t in loop.tables],
+        "every": loop.every,
+        "shown": len(loop.shown),
+        "errors": len(loop.ready.loop.trace[loop.error].columns),
+        "live": list(loop.ready.live.paths),
+    }
+
+
+def _charts(lab: Lab) -> list[dict[str, Any]]:
+    """One chart per coordinate, error and command; curves are columns of the loops."""
+    trace, first = lab.loops[0].ready.loop.trace, lab.loops[0]
+    names = trace[first.error].elements or (first.error,)
+    charts = []
+    for k, name in enumerate(names):
+        unit = trace[first.error].entry_units[k]
+        charts.append({"title": f"error of {name}", "unit": unit, "error": k, "column": f"{first.error}.{name}"})
+        charts.append(
+            {"title": name, "unit": unit, "column": f"{judged_motion(trace)}.{name}", "aim": f"reference.{name}"}
+        )
+    command = trace["command"]
+    charts += [
+        {"title": f"command {name}", "unit": unit, "column": f"command.{name}"}
+        for name, unit in zip(command.elements, command.entry_units, strict=True)
+    ]
+    for chart in charts:
+        chart["places"] = [_place(loop, str(chart["column"])) for loop in lab.loops]
+        chart["aims"] = _place(first, str(chart["aim"])) if "aim" in chart else None
+    return charts
+
+
+def _place(loop: LabLoop, column: str) -> int | None:
+    return loop.shown.index(column) if column in loop.shown else None

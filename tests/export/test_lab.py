@@ -1,0 +1,154 @@
+"""The lab: a page has the numbers of the one loop, and a slider that would need Python is left out with its reason."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import NotSupported
+from fpirhc.export.lab import lab as module
+from fpirhc.export.lab.lab import Lab, make_lab, page, with_parameter
+
+CASES = {
+    "two_mass": ("RHC", "RHC+FPI"),
+    "crane_slots": ("slots", "slots+FPI"),
+    "noisy_motor": ("RHC", "RHC+FPI"),
+    "turbojet": ("RHC", "RHC+FPI"),
+}
+DRIVER = """
+const asked = JSON.parse(require("fs").readFileSync(process.argv[2]));
+globalThis.postMessage = (said) => { if (said.ready) return onmessage({ data: { number: 1, numbers: asked.numbers } });
+  console.log(JSON.stringify(said, (_, v) => (v instanceof Float64Array ? [...v] : v))); };
+"""
+
+
+def made(name: str, duration: float | None = None) -> Lab:
+    task = fp.load_problem(name)
+    problem = task.problem if duration is None else replace(task.problem, duration=duration, measure_from=0.0)
+    return make_lab(name, task.title, name, problem, {n: task.controllers[n] for n in CASES[name]})
+
+
+def answers(lab: Lab, moved: dict[str, float], folder: Path) -> Any:
+    """What the page's worker says of the loops, with some sliders moved."""
+    text = page(lab)
+    data = json.loads(text[text.index("const DATA=") + 11 : text.index(";\n", text.index("const DATA="))])
+    numbers = [
+        [
+            {"place": place, "value": moved[s["path"]]}
+            for s in data["sliders"]
+            if s["path"] in moved
+            for place in s["places"][k]
+        ]
+        for k in range(len(lab.loops))
+    ]
+    (folder / "asked.json").write_text(json.dumps({"loops": data["loops"], "numbers": numbers}))
+    end = "\nonmessage({ data: { loops: asked.loops } });\n"
+    (folder / "worker.cjs").write_text(data["worker"].replace("onmessage =", "globalThis.onmessage =") + DRIVER + end)
+    done = subprocess.run(
+        [str(shutil.which("node")), str(folder / "worker.cjs"), str(folder / "asked.json")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)["answers"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
+    """Every curve and the sums of squares, with parameters of plant and model and a gain moved: 1e-12 of the largest."""
+    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    lab = made(name)
+    paths = {s.path: s for s in lab.sliders}
+    moved = {}
+    for ends, ratio in ((("exact.", ""), 1.1), (("approximate.", ""), 0.95), (("", "gain"), 0.9)):
+        path = next(p for p in paths if p.startswith(ends[0]) and p.endswith(ends[1]))
+        moved[path] = ratio * paths[path].value
+    exact, approximate, gain = moved
+    said = answers(lab, moved, tmp_path)
+    for loop, one in zip(lab.loops, said, strict=True):
+        problem = variant = loop.ready.problem
+        for path in (exact, approximate):
+            side, _, key = path.partition(".")
+            variant = with_parameter(variant, key, side, moved[path])
+        settings = {gain: moved[gain]} if gain in loop.ready.live.paths else {}
+        run = loop.ready.run(seed=0, variant=variant, settings=settings)
+        assert one["cycles"] == problem.cycles
+        for column, values in zip(loop.shown, one["columns"], strict=True):
+            wanted = np.ravel(run[column])[:: loop.every]
+            assert np.abs(np.array(values) - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max()), column
+        error = np.reshape(run[loop.error], (problem.cycles, -1))
+        counted = error[int(np.ceil(problem.measure_from / problem.period - 1e-9)) :]
+        assert np.allclose(one["squares"], (counted**2).sum(axis=0), rtol=1e-9, atol=0)
+
+
+def test_a_slider_that_needs_python_is_left_out_and_says_why(monkeypatch):
+    """The first plan follows from the upper limit of the motor's voltage; a zero has no scale."""
+    monkeypatch.setattr(module, "package", lambda *_: None)
+    lab = made("noisy_motor", duration=0.5)
+    paths = {s.path for s in lab.sliders}
+    assert {"exact.k", "approximate.k"} & paths or len(paths) > 5
+    assert "only Python computes that" in lab.without["limits.inputs.voltage.1"]
+    assert lab.without["approximate.coulomb"] == "it is zero: nothing says how far a slider would go"
+    assert not paths & set(lab.without)
+
+
+def test_a_slider_stays_inside_the_bounds_of_its_setting(monkeypatch):
+    monkeypatch.setattr(module, "package", lambda *_: None)
+    lab = made("two_mass", duration=0.5)
+    for slider in lab.sliders:
+        assert slider.low < slider.value < slider.high or slider.value in (slider.low, slider.high)
+        if not slider.path.startswith(("exact.", "approximate.")):
+            loops = [loop for loop in lab.loops if slider.path in loop.ready.live.paths]
+            assert all(loop.ready.live.bounds(slider.path)[0] <= slider.low for loop in loops)
+            assert all(loop.ready.live.bounds(slider.path)[1] >= slider.high for loop in loops)
+
+
+def test_what_has_no_lab(monkeypatch):
+    """A plant outside; a setting that no controller has; no zig."""
+    task = fp.load_problem("two_mass")
+    chosen = {n: task.controllers[n] for n in CASES["two_mass"]}
+    monkeypatch.setitem(__import__("sys").modules, "ziglang", None)
+    with pytest.raises(NotSupported, match=r"a lab needs ziglang.*fpirhc\[compiler\]"):
+        make_lab("t", "", "two_mass", task.problem, chosen)
+    monkeypatch.setattr(module, "package", lambda *_: None)
+    with pytest.raises(NotSupported, match=r"no controller of the lab can have 'deformation.gian' live.*Did you mean"):
+        make_lab("t", "", "two_mass", task.problem, chosen, ["deformation.gian"])
+    outside = fp.ExternalPlant(_Body(), measures=dict(zip(_QUANTITIES, _UNITS, strict=True)))
+    with pytest.raises(NotSupported, match="a plant outside Python's equations has none"):
+        make_lab("t", "", "two_mass", replace(task.problem, reality=outside), chosen)
+
+
+_QUANTITIES, _UNITS = ("q1", "q2", "q1'", "q2'", "q1''", "q2''"), ("m", "m", "m/s", "m/s", "m/s^2", "m/s^2")
+
+
+class _Body:
+    def reset(self, seed: int) -> np.ndarray:
+        return np.full(6, float(seed))
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        return np.full(6, time + command[0])
+
+
+def test_a_page_runs_its_own_scripts_and_webassembly_alone(monkeypatch):
+    """The policy names hashes, and nothing of a title or a reason is markup."""
+    monkeypatch.setattr(module, "package", lambda *_: None)
+    monkeypatch.setattr(module.LabLoop, "module", b"")
+    lab = replace(made("two_mass", duration=0.5), title="<b>&", without={"a": "</script><b>"})
+    text = page(lab)
+    policy = text.partition('content="')[2].partition('"')[0]
+    assert "default-src 'none'" in policy
+    assert "'wasm-unsafe-eval'; worker-src blob:;" in policy
+    assert "<title>&lt;b&gt;&amp;: lab</title>" in text
+    assert text.count("</script>") == 2
+    assert "@" not in resources.files("fpirhc.export.lab").joinpath("lab.js").read_text()
