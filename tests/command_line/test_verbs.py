@@ -310,7 +310,7 @@ JOURNEYS: dict[str, Any] = {
         (None, "line.py CTC --out other --to d", 2),
         (None, "line.py CTC --out other --name 2nd", 2),
     ],
-    "lab": [(None, "line.py --controllers nobody", 2)],
+    "lab": [(None, "line.py --out lab.html", 0), (None, "line.py --out .", 3), (None, "line.py --controllers nobody", 2)],
     "new": [(None, "class", 2), (None, "arm", 0), (None, "arm", 3)],
     "check": [
         (None, "", 6),
@@ -348,6 +348,9 @@ def test_exit_codes_are_those_of_the_help(verb, folder, monkeypatch, capsys):
         "fpirhc.doctor.examine",
         lambda: Diagnosis({}, [Finding("a check", Outcome.FAIL if FAULTY else Outcome.OK, "found")]),
     )
+    # Loops are compiled for a page in tests of their own, where zig is.
+    monkeypatch.setattr("fpirhc.export.lab.lab.package", lambda *_: None)
+    monkeypatch.setattr("fpirhc.export.lab.lab.web_module", lambda _: b"")
     FAULTY.clear()
     if verb.name == "completion":
         pytest.importorskip("shtab")
