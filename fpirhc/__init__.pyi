@@ -7,8 +7,7 @@ from .controllers.feedforward_only import FeedforwardOnly
 from .controllers.receding_horizon import Feedforward, HoldPlan, RecedingHorizon, StopRun
 from .controllers.replanning import FromMeasurement, FromMeasurementTracked, FromPlan
 from .controllers.rivals.pid import PID
-from .controllers.slots.chosen_schedules import ByError, ByLookAhead
-from .controllers.slots.schedules import FixedSchedule, Periodic
+from .controllers.slots.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
 from .controllers.slots.slot import Slot
 from .controllers.slots.slotted import Slotted
 from .controllers.wrappers.cascade import Cascade, ThroughModel

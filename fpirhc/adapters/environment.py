@@ -14,8 +14,8 @@ from fpirhc.errors import NotSupported, package
 from fpirhc.simulation.held_input import HELD_INPUT, HeldInput
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
-from fpirhc.simulation.set_points import Setpoints
 from fpirhc.simulation.simulate import run_tables
+from fpirhc.simulation.step_arguments import Setpoints
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem
 

@@ -291,7 +291,7 @@ def _late(deformation: Deformation, problem: Problem) -> Deformation:
         deformation = deformation if inner is deformation.inner else with_inner(deformation, inner)
     if not is_dataclass(deformation):
         return deformation
-    lags, inputs = problem.foreign.lag if problem.foreign is not None else {}, tuple(problem.plant.inputs)
+    lags, inputs = problem.moves.lag, tuple(problem.plant.inputs)
     times = problem.dead_time.inputs
     known = {
         "cycles": [nominal(times.get(name, 0.0)) / problem.period for name in inputs],

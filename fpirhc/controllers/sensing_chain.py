@@ -98,9 +98,9 @@ def seeing_blocks(problem: Problem) -> list[Block]:
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return state, or outputs, and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
-    plant = problem.plant
-    motion = problem.start_output if plant.outputs else np.array(list(_first_states(problem).values()))
-    return motion, _first_values(problem, response_names(plant))
+    followed = problem.plant.output.elements
+    first = _first(problem, followed)
+    return np.array([first[e] for e in followed]), _first_values(problem, response_names(problem.plant))
 
 
 def first_shown(problem: Problem) -> dict[str, float]:
@@ -108,13 +108,13 @@ def first_shown(problem: Problem) -> dict[str, float]:
     plant, (motion, response) = problem.plant, first_estimates(problem)
     names = (*plant.output.elements, *response_names(plant))
     shown = dict(zip(names, map(float, np.concatenate([motion, response])), strict=True))
-    return _first_states(problem) | shown
+    return _first(problem, plant.state.elements) | shown
 
 
-def _first_states(problem: Problem) -> dict[str, float]:
-    """First states of the plant that moves, by name in the model; the model's where it does not have them."""
-    plant, shown = problem.plant, problem.truth.shown(problem.plant)
-    states = dict(zip(plant.state.elements, map(float, problem.start_state), strict=True))
+def _first(problem: Problem, quantities: Sequence[str]) -> dict[str, float]:
+    """First values of the plant that moves, by name in the model; the model's states where it does not have them."""
+    shown = problem.truth.shown(quantities)
+    states = dict(zip(problem.plant.state.elements, map(float, problem.start_state), strict=True))
     return states | dict(zip(shown, map(float, _first_values(problem, shown)), strict=True))
 
 

@@ -231,10 +231,10 @@ def _outer_slopes(reality: Reality, model: Plant, state: np.ndarray, command: np
         command: shape (nu,).
     """
     plant, known = reality.plant, sorted(reality.shared(model).values())
-    if model.outputs or len(known) == model.state.size or len(reality.shown(model)) < model.state.size:
+    if model.outputs or len(known) == model.state.size or len(reality.shown(model.state.elements)) < model.state.size:
         return np.eye(plant.state.size)[known]
     x, u, p = plant.symbols()
-    shown = reality.function(reality.shown(model))(x, u, p, ca.SX.zeros(len(plant.names)))
+    shown = reality.function(reality.shown(model.state.elements))(x, u, p, ca.SX.zeros(len(plant.names)))
     slopes = ca.Function("fpirhc_outer", [x, u, p], [ca.densify(ca.jacobian(shown, x))])
     return np.asarray(slopes(state, command, plant.exact).full())
 

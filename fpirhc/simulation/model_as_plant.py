@@ -46,10 +46,10 @@ def _with_dead_time(problem: Problem, mirror: Mirror) -> Problem:
 
 def behind_stated_lag(problem: Problem) -> Problem:
     """Return the problem whose reality is the model behind the lags that an external plant states; itself where it states none."""
-    outside = problem.foreign
-    if outside is None or not any(outside.lag.values()):
+    lag = problem.moves.lag
+    if not any(lag.values()):
         return problem
-    return _behind(problem.of_model, tuple(outside.lag.get(name, 0.0) for name in problem.plant.inputs))
+    return _behind(problem.of_model, tuple(lag.get(name, 0.0) for name in problem.plant.inputs))
 
 
 def _with_lag(problem: Problem, mirror: Mirror) -> Problem:

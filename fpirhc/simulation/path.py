@@ -142,7 +142,7 @@ class Equations(Mover):
     @property
     def states(self) -> tuple[str, ...]:
         """Those of the same names, or seen in their place."""
-        return self.problem.truth.shown(self.problem.plant)
+        return self.problem.truth.shown(self.problem.plant.state.elements)
 
     @property
     def shows_truth(self) -> bool:

@@ -27,7 +27,7 @@ from fpirhc.simulation.path import disturbance_values
 from fpirhc.simulation.ranges import Dropped, physical_ranges, ranges_of
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
-from fpirhc.simulation.set_points import Setpoints, set_point_record, set_point_table
+from fpirhc.simulation.step_arguments import Setpoints, set_point_record, set_point_table
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout

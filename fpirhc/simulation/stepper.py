@@ -24,8 +24,7 @@ from fpirhc.simulation.harm_warning import warn_of_harm, with_recommended_gain
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, measures, refuse_unbounded
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
-from fpirhc.simulation.set_points import SetpointsNow
-from fpirhc.simulation.step_arguments import NOT_WRITTEN, NOTHING, NumbersNow, StepArguments
+from fpirhc.simulation.step_arguments import NOT_WRITTEN, NOTHING, NumbersNow, SetpointsNow, StepArguments
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native

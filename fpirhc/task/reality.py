@@ -75,6 +75,11 @@ class Reality(Checked):
         return {}
 
     @property
+    def lag(self) -> Mapping[str, float]:
+        """That of its inputs: none beside what its equations have."""
+        return {}
+
+    @property
     def drawn(self) -> Plant:
         """Whose exact parameters studies draw."""
         return self.plant
@@ -156,10 +161,10 @@ class Reality(Checked):
             _check_expression(self.plant, model, name, mistakes)
         mistakes.raise_if_any()
 
-    def shown(self, model: Plant) -> tuple[str, ...]:
-        """Return the names of the model's states that it has, in the model's order."""
+    def shown(self, quantities: Sequence[str]) -> tuple[str, ...]:
+        """Return those of the model's states, outputs and their derivatives that it has."""
         own = _quantities_of(self.plant)
-        return tuple(e for e in model.state.elements if self._own(e.rstrip("'"), seen=True) in own)
+        return tuple(e for e in quantities if self._own(e.rstrip("'"), seen=True) in own)
 
     def function(self, quantities: Sequence[str], *, seen: bool = False) -> ca.Function:
         """Function (state, input, parameters, forcing) of what moves -> quantities of the model by name: "q1", "q1'", "y".
@@ -199,7 +204,9 @@ class Reality(Checked):
 
     def _check_shown_start(self, model: Plant, start: np.ndarray, first: np.ndarray, command: np.ndarray) -> None:
         """Raise if outputs stand for the model's coordinates, no start is stated, and they start elsewhere than the model."""
-        hidden = [e for e in self.shown(model) if self.true_name(e.rstrip("'")) not in self.plant.coordinates]
+        hidden = [
+            e for e in self.shown(model.state.elements) if self.true_name(e.rstrip("'")) not in self.plant.coordinates
+        ]
         if model.outputs or self.start or not hidden:
             return
         values = self.function(hidden)(first, command, self.plant.exact, np.zeros(len(self.plant.names)))
