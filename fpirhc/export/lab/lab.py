@@ -25,8 +25,8 @@ from fpirhc.export.binaries import web_module
 from fpirhc.export.device import c_of
 from fpirhc.export.targets.c import template, with_own_math
 from fpirhc.report.html import asset
-from fpirhc.simulation.common_columns import judged_motion
 from fpirhc.simulation.drawing import PALETTE
+from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.simulate import Simulator, run_tables, simulator
 from fpirhc.symbolic.driver import SIGNATURE
