@@ -10,6 +10,7 @@ Times are rounded to whole control cycles.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -228,7 +229,7 @@ class Mode:
     @property
     def rate(self) -> float:
         """Largest real part of the eigenvalues, 1/s: the speed with which the slot's zero dynamics diverge."""
-        return float(self.eigenvalues.real.max())
+        return float(self.eigenvalues.real.max()) if np.isfinite(self.generator).all() else math.inf
 
     def start(self, before: Mode) -> np.ndarray:
         """Return the matrix from z at the end of the slot `before` to z at the start of this one; the command is continuous."""
@@ -305,13 +306,15 @@ def _mode(
     a, b, chain, own, gain = (np.asarray(v.full()) for v in function(state, command, parameters))
     n, gains = a.shape[0], np.array(law.gains)
     integral, proportional = (gains[0], gains[1:]) if law.integral else (0.0, gains)
-    feedback = proportional @ chain
+    with np.errstate(all="ignore"):  # rates beyond all numbers: the mode says so
+        feedback = proportional @ chain
     desired = np.concatenate([-feedback, [integral, 0.0]])
     offset = np.eye(n + 2)[n + 1] if blend > 0 else np.zeros(n + 2)
-    through = (desired + offset - np.concatenate([own.ravel(), [0, 0]])) / gain.item()
     generator = np.zeros((n + 2, n + 2))
     generator[:n, :n] = a
-    generator[:n] += b @ through[None, :]
+    with np.errstate(all="ignore"):
+        through = (desired + offset - np.concatenate([own.ravel(), [0, 0]])) / gain.item()
+        generator[:n] += b @ through[None, :]
     if law.integral:
         generator[n, :n] = -chain[0]
     if blend > 0:
