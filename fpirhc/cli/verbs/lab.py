@@ -15,7 +15,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--controllers", nargs="+", metavar="NAME", help=text)
     text = "settings with a slider (default: gain, rate, limits of inputs); parameters always have one"
     parser.add_argument("--live", nargs="+", default=[], metavar="PATH", help=text)
-    parser.add_argument("--out", metavar="FILE", help="the page (default: results/NAME-lab.html)")
+    parser.add_argument("--out", metavar="FILE", help="the page, or a folder for it (default: results)")
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -29,7 +29,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
     lab = make_lab(
         task.name, task.title, options.problem, task.problem, {name: chosen[name] for name in names}, options.live
     )
-    path = Path(options.out or f"results/{task.name}-lab.html")
+    path = Path(options.out or "results")
+    path = path / f"{task.name}-lab.html" if path.is_dir() or not options.out else path
     write_lab(lab, path)
     print(f"{len(lab.sliders)} sliders for {', '.join(names)}")
     for number, why in lab.without.items():
