@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fpirhc.broken import attempted
 from fpirhc.contraction.gains import ContractionReport, assess_gain
 from fpirhc.contraction.large_errors import two_cycle_limit
 from fpirhc.contraction.spectrum import Spectrum
@@ -34,6 +35,7 @@ from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.question import Case
 from fpirhc.review.questions.margins import keeps_margins
 from fpirhc.review.questions.right_model import leaves_right_model_alone
+from fpirhc.review.questions.speed import fast_enough, plan_keeps_up
 from fpirhc.review.spectra import largest_product, spectrum_near
 from fpirhc.task.problem import Problem
 
@@ -222,3 +224,28 @@ def _case_with(case: Case, gain: float) -> Case:
     deformation = case.controller.deformation.with_effective_gain(gain)
     controller = resolved(case.problem, case.controller.with_deformation(deformation))
     return Case(case.grid, controller, loops_along(case.grid, controller), case.runs)
+
+
+def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> str:
+    """Return what a review says of the gain: the recommended one where errors grow, else whether it is too small, else nothing.
+
+    Args:
+        problem: of the run.
+        controller: resolved.
+        grows: whether the iteration is no contraction along the run.
+    """
+    if controller.deforms == "target" or not controller.deformation.adapts:
+        return ""
+    if grows:
+        advice = recommended_for(problem, controller)
+        return "" if advice is None else f"Its gain{' is too large' if advice.exceeded else ''}: {advice.text}."
+    answer = attempted("the speed of the iteration", _speed, problem, controller, broken=[])
+    if answer is None or answer.verdict is not Verdict.NO:
+        return ""
+    return f"Its gain is too small: {answer.evidence}. {answer.change}"
+
+
+def _speed(problem: Problem, controller: Controller) -> Answer | None:
+    grid = review_grid(problem, 0.0, 0)
+    case = Case(grid, controller, loops_along(grid, controller), NominalRuns(grid.problem))
+    return fast_enough(case) or plan_keeps_up(case)
