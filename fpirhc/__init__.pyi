@@ -88,6 +88,7 @@ from .simulation.simulate import simulate, simulator
 from .simulation.stepper import Stepper
 from .status import Status
 from .studies.comparison.compare import compare
+from .studies.information import compare_information
 from .studies.scenarios.scenario_study import compare_scenarios
 from .studies.tuning.tune import tune
 from .symbolic.functions import signed_power
@@ -235,6 +236,7 @@ __all__ = [
     "certify",
     "check_baseline",
     "compare",
+    "compare_information",
     "compare_scenarios",
     "disturbed",
     "figures",

@@ -23,6 +23,8 @@ for name, run in runs.items():
     print(f"{name:25s} {1e3 * error:.3g} mm")
 
 # %%
+# Offset-free control, with the same measurements in every cycle, wins by a third.
+#
 # At each reversal the bristles bend the other way before they slip: friction lags
 # behind the velocity and turns over by 2 N within a twentieth of a second. The model
 # knows nothing of it, so RHC alone learns of it from the error only.

@@ -33,8 +33,8 @@ task, runs = results("tumour", (*names, "RHC exact model"))
 picture.draw(plt.figure(figsize=(8, 5), layout="constrained"), runs)
 
 # %%
-# One reading and one dose a day: the estimate of the offset-free plan now acts as often
-# as the deformation does, and it does as well as the model-referenced form. In the
+# One reading and one dose a day: the offset-free plan and the model-referenced form are
+# equally good, as they are with twenty. In the
 # plain form a small gain is no safe choice: a correction that takes days to arrive
 # misleads the plan, which answers with all or nothing. The same gain is safe in the
 # model-referenced form, which passes at once what the model expects.

@@ -22,9 +22,10 @@ def results(name, names):
 
 
 # %%
-# The deformation corrects every 10 ms, the plan is renewed every 100 ms, and so is the
-# disturbance that an offset-free plan believes in: the plain form of the deformation,
-# "RHC+FPI", has a tenth of its error, the model-referenced form a fiftieth.
+# The deformation and the estimate of the offset-free plan correct every 10 ms, the plan
+# is renewed every 100 ms. The plain form of the deformation, "RHC+FPI", has a tenth of
+# the offset-free plan's error, the model-referenced form a hundredth: a plan foresees a
+# constant disturbance, and the model's error follows the thrust.
 
 names = ("RHC", "RHC+FPI, model-referenced", "RHC+FPI", "RHC offset-free")
 task, runs = results("turbojet", (*names, "RHC exact model"))
@@ -37,7 +38,7 @@ loop.draw(
 
 # %%
 # With a cycle as long as a stage of the plan, 100 ms, the plain form and the
-# offset-free plan are equally good. In the plain form a gain that is slower than the
+# offset-free plan are nearly equal. In the plain form a gain that is slower than the
 # plan is worse than none; in the model-referenced form it is not.
 
 gentle = ("RHC+FPI, gentle, model-referenced", "RHC+FPI, gentle")

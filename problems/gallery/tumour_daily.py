@@ -6,18 +6,17 @@ Everything but the cycle is that of `tumour`: a day, as long as a stage of the p
     CTC                                          0.012
     CTC+FPI                                      0.004
     RHC                                           0.14
-    RHC+FPI, model-referenced                  2.9e-05
+    RHC+FPI, model-referenced                  2.4e-05
     RHC+FPI                                     0.0001
-    RHC offset-free                            2.8e-05
+    RHC offset-free                            2.4e-05
     RHC exact model                              0.025
     RHC+FPI, gentle, model-referenced          0.00095
     RHC+FPI, gentle                               0.67
 
-An offset-free plan now uses its estimate in every cycle, as often as the deformation acts, and its model of a constant
-disturbance fits: it does as well as the model-referenced form. With the plain form a small gain is no safe choice: with -0.3
-every change of the desired response takes days to act, the plan reacts to the errors of these days with doses from zero to the
-largest, and the error is larger than without adaptation. The same gain in the model-referenced form passes what the model
-expects at once.
+The offset-free plan's model of a constant disturbance fits: it is as good as the model-referenced form. With the
+plain form a small gain is no safe choice: with -0.3 every change of the desired response takes days to act, the plan
+reacts to the errors of these days with doses from zero to the largest, and the error is larger than without
+adaptation. The same gain in the model-referenced form passes what the model expects at once.
 """
 
 from dataclasses import replace

@@ -6,17 +6,17 @@ Everything but the cycle is that of `turbojet`.
     CTC                                    4.7
     CTC+FPI                               0.21
     RHC                                    4.4
-    RHC+FPI, model-referenced            0.029
+    RHC+FPI, model-referenced           0.0083
     RHC+FPI                               0.14
-    RHC offset-free                       0.13
+    RHC offset-free                        0.1
     RHC exact model                    0.00041
     RHC+FPI, gentle, model-referenced     0.34
     RHC+FPI, gentle                         26
 
-The deformation and the estimate of an offset-free plan act equally often now: the plain form and offset-free control are
-equally good, and model-referenced is better than both. With the plain form a small gain is no safe choice: with -0.3 every
-change of the desired response takes a second to act, the plan reacts to the errors of this second with all or no throttle, and
-the thrust swings. The same gain in the model-referenced form passes what the model expects at once.
+The plain form and offset-free control are nearly equal here, and model-referenced is ten times better than both. With
+the plain form a small gain is no safe choice: with -0.3 every change of the desired response takes a second to act,
+the plan reacts to the errors of this second with all or no throttle, and the thrust swings. The same gain in the
+model-referenced form passes what the model expects at once.
 """
 
 from dataclasses import replace
