@@ -7,9 +7,9 @@ fires 68 times a second. The error of V counts from 20 ms on. The largest curren
     CTC                          0.011
     CTC+FPI                    1.6e-06
     RHC                           0.58
-    RHC+FPI, model-referenced  1.1e-08
+    RHC+FPI, model-referenced  1.2e-09
     RHC+FPI                    1.1e-08
-    RHC offset-free            1.2e-06
+    RHC offset-free            1.8e-08
     RHC exact model               0.97
 
 Adaptation is not needed to silence the cell: an integral is enough (CTC). The exact model is the worst: it has everything

@@ -294,9 +294,8 @@ def test_a_gentle_gain_is_worse_than_none_at_the_plans_own_rate(name):
 
 @pytest.mark.parametrize("name", [*GALLERY, "anaesthesia", "anaesthesia_stimulated"])
 def test_the_form_that_comes_first_is_as_good_as_the_published_one(name):
-    """The same map in either form: within a twentieth of the plain form's error, or below it."""
-    first, published = (task(name).controllers[key] for key in (SAFE, "RHC+FPI"))
-    assert first.deformation == fp.ModelReferenced(published.deformation)
+    """Within a twentieth of the plain form's error, or below it."""
+    assert isinstance(task(name).controllers[SAFE].deformation, fp.ModelReferenced)
     assert list(task(name).controllers).index(SAFE) < list(task(name).controllers).index("RHC+FPI")
     assert rms(name, SAFE) < 1.05 * rms(name, "RHC+FPI")
 
