@@ -310,7 +310,11 @@ JOURNEYS: dict[str, Any] = {
         (None, "line.py CTC --out other --to d", 2),
         (None, "line.py CTC --out other --name 2nd", 2),
     ],
-    "lab": [(None, "line.py --out lab.html", 0), (None, "line.py --out line.py/lab.html", 3), (None, "line.py --controllers nobody", 2)],
+    "lab": [
+        (None, "line.py --out lab.html", 0),
+        (None, "line.py --out line.py/lab.html", 3),
+        (None, "line.py --controllers nobody", 2),
+    ],
     "new": [(None, "class", 2), (None, "arm", 0), (None, "arm", 3)],
     "check": [
         (None, "", 6),
