@@ -185,7 +185,7 @@ def _median(errors: np.ndarray) -> float:
 
 
 def circle(task: Task) -> None:
-    """Print the mean distance from 3 to 8 s on the circle in a wind of 3 m/s, with latencies that nobody told."""
+    """Print the mean distance from 3 to 8 s on the circle in a wind of 3 m/s, with latencies that the model lacks."""
     print("circle in 3 m/s wind, mean distance 3 to 8 s, m: " + CIRCLE)
     late = [("", {}), *((f"thrust {t} ms", {"late_thrust": t / 1e3}) for t in (10, 20, 30, 40, 50))]
     late += [(f"motors {t} ms", {"late_motors": t / 1e3}) for t in (10, 20, 30)]

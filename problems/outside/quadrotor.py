@@ -1,4 +1,4 @@
-"""A quadrotor of RotorPy on a circle in wind, with a payload that nobody told, behind a point mass.
+"""A quadrotor of RotorPy on a circle in wind, with a payload that the model does not know, behind a point mass.
 
 The vehicle (RotorPy's Hummingbird, MIT) has motors that lag, drag, and an attitude loop; it flies 2 m around at 0.2 Hz in a
 wind of 3 m/s and carries 0.15 kg. The model is the point mass r'' = thrust - g. Scenarios draw wind and payload.
