@@ -1,13 +1,15 @@
-"""The folders to which commands write their results."""
+"""The folders to which commands write their results, and what is said of a command that is interrupted or breaks."""
 
 from __future__ import annotations
 
+import os
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fpirhc.cli.crash import interrupted
+from fpirhc.cli.verb import ExitCode
 
 RESULTS = "results.json"  # what --json prints, beside every report
 
@@ -55,3 +57,61 @@ def resumable(ledger: Path) -> Iterator[None]:
             raise
         print(f"fpirhc: finished results are kept in {ledger}; the same command continues from them", file=sys.stderr)
         raise
+
+
+REPORT = "please report it on the project's issue page, with the command line and what --debug prints"
+
+
+def crash(error: BaseException) -> tuple[str, ExitCode]:
+    """Return one line about an error that the library does not raise on purpose, and the exit code.
+
+    An error of a problem file's own code is bad input; every other one is an error inside fpirhc.
+    """
+    from fpirhc.fields.user_code import explained, place_in_users_code
+
+    if of_a_problem_file(error):
+        return f"{place_in_users_code(error)}: {explained(error)}", ExitCode.BAD_INPUT
+    if isinstance(error, MemoryError):
+        return "the memory does not suffice; use fewer cycles, stages or processes", ExitCode.CRASHED
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    name = f"{type(error).__name__} in {os.path.basename(place.filename)}, line {place.lineno}"
+    text = " ".join(str(error).split())
+    return f"an error inside fpirhc: {name}: {text[:_LONGEST]}; {REPORT}", ExitCode.CRASHED
+
+
+def of_a_problem_file(error: BaseException) -> bool:
+    """Whether the error arose in code of a problem file, or in a library that this code called."""
+    problem = False
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        name = frame.f_globals.get("__name__", "")
+        if name.startswith("fpirhc_problem_"):
+            problem = True
+        elif name.partition(".")[0] == "fpirhc":
+            problem = False
+    return problem
+
+
+def interrupted(error: BaseException) -> bool:
+    """Whether an error is an interruption from the keyboard; a solver that is interrupted passes it on inside a SystemError."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, KeyboardInterrupt) or "KeyboardInterrupt" in str(seen):
+            return True
+        seen = seen.__cause__ or seen.__context__
+    return False
+
+
+def closed_by_reader(error: BaseException) -> bool:
+    """Whether the reader of the output has closed it, as `head` does; rich ends the program with 1 then."""
+    return isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError)
+
+
+def silence_output() -> None:
+    """Send what is still in the output's buffer nowhere: writing it at the end of the program would fail once more."""
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):  # an output without a file, such as that of a test
+        return
+
+
+_LONGEST = 300  # characters of an error's own text

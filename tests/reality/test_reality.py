@@ -16,7 +16,7 @@ from fpirhc.controllers.contract import checked
 from fpirhc.describe import describe
 from fpirhc.errors import InvalidProblem, NotContractive, NotSupported
 from fpirhc.sensing.base import response_names
-from fpirhc.studies.comparison.entry_facts import has_exact_model
+from fpirhc.studies.comparison.entry import has_exact_model
 from fpirhc.studies.scenarios.draws import COMPARING, draw
 
 TRACK = fp.Exponential(rate=6.0)

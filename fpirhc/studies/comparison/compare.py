@@ -32,8 +32,7 @@ from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.caveats import yardstick_of
 from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.comparison import Comparison
-from fpirhc.studies.comparison.entry import Contraction, Entry
-from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every
+from fpirhc.studies.comparison.entry import Contraction, Entry, has_exact_model, plan_every
 from fpirhc.studies.comparison.harm import partners
 from fpirhc.studies.comparison.information import information, sentences
 from fpirhc.studies.comparison.null_test import NullTest

@@ -19,7 +19,7 @@ from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.studies.comparison.causes import grows
-from fpirhc.studies.comparison.entry_facts import no_bound_because
+from fpirhc.studies.comparison.entry import no_bound_because
 from fpirhc.studies.comparison.null_test import NullTest, null_test
 from fpirhc.studies.comparison.other_rows import beaten_by
 from fpirhc.studies.comparison.outcome import Finding, Outcome
