@@ -45,6 +45,13 @@ class _CheckedWhenCalled(ABCMeta):
         find_by_name(value)
         return value
 
+    @property
+    def __signature__(cls) -> inspect.Signature:
+        """The arguments that a value is made with, for notebooks and editors."""
+        makes: Callable[..., object] = getattr(cls, "__init__")  # noqa: B009 -- the class's own, as in `_arguments_of`
+        _, *arguments = inspect.signature(makes).parameters.values()
+        return inspect.Signature(arguments)
+
     if not TYPE_CHECKING:
 
         def __getattr__(cls, name: str) -> object:

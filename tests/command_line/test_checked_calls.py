@@ -115,3 +115,13 @@ def test_every_annotation_is_read(function):
     assert len(CHECKED) >= 19
     expected = checks_of(inspect.unwrap(function)).expected
     assert [name for name, one in expected.items() if isinstance(one, Anything)] == []
+
+
+def test_signatures_of_classes_show_their_arguments():
+    """Notebooks and editors ask for them; the check of the arguments does not hide them."""
+    assert list(inspect.signature(fp.Affine).parameters) == ["gain"]
+    increment = inspect.signature(fp.Increment).parameters
+    assert list(increment) == ["map", "cycles", "uncertainty", "pole", "longest"]
+    assert increment["longest"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert increment["cycles"].default is inspect.Parameter.empty
+    assert increment["pole"].default is None

@@ -148,7 +148,7 @@ def unknown_rms(true: int, deformation: Deformation, predicted: float = 0.025) -
     return fp.measure(problem, run).rms_error["q"]
 
 
-COVERING = fp.Increment(FASTEST, cycles=25, uncertainty=25)
+COVERING = fp.Increment.within(FASTEST, 50)
 
 
 @pytest.mark.parametrize("true", [2, 12, 20, 33, 48])
@@ -169,11 +169,15 @@ def test_the_theorem_is_of_the_iteration_alone():
     assert unknown_rms(48, COVERING, 0.0) > 10 * unknown_rms(48, fp.Identity(), 0.0)
 
 
-def test_half_of_the_longest_dead_time_covers_all():
-    """Believed D / 2 and wrong by D / 2, the map itself decays with every dead time from none to D = 50 cycles."""
-    pole = fp.Increment(affine(1.0), cycles=25, uncertainty=25).iteration.leak
-    assert leaky_margin(1.0, pole) >= 25
-    assert max(radius(1.0, pole, 25, true) for true in range(51)) < 1
+@pytest.mark.parametrize("most", [1, 7, 50])
+def test_within_covers_every_dead_time(most):
+    """The map itself decays with every dead time from none to the longest one, whole numbers of cycles or not halved evenly."""
+    deformation = fp.Increment.within(affine(1.0), most)
+    assert deformation.cycles == most / 2
+    pole = deformation.iteration.leak
+    assert leaky_margin(1.0, pole) >= most / 2
+    if most % 2 == 0:
+        assert max(radius(1.0, pole, most // 2, true) for true in range(most + 1)) < 1
 
 
 ESTIMATE_LIMITS = {0: 10.0, 1: 6.0, 2: 4.39, 5: 2.97, 10: 2.41, 20: 2.15}
@@ -239,6 +243,7 @@ def test_a_dead_time_for_every_channel():
         (lambda: fp.ModelReferenced(affine(0.5), cycles=1.5, uncertainty=3), "expected whole cycles from 0 to 2"),
         (lambda: fp.Increment(affine(0.5), cycles=(4, 2), uncertainty=3), "from 0 to 2"),
         (lambda: fp.Increment(affine(0.5), cycles=4, pole=1.0), r"Increment\(pole=1.0\): expected a number from 0"),
+        (lambda: fp.Increment.within(affine(0.5), -1), r"Increment.within\(most=-1\): expected a dead time between 0"),
         (lambda: fp.Increment(affine(0.5), cycles=()), "or a tuple with one for every controlled coordinate"),
         (lambda: fp.ModelReferenced(affine(0.5), cycles=900, measurement=200), "between 0 and 1000"),
         (lambda: leaky_pole(2.0, 1), r"leaky_pole\(product=2.0\): expected .* in \(0, 2\)"),

@@ -23,6 +23,7 @@ chatters. There are two remedies:
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -198,6 +199,20 @@ class Increment(_Queued):
             check_uncertainty("Increment", self.uncertainty, self.cycles)
         if self.pole is not None:
             check_pole("Increment", self.pole)
+
+    @classmethod
+    def within(cls, map: Deformation, most: float) -> Increment:
+        """Return the form that is stable for all dead times up to `most` cycles: believed D / 2, wrong by D / 2.
+
+        Args:
+            map: any deformation that iterates; the effective gain 1 / lambda_max is the usual one.
+            most: D, longest dead time between a request and its response, in cycles, beyond the one that every loop has.
+
+        Raises:
+            InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles.
+        """
+        check_cycles("Increment.within", most, "most")
+        return cls(map, cycles=most / 2, uncertainty=math.ceil(most / 2))
 
     @property
     def iteration(self) -> Iteration:
