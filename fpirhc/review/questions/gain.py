@@ -11,7 +11,7 @@ from fpirhc.deformation.base import Deformation, innermost
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.question import Case, ControllerQuestion
-from fpirhc.review.questions.right_model import leaves_right_model_alone
+from fpirhc.review.questions.right_model import RIGHT_MODEL
 from fpirhc.review.questions.speed import gain_times
 from fpirhc.review.recommended_gain import FAR, MARGIN, Recommended, gain_advice, limit_of_loop, secant_limit
 from fpirhc.review.spectra import largest_product
@@ -169,7 +169,7 @@ def _gain(case: Case) -> Answer | None:
     own, boxed = case.spectra
     deformation = case.controller.deformation
     limit = largest_product(case.problem, deformation, own.eigenvalues)
-    return gain_admissible(deformation, own, boxed, limit, gain_advice(case, boxed, leaves_right_model_alone(case)))
+    return gain_admissible(deformation, own, boxed, limit, gain_advice(case, boxed, case.answer(RIGHT_MODEL)))
 
 
 QUESTIONS = (

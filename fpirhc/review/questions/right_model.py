@@ -211,7 +211,5 @@ def _faster(nominal: NominalRun, share: int) -> NominalRun:
     )
 
 
-QUESTIONS = (
-    ControllerQuestion(pays, PAYS, order=14),
-    ControllerQuestion(leaves_right_model_alone, NULL_TEST, order=15, of_targets=True),
-)
+RIGHT_MODEL = ControllerQuestion(leaves_right_model_alone, NULL_TEST, order=15, of_targets=True)
+QUESTIONS = (ControllerQuestion(pays, PAYS, order=14), RIGHT_MODEL)
