@@ -38,7 +38,7 @@ ROWS: dict[str, Sequence[str]] = {
     "`fpirhc list`": ("-m", "fpirhc", "list"),
     "the message of a wrong problem file": ("-m", "fpirhc", "compare", "wrong.py"),
     "`fpirhc review two_mass`": ("-m", "fpirhc", "review", "two_mass"),
-    "`fpirhc compare two_mass` (ten controllers)": ("-m", "fpirhc", "compare", "two_mass", "--out", "two"),
+    "`fpirhc compare two_mass` (eleven controllers)": ("-m", "fpirhc", "compare", "two_mass", "--out", "two"),
     "`fpirhc compare pendulum.py`, the problem of the README": (
         "-m",
         "fpirhc",
