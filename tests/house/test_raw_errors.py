@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import InvalidField, InvalidName, InvalidShape, InvalidValue, NotSupported
+from fpirhc.errors import InvalidField, InvalidName, InvalidShape, InvalidValue, NotSupported, nearest
 from fpirhc.problem_files.problem_file import load_problem
 
 TASK = load_problem("two_mass")
@@ -124,3 +124,9 @@ def test_deviations_that_leave_no_digit_are_refused_by_name():
     wild = fp.DisturbanceKalman(drift={"q1": 1e90}, measured={"q1": 1e-90}, noise={"q2": 1.0})
     with pytest.raises(NotSupported, match="no stationary gain makes the filter stable"):
         fp.simulate(PROBLEM, fp.Estimating(CONTROLLER, wild), seed=0)
+
+
+def test_a_name_with_a_comma_stands_in_quotes():
+    """Else "RHC, stiff" reads as two names; where no name has a comma the list is plain."""
+    assert nearest("RHCC", ["RHC", "RHC, stiff"]) == " Did you mean 'RHC'? Valid: 'RHC', 'RHC, stiff'."
+    assert nearest("x", ["CTC", "RHC"]) == " Valid: CTC, RHC."
