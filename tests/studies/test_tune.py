@@ -253,3 +253,15 @@ def test_what_cannot_be_tuned_is_said(task, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(NotSupported, match=r"pip install 'fpirhc\[tune\]'"):
         fp.tune(task, trials=1, seed=0, folder=tmp_path)
+
+
+def test_a_search_space_that_is_missing_is_offered_for_a_controller_that_adapts(tmp_path):
+    """The gain of the first one that has any, around its number; a problem without one is offered a rate."""
+    task = fp.load_problem("leaking_tanks")
+    with pytest.raises(
+        InvalidProblem, match=r"tuning = \{'RHC\+FPI': \{'deformation\.gain': fpirhc\.LogSpan\(-6, -0\.2\)\}\}"
+    ):
+        fp.tune(task, trials=1, seed=0, folder=tmp_path, controllers=["RHC"])
+    alone = replace(task, controllers={"RHC": task.controllers["RHC"]}, headline=None)
+    with pytest.raises(InvalidProblem, match=r"tuning = \{'RHC': \{'tracking\.rate'"):
+        fp.tune(alone, trials=1, seed=0, folder=tmp_path)

@@ -65,7 +65,7 @@ def _given(problem: Problem) -> str:
         beside = [element for signal in measured_signals(plant)[:-1] for element in signal.elements]
         names = (*beside, *(n for n in names if n not in beside))
     names = tuple(dict.fromkeys(names))  # an output of order 0 is its own response
-    text = f"all controllers are given {', '.join(names)} in every cycle of {problem.period:g} {problem.time_unit}"
+    text = f"all controllers are given {', '.join(names)} in every cycle of {problem.period:.3g} {problem.time_unit}"
     late = problem.dead_time.measurement
     text += f", {late:g} {problem.time_unit} late" if late else ""
     if sensing.estimates:

@@ -34,6 +34,7 @@ from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import as_python
+from fpirhc.symbolic.paths import content_at, paths_to
 
 LEDGER = "trials.jsonl"
 _PRESENT = -1  # number of the trial of the settings as they are, which no budget counts
@@ -194,12 +195,22 @@ def _optuna() -> ModuleType:
     return optuna
 
 
+def _example(task: Task) -> str:
+    """A search space of this task: a gain around its number, of the first controller that adapts."""
+    for name, controller in task.controllers.items():
+        for path in paths_to("gain", controller):
+            value = content_at(controller, path)
+            if not path.startswith("optimiser.") and isinstance(value, float) and value:
+                low, high = sorted((3 * value, value / 10))
+                return f"{{{name!r}: {{{path!r}: fpirhc.LogSpan({low:.2g}, {high:.2g})}}}}"
+    return f"{{{next(iter(task.controllers))!r}: {{'tracking.rate': fpirhc.LogSpan(1, 20)}}}}"
+
+
 def _tunable(task: Task, names: Sequence[str] | None) -> list[str]:
     if not task.tuning:
-        first = next(iter(task.controllers))
         raise InvalidProblem(
             f"problem '{task.name}' has no search space for tuning; add to its file, for example, "
-            f"tuning = {{{first!r}: {{'deformation.gain': fpirhc.LogSpan(-1.5, -0.05)}}}}"
+            f"tuning = {_example(task)}"
         )
     selected = list(select(task, names)) if names else list(task.tuning)
     spanless = [n for n in selected if not task.tuning.get(n)]
