@@ -38,7 +38,9 @@ from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal, sett
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
-_LATEST: Latest[OptimalControl] = Latest(8)
+_LATEST: Latest[OptimalControl] = Latest(
+    16
+)  # a comparison goes through its controllers, and asks for the first one again
 
 
 def transcribe(
@@ -51,7 +53,7 @@ def transcribe(
     start: np.ndarray | None = None,
     others: Mapping[str, LiveNumber] = MappingProxyType({}),
 ) -> OptimalControl:
-    """Return the standard form of one horizon; the same objects have the same one.
+    """Return the standard form of one horizon; it is the same one for the same objects, and for plants with other exact parameters.
 
     Args:
         plant: the model.
@@ -67,9 +69,17 @@ def transcribe(
     Raises:
         InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
     """
-    values = plant, reference, horizon, cost, limits, signals
+    same = (
+        plant.equations,
+        reference,
+        horizon,
+        cost,
+        limits,
+        signals,
+    )  # the approximate parameters are those of the equations
     first = None if start is None else np.asarray(start, dtype=float).tobytes()
-    return _LATEST.of((*values, *others.values()), (first, *others), lambda: _transcribed(*values, start, others))
+    arguments = plant, reference, horizon, cost, limits, signals, start, others
+    return _LATEST.of((*same, *others.values()), (first, *others), lambda: _transcribed(*arguments))
 
 
 def _transcribed(

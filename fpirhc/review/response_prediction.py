@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 
 from fpirhc.by_name import ByName
 from fpirhc.contraction.spectrum import response_jacobians
@@ -229,8 +228,9 @@ def _impulses(loop: LinearLoop, gain: np.ndarray, cycles: int) -> np.ndarray:
 
 
 def _convolved(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Convolution along the first axis, as in scipy.signal, whose import takes longer than all of this."""
+    """Convolution along the first axis, by numpy alone: the import of scipy.fft or scipy.signal takes longer than all of this."""
     length = len(one) + len(other) - 1
-    padded = next_fast_len(length, real=True)
-    convolved: np.ndarray = irfft(rfft(one, padded, axis=0) * rfft(other, padded, axis=0), padded, axis=0)
+    padded = 1 << (length - 1).bit_length()
+    one, other = (np.fft.rfft(signal, padded, axis=0) for signal in (one, other))
+    convolved: np.ndarray = np.fft.irfft(one * other, padded, axis=0)
     return convolved[:length]

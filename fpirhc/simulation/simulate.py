@@ -166,16 +166,17 @@ def simulator(
     long = problem.cycles * (problem.horizon.stages if problem.horizon is not None else 1) > _SHORT_RUN
     backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
     if compiled or (compiled is None and long):
-        backend = native(_chained(problem, loop, CHUNK), flags, required=bool(live))
-    function = backend.function if backend.compiled else _chained(problem, loop, SHORT)
+        calls = CHUNK if problem.foreign is None else 0
+        backend = native(loop.function, flags, required=bool(live), calls=calls)
+    function = backend.function if backend.compiled else _chained(problem, loop)
     return Simulator(problem, ready, loop, Evaluator(function), backend.compiled, backend.reason, settings)
 
 
-def _chained(problem: Problem, loop: Composite, cycles: int) -> ca.Function:
-    """The loop over so many cycles; over one beside a foreign reality, which is called in every cycle."""
+def _chained(problem: Problem, loop: Composite) -> ca.Function:
+    """The loop over `SHORT` cycles; over one beside a foreign reality, which is called in every cycle."""
     if problem.foreign is not None:
         return loop.function
-    return loop.function.mapaccum(f"{loop.function.name()}_run", cycles, {} if cycles == CHUNK else {"base": _CHAIN})
+    return loop.function.mapaccum(f"{loop.function.name()}_run", SHORT, {"base": _CHAIN})
 
 
 @checked_call

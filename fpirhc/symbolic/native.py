@@ -77,13 +77,15 @@ def find_compiler() -> str | None:
     return None
 
 
-def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool = False) -> Native:
+def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool = False, calls: int = 0) -> Native:
     """Return `function` compiled, or as it is with the reason why not.
 
     Args:
         function: to compile.
         flags: for the compiler, after its usual ones.
         required: whether a failure of the compiler is an error; without a compiler `function` is returned as it is all the same.
+        calls: number of calls that the compiled Function makes, `mapaccum`; 0: it is `function` itself. The chain is built only
+            where its library is not in the cache.
 
     Raises:
         CompileError: `required`, and the compiler failed.
@@ -94,10 +96,11 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
     if compiler is None:
         return Native(function, False, _why_no_compiler())
     try:
-        note = _note(function, compiler, flags)
+        note = _note(function, compiler, flags, calls)
         known = _noted(note) if note else None
         if known is None:
-            key, known = _library(generate(function), compiler, flags)
+            whole = function.mapaccum(f"{function.name()}_run", calls) if calls else function
+            key, known = _library(generate(whole), compiler, flags)
             _remember(note, key)
         return Native(known, True, "")
     except (NotSupported, CompileError) as error:
@@ -228,8 +231,8 @@ def _machine_flags() -> tuple[str, ...]:
     return ("-DALWAYS_WIDE",) if platform.machine() == "x86_64" and " avx2 " in facts else ()
 
 
-def _note(function: ca.Function, compiler: str, more: Sequence[str]) -> Path | None:
-    """The file that says which library a Function has; None for a Function that cannot be written down.
+def _note(function: ca.Function, compiler: str, more: Sequence[str], calls: int) -> Path | None:
+    """The file that says which library so many calls of a Function have; None for a Function that cannot be written down.
 
     Its name is a hash of the Function, in which the names of drivers have a hash of their text, and of all else that decides the
     library: compiler, flags, machine, CasADi, and the code that writes C. So what is in the cache is found without writing C.
@@ -239,7 +242,16 @@ def _note(function: ca.Function, compiler: str, more: Sequence[str]) -> Path | N
     except RuntimeError:
         return None
     link, command = (compiler, *more, *_LINK), _unit("", compiler, more).command
-    facts = (_writer(), _version(compiler), platform.machine(), ca.CasadiMeta.version(), *command, *link, content)
+    facts = (
+        _writer(),
+        _version(compiler),
+        platform.machine(),
+        ca.CasadiMeta.version(),
+        str(calls),
+        *command,
+        *link,
+        content,
+    )
     return cache_folder() / f"{hashlib.sha256(chr(0).join(facts).encode()).hexdigest()[:32]}.note"
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import control
 import numpy as np
@@ -211,3 +213,23 @@ def test_a_table_serves_as_a_reference():
     values = stage_data(plant, table, horizon, COSTS["deviation"])(0.2, plant.approximate)
     np.testing.assert_allclose(values.full(), expected.full(), atol=1e-5)
     transcribe(plant, table, horizon, COSTS["deviation"], fp.Limits())
+
+
+def test_horizons_of_plants_with_other_exact_parameters_are_the_same_one():
+    """A plan knows the approximate parameters alone: its horizon is that of a plant which is built anew with these exact ones."""
+    problem = TASK.problem
+    plant, other = problem.plant, problem.with_exact(1.1 * problem.plant.exact).plant
+    believed = {name: replace(p, approximate=1.1 * p.approximate) for name, p in plant.parameters.items()}
+
+    def horizon(plant):
+        start = problem.start_state
+        assert problem.horizon is not None
+        assert problem.cost is not None
+        return transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits, start=start)
+
+    shared, anew = horizon(plant), horizon(replace(plant, parameters=other.parameters))
+    assert horizon(other) is shared
+    assert anew is not shared
+    for one, same in zip(anew.nodes, shared.nodes, strict=True):
+        np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(horizon(replace(plant, parameters=believed)).nodes[2], shared.nodes[2])

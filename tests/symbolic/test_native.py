@@ -146,6 +146,20 @@ def test_a_library_is_found_without_writing_c(cache, monkeypatch):
 
 
 @needs_compiler
+def test_calls_in_a_chain_have_a_library_of_their_own(cache, monkeypatch):
+    """It hands on what is remembered; another number of calls has another library, which is found without the chain."""
+    x = np.linspace(-1.0, 1.0, 3)
+    for calls in (4, 5, 5):
+        expected = model(0.5).mapaccum("chain", calls)(x)
+        np.testing.assert_array_equal(native(model(0.5), calls=calls).function(x).full(), expected.full())
+    np.testing.assert_array_equal(native(model(0.5)).function(x).full(), model(0.5)(x).full())
+    assert len(_libraries(cache)) == 3
+    monkeypatch.setattr(module, "_loaded", {})
+    monkeypatch.setattr(module, "generate", lambda _: pytest.fail("its C was written again"))
+    np.testing.assert_array_equal(native(model(0.5), calls=5).function(x).full(), expected.full())
+
+
+@needs_compiler
 @pytest.mark.parametrize("damage", ["exchanged", "cut", "strange", "no library"])
 def test_a_wrong_note_finds_nothing(cache, monkeypatch, damage):
     """A note of another Function, half of one, other words, and one whose library is gone: the numbers are the model's own."""
