@@ -6,7 +6,7 @@ what the controller remembers has found its place, also in a loop that does not 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import TypeAlias, TypeVar
@@ -42,7 +42,7 @@ class Loops:
     Args:
         places: indices of the loops' points among the reference's points, those at a limit left out: there nothing is fed back.
         loops: loops of the plant with its exact parameters, one for every place.
-        ideal: loop of the controller without deformation whose model is the plant: the outer loop by itself.
+        ideal: loop of the controller without deformation whose model is the plant, the outer loop by itself; None: not computed.
         drawn: loops of plants from the box of parameters, and with the shortest and the longest dead time of the box.
         reason: why there are no loops; else empty.
         learns: whether the controller changes on line what the loops have as it is at their points: a model, or gains.
@@ -64,9 +64,18 @@ class Loops:
 
 
 def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
-    """Return the controller's linear loops along the reference, or the reason why there are none."""
+    """Return the controller's linear loops along the reference with the ideal one, or the reason why there are none."""
+    return _or_reason(controller, lambda: replace(_loops(grid, controller), ideal=ideal_loops(grid, controller, 1)[0]))
+
+
+def own_loops(grid: ReviewGrid, controller: Controller) -> Loops:
+    """Return the controller's linear loops along the reference, without the ideal one, or the reason why there are none."""
+    return _or_reason(controller, lambda: _loops(grid, controller))
+
+
+def _or_reason(controller: Controller, loops: Callable[[], Loops]) -> Loops:
     try:
-        return _loops(grid, controller)
+        return loops()
     except FpirhcError as error:
         return Loops((), (), None, reason=str(error), learns=controller.learns)
     except np.linalg.LinAlgError as error:
@@ -86,9 +95,8 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     drawn = {pair: points.at(*pair) for pair in pairs if np.isfinite(grid.commands[pair[::-1]]).all()}
     drawn = {pair: one for pair, one in drawn.items() if (_fed_back(one) >= _SMALL * strongest).all()}
     late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, places[:: max(1, len(places) // 2)])]
-    ideal = ideal_loops(grid, controller, 1)[0]
     loops, learns = tuple(every[k] for k in places), controller.learns and points.asked.keeps_learned
-    return Loops(places, loops, ideal, (*drawn.values(), *late), learns=learns, draws=tuple(drawn))
+    return Loops(places, loops, None, (*drawn.values(), *late), learns=learns, draws=tuple(drawn))
 
 
 def _fed_back(loop: LinearLoop) -> np.ndarray:

@@ -30,7 +30,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import review_grid
-from fpirhc.review.loops import LoopsByGain, loops_along
+from fpirhc.review.loops import LoopsByGain, loops_along, own_loops
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.question import Case
 from fpirhc.review.questions.margins import keeps_margins
@@ -247,5 +247,5 @@ def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> s
 
 def _speed(problem: Problem, controller: Controller) -> Answer | None:
     grid = review_grid(problem, 0.0, 0)
-    case = Case(grid, controller, loops_along(grid, controller), NominalRuns(grid.problem))
+    case = Case(grid, controller, own_loops(grid, controller), NominalRuns(grid.problem))
     return fast_enough(case) or plan_keeps_up(case)

@@ -16,7 +16,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.mismatch import check_mismatch
 from fpirhc.review.grid import ReviewGrid, review_grid
-from fpirhc.review.loops import ideal_loops, ideal_places, loops_along
+from fpirhc.review.loops import ideal_loops, ideal_places, own_loops
 from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, nominal_run, response_errors
 from fpirhc.review.state_slopes import state_slopes
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
@@ -128,7 +128,7 @@ def _widest(
 ) -> tuple[np.ndarray | None, str]:
     gain = nominal.controller.deformation.effective_gain()
     grid = review_grid(nominal.problem, 0.0, 0)
-    loops = loops_along(grid, nominal.controller)
+    loops = own_loops(grid, nominal.controller)
     if not np.isfinite(adapted.error).all():
         return None, "no tube: the predicted response errors do not stay finite"
     if loops.loops and loops.radii.max() >= 1:

@@ -19,7 +19,7 @@ from fpirhc.controllers import contract
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.grid import review_grid
-from fpirhc.review.loops import loops_along
+from fpirhc.review.loops import loops_along, own_loops
 from fpirhc.review.questions.form import forms_of
 from fpirhc.review.questions.horizon import plan_gain
 from fpirhc.review.questions.margins import margins
@@ -117,6 +117,20 @@ def test_deformation_adds_its_own_pole():
     """J = 1.5 and a = 0.198 (gain -0.5): the fast mode of the loop is 1 - a J, as the contraction says."""
     loops = loops_along(review_grid(mass(), 0.0, 0), torque(rate=1.0))
     assert np.abs(loops.loops[0].poles - (1 - 0.5 * 0.3967373 * 1.5)).min() < 5e-3
+
+
+def test_own_loops_are_those_beside_the_ideal_one():
+    """A prediction and the advice on a gain ask for the former alone; the ideal loop of a wrong model is that of the right one."""
+    grid, right = review_grid(mass(), 0.0, 0), fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=1.0)))
+    alone, whole = own_loops(grid, torque(rate=1.0)), loops_along(grid, torque(rate=1.0))
+    assert alone.ideal is None
+    assert alone.places == whole.places
+    np.testing.assert_array_equal(alone.radii, whole.radii)
+    assert whole.ideal is not None
+    for loop in (whole.ideal, own_loops(grid, right).loops[0]):  # a threefold pole is soft, its mean is not
+        slow = loop.poles[np.abs(loop.poles) > 0.5]
+        assert np.log(slow).mean() / PERIOD == pytest.approx(-1.0, rel=0.01)
+    assert own_loops(grid, fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-6))).reason
 
 
 @pytest.mark.parametrize("cycles", [0, 1, 2, 5])
