@@ -35,5 +35,5 @@ def test_a_comparison_composes_every_controller_once(monkeypatch):
     result = fp.compare(task, seed=0, controllers=names, compiled=False)
     assert [e.name for e in result.entries] == names
     assert all(e.price or not e.adaptive for e in result.entries)
-    assert sorted(composed.values()) == [1, 1, 5], "the controllers, and three loops that are asked"
+    assert sorted(composed.values()) == [1, 1, 4], "the controllers, and two loops that are asked"
     assert set(planned.values()) == {1}
