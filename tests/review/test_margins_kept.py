@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fpirhc.review.questions.margins import LEAST_GAIN, LEAST_PHASE, keeps_margins, margins
+from fpirhc.review.questions.margins import LEAST_GAIN, LEAST_PHASE, _turning, keeps_margins, margins
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
 
@@ -35,3 +35,13 @@ def test_the_short_answer_is_that_of_the_sizes(cycles):
         answers.add(keeps_margins(one, 0))
         assert keeps_margins(one, 0) == (gain >= LEAST_GAIN and phase >= LEAST_PHASE), seed
     assert answers == {True, False}  # the loops are of both kinds
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.3, 2.5, np.exp(-0.7j)])
+def test_a_multiplied_command_has_the_poles_of_the_product_of_its_cycles(factor):
+    one = loop(4, 3)
+    product = np.eye(6)
+    for part in one.cycles:
+        product = (part.dynamics + (factor - 1) * part.entry @ part.arriving) @ product
+    [poles] = _turning(one, 0)(np.array([factor]))
+    np.testing.assert_allclose(np.poly(poles), np.poly(np.linalg.eigvals(product)), rtol=1e-9, atol=1e-12)

@@ -135,7 +135,7 @@ def keeps_margins(loop: LinearLoop, place: int) -> bool:
         return gain >= LEAST_GAIN and phase >= LEAST_PHASE
     most, angle = math.log(LEAST_GAIN), math.radians(LEAST_PHASE)
     factors = [*np.exp(_up_to(most, _DECADES)), *np.exp(-_up_to(most, _DECADES)), *np.exp(-1j * _up_to(angle, math.pi))]
-    return bool((np.abs(_turned(loop, place, np.array(factors))) < 1).all())
+    return bool((np.abs(_turning(loop, place)(np.array(factors))) < 1).all())
 
 
 def _up_to(end: float, most: float) -> np.ndarray:
@@ -175,27 +175,43 @@ def _of_a_period(loop: LinearLoop, place: int) -> tuple[float, float, float]:
 
     A mode turns by at most pi in a period, so the delay of a turned command follows from the turn of the mode.
     """
-    up = _first(lambda x: _turned(loop, place, np.exp(x)), _DECADES)
-    down = _first(lambda x: _turned(loop, place, np.exp(-x)), _DECADES)
-    angle = _first(lambda x: _turned(loop, place, np.exp(-1j * x)), math.pi)
-    poles = _turned(loop, place, np.exp([-1j * angle]))[0] if math.isfinite(angle) else np.ones(1)
+    turned = _turning(loop, place)
+    up = _first(lambda x: turned(np.exp(x)), _DECADES)
+    down = _first(lambda x: turned(np.exp(-x)), _DECADES)
+    angle = _first(lambda x: turned(np.exp(-1j * x)), math.pi)
+    poles = turned(np.exp([-1j * angle]))[0] if math.isfinite(angle) else np.ones(1)
     turns = np.angle(poles[np.abs(np.abs(poles) - 1) < 1e-3])
     fastest = float(np.abs(turns).max(initial=0.0)) / (len(loop.cycles) * loop.period)
     return math.exp(min(up, down)), math.degrees(angle), angle / fastest if fastest else math.inf
 
 
-def _turned(loop: LinearLoop, place: int, factors: np.ndarray) -> np.ndarray:
-    """Poles (factors, poles) of a period in which a command is multiplied, without those that are no fault of the loop."""
+def _turning(loop: LinearLoop, place: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Function factors -> poles (factors, poles) when a command is multiplied, without those of no fault of the loop.
+
+    Over a period z -> A z + B u and v = C z + D u, where v are the values of the command in its cycles and u what is added to them.
+    With u = (factor - 1) v, the period's map is A + B (1 / (factor - 1) - D)^-1 C.
+    """
     whole: np.ndarray = np.eye(loop.dynamics.shape[1])
-    for one in loop.cycles:
-        more = (factors[:, None, None] - 1) * np.outer(one.entry[:, place], one.arriving[place])
-        whole = (one.dynamics + more) @ whole
-    poles = np.asarray(np.linalg.eigvals(whole))
-    for hidden in loop.poles[loop.hidden]:
-        nearest = np.argmin(np.abs(poles - hidden), axis=1)
-        others = np.arange(poles.shape[1]) != nearest[:, None]
-        poles = poles[others].reshape(len(poles), -1)
-    return poles
+    added, shown, through = np.zeros((len(whole), 0)), [], np.zeros((len(loop.cycles), len(loop.cycles)))
+    for k, one in enumerate(loop.cycles):
+        command = one.arriving[place]
+        shown.append(command @ whole)
+        through[k, :k] = command @ added
+        added, whole = np.column_stack([one.dynamics @ added, one.entry[:, place]]), one.dynamics @ whole
+    faultless = loop.poles[loop.hidden]
+
+    def poles_of(factors: np.ndarray) -> np.ndarray:
+        more = (factors - 1)[:, None, None]
+        poles = np.linalg.eigvals(
+            whole + added @ np.linalg.solve(np.eye(len(shown)) - more * through, more * np.array(shown))
+        )
+        for hidden in faultless:
+            nearest = np.argmin(np.abs(poles - hidden), axis=1)
+            others = np.arange(poles.shape[1]) != nearest[:, None]
+            poles = poles[others].reshape(len(poles), -1)
+        return np.asarray(poles)
+
+    return poles_of
 
 
 def _first(poles: Callable[[np.ndarray], np.ndarray], most: float) -> float:
