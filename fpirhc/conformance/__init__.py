@@ -12,20 +12,6 @@ Each raises one AssertionError for the first law that is broken, with the number
 every number). The laws are the tuples `LAWS` of the modules, one module per family.
 """
 
-from fpirhc.conformance.controller import check_controller
-from fpirhc.conformance.deformation import check_deformation
-from fpirhc.conformance.live import check_live
-from fpirhc.conformance.observer import check_observer
-from fpirhc.conformance.optimiser import check_optimiser
-from fpirhc.conformance.plant import check_plant
-from fpirhc.conformance.tracking import check_tracking
+import lazy_loader as _lazy
 
-__all__ = [
-    "check_controller",
-    "check_deformation",
-    "check_live",
-    "check_observer",
-    "check_optimiser",
-    "check_plant",
-    "check_tracking",
-]
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,21 +1,5 @@
 """Sensing: the way from the plant to the controller, through sensors and an estimator of unmeasured quantities."""
 
-from fpirhc.sensing.base import DerivativeEstimator
-from fpirhc.sensing.measured import Measured
-from fpirhc.sensing.positions import PositionDifference, SavitzkyGolay, StepDifference
-from fpirhc.sensing.sensing import Sensing, Sensor
-from fpirhc.sensing.state_filter import StateVariableFilter
-from fpirhc.sensing.velocities import LowPassDifference, VelocityDifference
+import lazy_loader as _lazy
 
-__all__ = [
-    "DerivativeEstimator",
-    "LowPassDifference",
-    "Measured",
-    "PositionDifference",
-    "SavitzkyGolay",
-    "Sensing",
-    "Sensor",
-    "StateVariableFilter",
-    "StepDifference",
-    "VelocityDifference",
-]
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -4,36 +4,6 @@ Offset-free predictive control is `Estimating(RecedingHorizon(...), DisturbanceK
 the filter it is the periodic one.
 """
 
-from fpirhc.controllers.rivals.acceleration_feedback import AccelerationFeedback
-from fpirhc.controllers.rivals.adaptive_inverse_dynamics import AdaptiveInverseDynamics
-from fpirhc.controllers.rivals.adrc import ADRC
-from fpirhc.controllers.rivals.backstepping_mrac import BacksteppingMRAC
-from fpirhc.controllers.rivals.disturbance_observer import DisturbanceObserver
-from fpirhc.controllers.rivals.force_mrac import ForceMRAC
-from fpirhc.controllers.rivals.indi import INDI
-from fpirhc.controllers.rivals.intelligent_pid import IntelligentPID
-from fpirhc.controllers.rivals.l1_adaptive import L1Adaptive
-from fpirhc.controllers.rivals.lyapunov_mrac import LyapunovMRAC
-from fpirhc.controllers.rivals.pid import PID
-from fpirhc.controllers.rivals.repetitive_control import RepetitiveControl
-from fpirhc.controllers.rivals.resolved_rate import ResolvedAccelerationRate
-from fpirhc.controllers.rivals.sliding_mode import SlidingMode
-from fpirhc.controllers.rivals.slotine_li import SlotineLi
+import lazy_loader as _lazy
 
-__all__ = [
-    "ADRC",
-    "INDI",
-    "PID",
-    "AccelerationFeedback",
-    "AdaptiveInverseDynamics",
-    "BacksteppingMRAC",
-    "DisturbanceObserver",
-    "ForceMRAC",
-    "IntelligentPID",
-    "L1Adaptive",
-    "LyapunovMRAC",
-    "RepetitiveControl",
-    "ResolvedAccelerationRate",
-    "SlidingMode",
-    "SlotineLi",
-]
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,21 @@
+"""The public names; `__init__.py` imports each when it is first used."""
+
+from .base import DerivativeEstimator
+from .measured import Measured
+from .positions import PositionDifference, SavitzkyGolay, StepDifference
+from .sensing import Sensing, Sensor
+from .state_filter import StateVariableFilter
+from .velocities import LowPassDifference, VelocityDifference
+
+__all__ = [
+    "DerivativeEstimator",
+    "LowPassDifference",
+    "Measured",
+    "PositionDifference",
+    "SavitzkyGolay",
+    "Sensing",
+    "Sensor",
+    "StateVariableFilter",
+    "StepDifference",
+    "VelocityDifference",
+]
