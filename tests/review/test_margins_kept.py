@@ -45,3 +45,18 @@ def test_a_multiplied_command_has_the_poles_of_the_product_of_its_cycles(factor)
         product = (part.dynamics + (factor - 1) * part.entry @ part.arriving) @ product
     [poles] = _turning(one, 0)(np.array([factor]))
     np.testing.assert_allclose(np.poly(poles), np.poly(np.linalg.eigvals(product)), rtol=1e-9, atol=1e-12)
+
+
+def test_margins_are_sought_no_farther_than_to_the_first_pole_outside(monkeypatch):
+    """A loop that leaves the unit circle at a small factor has the poles of few factors computed."""
+    sizes, original = [], np.linalg.eigvals
+
+    def counted(matrices):
+        sizes.append(len(matrices) if np.ndim(matrices) == 3 else 1)
+        return original(matrices)
+
+    monkeypatch.setattr(np.linalg, "eigvals", counted)
+    one = next(loop(seed, 3) for seed in range(60) if margins(loop(seed, 3), 0)[0] < 1.1)
+    sizes.clear()
+    assert not keeps_margins(one, 0)
+    assert sum(sizes) <= 3  # its own poles, those of no change and of the first step

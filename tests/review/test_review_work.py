@@ -26,7 +26,7 @@ def test_controllers_that_differ_in_their_deformation_share_what_a_review_builds
     plans = counted(monkeypatch, replanning, "first_memory")
     asked = counted(monkeypatch, AskedLoop, "__init__")
     linear = counted(monkeypatch, AskedLoop, "_among")
-    steps = counted(monkeypatch, Step, "__call__")
+    steps = counted(monkeypatch, Step, "into")
     fp.review(task.problem, pair, mismatch=0.0, seed=0)
     assert len(plans) == 1  # exact parameters are numbers of the plant, and no other horizon
     assert len(asked) == 2  # without adaptation, and with a map of any gain

@@ -32,7 +32,7 @@ _LARGEST = 400  # states of a loop whose margins are computed
 _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 _DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
-_STEPS = 60
+_STEPS, _TOGETHER = 60, 5
 SLOWER = "Let it learn more slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
 
 
@@ -135,7 +135,8 @@ def keeps_margins(loop: LinearLoop, place: int) -> bool:
         return gain >= LEAST_GAIN and phase >= LEAST_PHASE
     most, angle = math.log(LEAST_GAIN), math.radians(LEAST_PHASE)
     factors = [*np.exp(_up_to(most, _DECADES)), *np.exp(-_up_to(most, _DECADES)), *np.exp(-1j * _up_to(angle, math.pi))]
-    return bool((np.abs(_turning(loop, place)(np.array(factors))) < 1).all())
+    poles = _turning(loop, place)
+    return all(bool((np.abs(poles(np.array([factor]))) < 1).all()) for factor in factors)
 
 
 def _up_to(end: float, most: float) -> np.ndarray:
@@ -221,11 +222,12 @@ def _first(poles: Callable[[np.ndarray], np.ndarray], most: float) -> float:
         return np.asarray(np.abs(poles(x)).max(axis=1, initial=0.0)) - 1
 
     steps = np.linspace(0, most, _STEPS + 1)
-    beyond = np.flatnonzero(outside(steps) >= 0)
-    if not beyond.size:
-        return math.inf
-    k = int(beyond[0])
-    return _root(lambda x: float(outside(np.array([x]))[0]), steps[k - 1], steps[k], 1e-6) if k else 0.0
+    for k in range(0, len(steps), _TOGETHER):
+        beyond = np.flatnonzero(outside(steps[k : k + _TOGETHER]) >= 0)
+        if beyond.size:
+            k += int(beyond[0])
+            return _root(lambda x: float(outside(np.array([x]))[0]), steps[k - 1], steps[k], 1e-6) if k else 0.0
+    return math.inf
 
 
 def _asked(case: Case) -> Answer:

@@ -36,6 +36,7 @@ _SHARE = 0.01  # of their sizes, by which states and inputs are moved to find th
 _SMALLEST = 1e-5  # scale of an entry, as a share of its value
 _ROOM = 0.01  # share of the range between an input's limits, nearer than which a command stands at one
 _AWAY = 1e100  # of an entry, from which a run has run away: squares of what is larger overflow
+_LOOK = 50  # cycles after which a run is looked at, whether it is at rest
 _STILL = 1e-7  # change of a command from period to period, as a share of the largest
 
 
@@ -148,24 +149,35 @@ class AskedLoop:
             request: that is put in place of the last deformed response once everything else has found its place, so that an
                 iteration that does not converge is near its fixed point too; None: none is.
         """
-        memories, traces, still = [memory], [], 0
+        memories, traces = np.empty((cycles + 1, memory.size)), np.empty((cycles, self.loop.trace.size))
+        memories[0], end = memory, cycles
         leads = None if led is None else np.isfinite(led)
+        asks = request is not None and len(self._request) == request.size
         for k in range(cycles):
-            memory_next, trace = self._step(memories[-1])
-            if not ((np.abs(memory_next) < _AWAY).all() and np.isfinite(trace[self._arriving]).all()):
+            memory_next, trace = memories[k + 1], traces[k]
+            self._step.into(memories[k], 0.0, memory_next, trace)
+            if not (_below(memory_next, _AWAY) and _below(trace[self._arriving], math.inf)):
+                end = k
                 break
             if led is not None and leads is not None:
                 np.copyto(memory_next[self._state], led[k], where=leads[k])
-            if request is not None and k == self.warm and len(self._request) == request.size:
+            if asks and k == self.warm:
                 memory_next[self._request] = request
-            memories.append(memory_next)
-            traces.append(trace)
-            if led is not None and k > self.warm:
-                command, before = trace[self._command], traces[-1 - self.repeats][self._command]
-                still = still + 1 if (np.abs(command - before) <= _STILL * np.abs(command).max()).all() else 0
-                if still > self._longest:
+            if led is not None and k % _LOOK == _LOOK - 1:
+                at_rest = self._at_rest(traces[: k + 1])
+                if at_rest is not None:
+                    end = at_rest
                     break
-        return Passage(np.array(memories), np.array(traces).reshape(-1, self.loop.trace.size))
+        return Passage(memories[: end + 1], traces[:end])
+
+    def _at_rest(self, traces: np.ndarray) -> int | None:
+        """The number of cycles after which commands have been still for longer than they may take; None: they have not."""
+        commands, n, first = traces[:, self._command], self.repeats, self.warm + 1
+        now, before = commands[first:], commands[first - n : len(commands) - n]
+        still = (np.abs(now - before) <= _STILL * np.abs(now).max(axis=1, keepdims=True)).all(axis=1)
+        counts = np.convolve(still, np.ones(self._longest + 1), "valid") if len(still) > self._longest else still[:0]
+        rests = np.flatnonzero(counts > self._longest)
+        return first + int(rests[0]) + self._longest + 1 if rests.size else None
 
     def quietest(self, passage: Passage) -> np.ndarray:
         """Return the memory in the quietest part of a run: where commands differ least from those of the period before.
@@ -310,6 +322,11 @@ class AskedLoop:
         for k, column in enumerate(self.loop.memory.columns):
             groups.setdefault(column.split("@")[0], []).append(k)
         return [places for places in groups.values() if len(places) > 1]
+
+
+def _below(values: np.ndarray, end: float) -> bool:
+    """Whether all values (n,) are numbers of a size below an end."""
+    return bool(values.dot(values) < _AWAY**2) or bool((np.abs(values) < end).all())
 
 
 def _started(problem: Problem, state: Mapping[str, float] | None, before: Mapping[str, float] | None) -> Problem:

@@ -45,10 +45,16 @@ class Step:
 
     def __call__(self, memory: np.ndarray, w: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Return the next memory and the trace; w is added to the plant's inputs."""
+        memory_next, trace = (np.empty_like(result) for result in self._evaluator.results)
+        self.into(memory, w, memory_next, trace)
+        return memory_next, trace
+
+    def into(self, memory: np.ndarray, w: np.ndarray | float, memory_next: np.ndarray, trace: np.ndarray) -> None:
+        """Write the next memory and the trace into two arrays."""
         self._evaluator.arguments[0][:] = memory
         self._evaluator.arguments[1][:] = w
         self._evaluator.evaluate()
-        return self._evaluator.results[0].copy(), self._evaluator.results[1].copy()
+        memory_next[:], trace[:] = self._evaluator.results
 
     def way(self, memory: np.ndarray, scales: np.ndarray) -> Way:
         """Return the function (deviations in scales, w) -> (next deviations in scales, deviations of the trace), all by columns."""
@@ -72,20 +78,25 @@ class Step:
         def move(deviations: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             sizes = np.sqrt(np.maximum((deviations**2).sum(axis=0), (w**2).sum(axis=0)))
             moved, traces = np.zeros_like(deviations), np.zeros((self.loop.trace.size, w.shape[1]))
-            with np.errstate(
-                invalid="ignore", over="ignore"
-            ):  # a loop that runs away has infinite values on both sides
-                for k in np.flatnonzero(sizes):
-                    h = _STEP / sizes[k]
-                    by_memory, by_input = h * scales * deviations[:, k], h * w[:, k]
-                    ahead, behind = self(memory + by_memory, by_input), self(memory - by_memory, -by_input)
-                    moved[:, k] = (ahead[0] - behind[0]) / (2 * h * scales)
-                    traces[:, k] = (ahead[1] - behind[1]) / (2 * h)
+            some = np.flatnonzero(sizes)
+            h = _STEP / sizes[some, None]
+            by_memory, by_input = h * scales * deviations.T[some], h * w.T[some]
+            with np.errstate(invalid="ignore", over="ignore"):  # a loop that runs away is infinite on both sides
+                ahead, behind = self._each(memory + by_memory, by_input), self._each(memory - by_memory, -by_input)
+                moved[:, some] = ((ahead[0] - behind[0]) / (2 * h * scales)).T
+                traces[:, some] = ((ahead[1] - behind[1]) / (2 * h)).T
             if not np.isfinite(moved).all():
                 raise NotSupported("the loop has no finite slope at a point of its run")
             return np.where(np.abs(moved) > _ROUNDING * sizes, moved, 0.0), traces
 
         return move
+
+    def _each(self, memories: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The next memories and the traces of some memories and inputs, by rows."""
+        memories_next, traces = np.empty_like(memories), np.empty((len(memories), self.loop.trace.size))
+        for k in range(len(memories)):
+            self.into(memories[k], w[k], memories_next[k], traces[k])
+        return memories_next, traces
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +141,13 @@ def reached(
     """
     count, kicks, fixed = len(ways), (np.zeros((free.size, inputs)), np.eye(inputs)), ~free
     parts = [_Part(some, free.size, None if begun is None else begun[k]) for k, some in enumerate(ways)]
-    waiting = [(0, np.where(np.arange(free.size) == k, 1.0, 0.0)) for k in first] if begun is None else []
+    waiting: list[list[np.ndarray]] = [[] for _ in ways]  # of each cycle, what is to be looked at
+    if begun is None:
+        waiting[0].extend(np.eye(free.size)[first])
 
     def passed(place: int, moved: np.ndarray) -> None:
         moved[fixed] = 0.0
-        waiting.extend(((place + 1) % count, one) for one in moved.T)
+        waiting[(place + 1) % count].extend(moved.T)
 
     for k, part in enumerate(parts):
         for way in ways[k] if begun is None else ways[k][:-1]:
@@ -142,18 +155,10 @@ def reached(
             passed(k, moved / (np.linalg.norm(moved * free[:, None], axis=0) + 1e-300))
         for moved in part.caught_up(inputs):
             passed(k, moved)
-    calm, at = np.zeros((inputs, 1)), 0
-    while at < len(waiting):
-        place, one = waiting[at]
-        at += 1
-        part = parts[place]
-        basis = part.basis[:, : part.count]
-        for _ in range(2):  # the second time for the rounding of the first
-            one = one - basis @ (one @ basis)
-        length = math.sqrt(one @ one)
-        if length > _NEW:
-            for moved in part.joined((one / length)[:, None], calm):
-                passed(place, moved)
+    while any(waiting):
+        for place, part in enumerate(parts):
+            some, waiting[place] = waiting[place], []
+            passed(place, part.moved(part.joined(some), inputs))
     return [part.directions for part in parts]
 
 
@@ -176,14 +181,27 @@ class _Part:
             known.append(way(self._begun.basis, calm))
         return [known[0][0].copy() for known in self._images[:-1]]
 
-    def joined(self, direction: np.ndarray, calm: np.ndarray) -> list[np.ndarray]:
-        """Add a direction (n, 1); return what every way makes of it."""
-        if self.count >= _LARGEST:
-            raise NotSupported(f"the loop moves in more than {_LARGEST} directions")
-        self._append(direction)
+    def joined(self, some: Sequence[np.ndarray]) -> np.ndarray:
+        """Add what is new in some deviations (n,); return these directions (n, m)."""
+        before = self.count
+        for one in some:
+            basis = self.basis[:, : self.count]
+            for _ in range(2):  # the second time for the rounding of the first
+                one = one - basis @ (one @ basis)
+            length = math.sqrt(one @ one)
+            if length > _NEW:
+                if self.count >= _LARGEST:
+                    raise NotSupported(f"the loop moves in more than {_LARGEST} directions")
+                self._append((one / length)[:, None])
+        return self.basis[:, before : self.count].copy()
+
+    def moved(self, directions: np.ndarray, inputs: int) -> np.ndarray:
+        """Return what every way makes of directions (n, m) that were added, direction by direction."""
+        if not directions.size:
+            return directions
         for way, known in zip(self.ways, self._images, strict=True):
-            known.append(way(direction, calm))
-        return [known[-1][0].copy() for known in self._images]
+            known.append(way(directions, np.zeros((inputs, directions.shape[1]))))
+        return np.stack([known[-1][0] for known in self._images], axis=2).reshape(len(directions), -1)
 
     def _append(self, directions: np.ndarray) -> None:
         rows, more = directions.shape
