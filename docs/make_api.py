@@ -14,7 +14,7 @@ STUB = Path(fp.__file__).with_suffix(".pyi")
 SECTIONS = {
     "Plants and problems": ("plant", "task", "problem_files", "symbolic"),
     "Sensing": ("sensing",),
-    "Controllers": ("controllers",),
+    "Controllers": ("controllers", "export"),
     "Tracking laws": ("tracking",),
     "Deformations": ("deformation", "contraction"),
     "Horizons and optimisers": ("horizon", "optimisers"),

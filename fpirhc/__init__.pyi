@@ -28,6 +28,7 @@ from .deformation.wrappers.guarded import Guarded
 from .deformation.wrappers.self_paired import DelayWatched, SelfPaired
 from .deformation.wrappers.tuned import Tuned
 from .errors import FpirhcError, HarmfulAdaptation
+from .export.processor import Processor
 from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.horizon import Horizon
@@ -188,6 +189,7 @@ __all__ = [
     "PositionDifference",
     "Predicted",
     "Problem",
+    "Processor",
     "Projection",
     "Pulse",
     "Qrqp",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import io
 import re
 import subprocess
 import sys
@@ -12,8 +13,11 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 import fpirhc as fp
-from fpirhc.export.target import device_of, target_called, write
+from fpirhc.export.cortex import Board, Image
+from fpirhc.export.target import device_of, processor_of, target_called, write
 from fpirhc.symbolic.native import find_compiler
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
@@ -26,6 +30,7 @@ CASES = (
     ("fishery", "RHC+FPI", {}),
 )
 WEB = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("anaesthesia", "RHC+FPI"))
+BOARDS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("leaking_tanks", "RHC+FPI"))
 UNITS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"))
 CYCLES = 2000
 
@@ -99,6 +104,36 @@ def web_row(problem: str, title: str) -> list[str]:
     return [f"{problem}, {title}", *(f"{size / 1000:.0f}" for size in sizes), *hashes]
 
 
+def cortex_row(problem: str, title: str) -> list[str]:
+    """One line of the table of Cortex-M7: sizes, instructions, and the commands of a run with it and with C here."""
+    task = fp.load_problem(problem)
+    shorter = replace(task.problem, duration=500 * task.problem.period, measure_from=0.0)
+    device = device_of(shorter, task.controllers[title], title, name="c", cycles=1, libm="own")
+    with tempfile.TemporaryDirectory() as name:
+        board, here, lines = Path(name) / "board", Path(name) / "c", io.BytesIO()
+        write(device, target_called("cortex-m"), board)
+        write(device, target_called("c"), here)
+        program = processor_of(target_called("c"))(here, "c")
+        run = fp.simulate(shorter, device.controller, seed=0)
+        other = fp.simulate(shorter, fp.Processor(program), seed=0)
+        given = np.hstack(
+            [other[n].reshape(len(other.time), -1) if n != "time" else other.time[:, None] for n in device.inputs.names]
+        )
+        text = b"r\n" + b"".join(
+            b"s " + b" ".join(b"%016x" % w for w in row.view(np.uint64).tolist()) + b"\n" for row in given
+        )
+        image = Image(board / "c_m7.elf")
+        emulated = Board(image, io.BytesIO(text), lines, "c_step")
+        emulated.run()
+        answers = [subprocess.run(program, input=text, capture_output=True, check=True).stdout, lines.getvalue()]
+    apart = np.abs(other["command"] - run["command"]).max()
+    hashes = [hashlib.sha256(one).hexdigest()[:12] for one in answers]
+    code, data = image.size(0), image.size(0x20000000)
+    counts = emulated.counts
+    return [f"{problem}, {title}", f"{code / 1000:.0f}", f"{data / 1000:.0f}", f"{np.mean(counts):.0f}", f"{max(counts)}",
+            f"{apart:.1g}", *hashes]  # fmt: skip
+
+
 def _said(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
@@ -119,6 +154,17 @@ def main() -> None:
     ]
     rows = [unit_row(problem, title, target) for problem, title in UNITS for target in ("fmu", "fmu2")]
     text = _filled(text, "units", head, rows)
+    head = [
+        "controller",
+        "code, kB",
+        "data, kB",
+        "instructions, mean",
+        "most",
+        "command",
+        "answers there",
+        "answers here",
+    ]
+    text = _filled(text, "cortex", head, [cortex_row(*case) for case in BOARDS])
     head = ["controller", "module, kB", "compressed, kB", "commands in Node", "commands in C here"]
     PAGE.write_text(_filled(text, "web", head, [web_row(*case) for case in WEB]), encoding="utf-8")
 

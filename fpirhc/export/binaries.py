@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from fpirhc.errors import CompileError, package
+from fpirhc.errors import CompileError, NotSupported, package
 from fpirhc.symbolic.native import find_compiler
 
 # No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.
@@ -28,6 +28,20 @@ PLATFORMS = {  # and the names that zig has for them
     "aarch64-darwin": "aarch64-macos",
 }
 
+# Headers of a libc, and of it what is reached, which makes no system calls.
+_THUMB = "thumb-linux-musleabihf"
+_CORTEX = {"m7": ("-mcpu=cortex_m7+fp_armv8d16",), "m4f": ("-mcpu=cortex_m4+vfp4d16sp", "-Dcasadi_real=float")}
+_BARE = (
+    "-g0",
+    "-fno-math-errno",
+    "-fno-unwind-tables",
+    "-fno-asynchronous-unwind-tables",
+    "-ffunction-sections",
+    "-fdata-sections",
+    "-fno-sanitize=all",
+    "-fno-stack-protector",
+)
+
 
 def shared_libraries(files: Mapping[str, str]) -> dict[str, bytes]:
     """Return a shared library by platform, "x86_64-linux" and so on; nothing where there is no compiler.
@@ -41,6 +55,22 @@ def shared_libraries(files: Mapping[str, str]) -> dict[str, bytes]:
     return {place: _compiled(files, command, place) for place, command in _compilers().items()}
 
 
+def program(sources: Sequence[Path], made: Path, *flags: str) -> None:
+    """Build a program of C files for this machine.
+
+    Raises:
+        NotSupported: there is no compiler.
+        CompileError: it refuses the files.
+    """
+    own = find_compiler()
+    if own is None:
+        raise NotSupported(
+            "a program of this machine needs a C compiler: install gcc or clang, or name one by FPIRHC_CC"
+        )
+    command = [own, "-std=c99", "-O2", "-ffp-contract=off", *flags, *map(str, sources), "-o", str(made), "-lm"]
+    _done(command, "no program")
+
+
 def web_module(files: Mapping[str, str]) -> bytes:
     """Return a WebAssembly module of C files, without imports.
 
@@ -52,6 +82,56 @@ def web_module(files: Mapping[str, str]) -> bytes:
     # 256 kB hold the deepest plan; zig's own 16 MB are all that a page would ask for.
     flags = ("-mexec-model=reactor", "-Wl,-z,stack-size=262144", "-Wl,--no-entry")
     return _compiled(files, [*_ZIG, "wasm32-wasi", *flags], "wasm32")
+
+
+def arm_programs(files: Mapping[str, str], around: Mapping[str, str], script: str) -> dict[str, bytes]:
+    """Return a program and a library of C files by processor, "m7.elf", "m7.a" and so on; M7 computes in double, M4F in float.
+
+    Args:
+        files: C files and headers by name.
+        around: C files that are in the programs alone.
+        script: of the linker.
+
+    Raises:
+        NotSupported: ziglang is not installed.
+        CompileError: it refuses the files.
+    """
+    package("ziglang", "cortex", "the target cortex-m")
+    made: dict[str, bytes] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in {**files, **around, "board.ld": script}.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        for place, flags in _CORTEX.items():
+            library, others = (
+                [_object(folder, file, place, flags) for file in part if file.endswith(".c")]
+                for part in (files, around)
+            )
+            program, archive = folder / f"{place}.elf", folder / f"{place}.a"
+            image = (
+                "-static",
+                "-Wl,-e,reset",
+                f"-Wl,-T,{folder / 'board.ld'}",
+                "-Wl,--gc-sections",
+                *map(str, [*library, *others]),
+            )
+            _done([*_ZIG, _THUMB, *flags, *image, "-o", str(program)], f"no program for {place}")
+            _done([*_ZIG[:3], "ar", "rcs", str(archive), *map(str, library)], f"no library for {place}")
+            made |= {path.name: path.read_bytes() for path in (program, archive)}
+    return made
+
+
+def _object(folder: Path, file: str, place: str, flags: Sequence[str]) -> Path:
+    made = folder / f"{Path(file).stem}_{place}.o"
+    own = ("-std=c99", "-O2", "-ffp-contract=off", *_BARE, *flags)
+    _done([*_ZIG, _THUMB, *own, "-c", str(folder / file), "-o", str(made)], f"no object for {place}")
+    return made
+
+
+def _done(command: Sequence[str], otherwise: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise CompileError(f"{otherwise}: {done.stderr.strip()[-2000:]}")
 
 
 def _compilers() -> dict[str, list[str]]:
@@ -79,9 +159,5 @@ def _compiled(files: Mapping[str, str], command: Sequence[str], place: str) -> b
             (folder / file).write_text(text, encoding="utf-8")
         library, sources = folder / "library", [str(folder / file) for file in files if file.endswith(".c")]
         elsewhere = ("-fPIC", "-lm") if place.endswith(("linux", "darwin")) else ()
-        done = subprocess.run(
-            [*command, *_FLAGS, *sources, *elsewhere, "-o", str(library)], capture_output=True, text=True, check=False
-        )
-        if done.returncode != 0:
-            raise CompileError(f"no library for {place}: {done.stderr.strip()[-2000:]}")
+        _done([*command, *_FLAGS, *sources, *elsewhere, "-o", str(library)], f"no library for {place}")
         return library.read_bytes()

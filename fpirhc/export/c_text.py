@@ -1,7 +1,8 @@
 """Generated C as somebody else's compiler and reviewer take it: nothing unused, nothing for one machine, one visible function.
 
 A text is split into its definitions at the outermost level. What the visible function does not reach is left out, parameters that a
-function does not read are named as unread, and alternatives for wide registers go. What is computed stays as it is.
+function does not read are named as unread, and alternatives for wide registers go. Constants have the type of all numbers, so that
+float is not computed in double. What is computed stays as it is.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ _COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
 _WORD = re.compile(r"[A-Za-z_]\w*")
 _FUNCTION = re.compile(r"\A([^{;=]*?\b(\w+)\s*\(([^{}]*)\)\s*)\{", re.DOTALL)
 _TABLE = re.compile(r"\A[^{;=(]*?\b(\w+)\s*(?:\[[^=]*)?=", re.DOTALL)
+_NUMBER = re.compile(r"(?<![\w.)])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
 _MACRO = re.compile(r"\A#define (\w+)(.*)", re.DOTALL)
 
 
@@ -57,7 +59,10 @@ def portable(text: str, visible: str) -> str:
     parts = list(_parts(_EXPORTED.sub("", text), visible))
     needed = _reached(parts)
     body = "".join(_static(part) for part in parts if not part.name or part.name in needed)
-    return re.sub(r"\n{3,}", "\n\n", body).lstrip("\n")
+    typed = "".join(
+        line if "OF_TYPE" in line else _NUMBER.sub(r"(casadi_real)\1", line) for line in body.splitlines(True)
+    )
+    return re.sub(r"\n{3,}", "\n\n", typed).lstrip("\n")
 
 
 def _reached(parts: list[_Part]) -> set[str]:

@@ -36,6 +36,7 @@ _C_WORDS = frozenset(
         true false""",
     )
 )
+_FILES = frozenset(("processor", "board", "example"))  # C files that are not the controller's own
 _LONGEST = 40  # characters of a name
 
 
@@ -147,19 +148,19 @@ def check_name(name: str) -> None:
     Raises:
         InvalidName: it is none; one is offered.
     """
-    if re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) and name not in _C_WORDS and len(name) <= _LONGEST:
+    if re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) and name not in _C_WORDS | _FILES and len(name) <= _LONGEST:
         return
     offer = default_name(name)
     raise InvalidName(
         f"'{name}' cannot be the name of a controller in C: expected at most {_LONGEST} letters, digits and underscores, a letter "
-        f"first, and no word of C. Did you mean '{offer}'?"
+        f"first, and no word of C or of the files beside it. Did you mean '{offer}'?"
     )
 
 
 def default_name(text: str) -> str:
     """Return a C name made of a text."""
     name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_").lower()[:_LONGEST].rstrip("_")
-    return name if re.match(r"[a-z]", name) and name not in _C_WORDS else f"c_{name}"[:_LONGEST].rstrip("_")
+    return name if re.match(r"[a-z]", name) and name not in _C_WORDS | _FILES else f"c_{name}"[:_LONGEST].rstrip("_")
 
 
 def literal(value: float) -> str:

@@ -12,10 +12,14 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
+import numpy as np
+
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import InvalidName, NotSupported, OutputError, nearest
 from fpirhc.export import targets as package
 from fpirhc.export.device import Device, check_name, default_name
+from fpirhc.export.processor import Processor
+from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.task.problem import Problem
 
@@ -29,12 +33,15 @@ class Target:
         summary: what comes out, in one line.
         files: function of a device that returns the contents of all files by name.
         libm: whose exp, sin and the like it takes, unless told otherwise: "system" or "own".
+        processor: function (folder of the files, prefix) -> program with its arguments that answers samples, see `Processor`; None:
+            the target has none.
     """
 
     name: str
     summary: str
     files: Callable[[Device], Mapping[str, str | bytes]]
     libm: str = "system"
+    processor: Callable[[Path, str], Sequence[str]] | None = None
 
 
 @cache
@@ -115,6 +122,36 @@ def write(device: Device, target: Target, folder: Path) -> list[Path]:
             f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
         ) from None
     return [folder / name for name in contents]
+
+
+def processor_of(target: Target) -> Callable[[Path, str], Sequence[str]]:
+    """Return the function that gives a target's program.
+
+    Raises:
+        NotSupported: it has none.
+    """
+    if target.processor is None:
+        there = ", ".join(one.name for one in targets().values() if one.processor is not None)
+        raise NotSupported(f"--check is there for {there}, not for {target.name}")
+    return target.processor
+
+
+def in_the_loop(device: Device, target: Target, folder: Path) -> tuple[int, float]:
+    """Return the cycles of a run with the exported program, and how far its commands are from those of this process.
+
+    The difference is the largest one, relative to the largest command.
+
+    Raises:
+        NotSupported: the target has no such program, or the problem is none for it.
+        CompileError: the program cannot be built.
+        OutputError: it cannot be started.
+    """
+    outside = Processor(processor_of(target)(folder, device.name))
+    run, other = (simulate(device.problem, one, seed=0) for one in (device.controller, outside))
+    if other.stop:
+        raise OutputError(f"the run with the exported program ended early: {other.stop}")
+    largest = float(np.abs(run["command"]).max())
+    return len(run.time), float(np.abs(other["command"] - run["command"]).max()) / (largest or 1.0)
 
 
 def _instead(controller: Controller) -> str:

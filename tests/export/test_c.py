@@ -314,7 +314,7 @@ def two_mass() -> tuple[Any, Any]:
     return task.problem, task.controllers
 
 
-@pytest.mark.parametrize("name", ["2nd", "a b", "int", "", "x" * 41, "ü"])
+@pytest.mark.parametrize("name", ["2nd", "a b", "int", "processor", "", "x" * 41, "ü"])
 def test_a_name_that_c_does_not_take_is_refused(name):
     problem, controllers = two_mass()
     with pytest.raises(InvalidName, match=r"cannot be the name of a controller in C.*Did you mean"):

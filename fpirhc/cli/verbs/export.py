@@ -16,7 +16,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
         "--to",
         metavar="TARGET",
         default="c",
-        help="c: C99 for every compiler (default); fmu, fmu2: unit for other simulators; wasm: a web page",
+        help="c: C99 for every compiler (default); cortex-m: boards; fmu, fmu2: units for other simulators; wasm: web pages",
     )
     parser.add_argument("--out", metavar="FOLDER", required=True, help="folder for the files, new or empty")
     text = "prefix of everything in C (default: made of the names of problem and controller)"
@@ -27,14 +27,18 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--libm", choices=("system", "own"), help=text)
     text = "cycles that are recorded for the replay, faults among them (default: 2000)"
     parser.add_argument("--cycles", type=int, default=2000, metavar="N", help=text)
+    text = "build what was exported, here or for an emulated Cortex-M7, run the plant with it, and say how far apart the runs are"
+    parser.add_argument("--check", action="store_true", help=text)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
-    from fpirhc.export.target import device_of, target_called, write
+    from fpirhc.export.target import device_of, in_the_loop, processor_of, target_called, write
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.studies.comparison.compare import select
 
     target = target_called(options.to)
+    if options.check:
+        processor_of(target)
     task = load_problem(options.problem)
     controller = select(task, [options.controller])[options.controller]
     device = device_of(
@@ -52,6 +56,11 @@ def _run(options: argparse.Namespace) -> ExitCode:
     print(f"numbers of one controller: {', '.join(f'{size} of {what}' for what, size in sizes.items())}")
     for path, (low, high) in device.bounds.items():
         print(f"setting {path}: from {low:.6g} to {high:.6g}, now {device.stepper.numbers[path]:.6g}")
+    if options.check:
+        cycles, apart = in_the_loop(device, target, Path(options.out))
+        print(
+            f"in the loop: {cycles} cycles, commands within {apart:.1g} of those of this run (relative to the largest one)"
+        )
     return ExitCode.FINISHED
 
 
@@ -67,6 +76,10 @@ VERB = Verb(
         (
             'fpirhc export two_mass "CTC+FPI (eq 6)" --out device --live deformation.gain limits.inputs.Q1',
             "and arm_set, which refuses numbers outside their bounds",
+        ),
+        (
+            'fpirhc export two_mass "RHC+FPI" --to cortex-m --out board --check',
+            "libraries, and a run in an emulated board",
         ),
         ('fpirhc export two_mass "RHC+FPI" --to fmu --out device', "an FMI 3.0 unit for co-simulation"),
         ('fpirhc export two_mass "RHC+FPI" --to wasm --out web', "WebAssembly with a wrapper in JavaScript"),

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
+from pathlib import Path
 
 import numpy as np
 
 from fpirhc.controllers.gate import HELD
+from fpirhc.export.binaries import program
 from fpirhc.export.device import Device, identifiers, literal
 from fpirhc.export.samples import recorded
 from fpirhc.export.target import Target
@@ -59,11 +61,23 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         "layout.json": json.dumps(layout_of(device), indent=1),
         "samples.bin": recorded(device),
         "main.c": filled(device, "main.c"),
+        "processor.c": filled(device, "processor.c"),
         "CMakeLists.txt": filled(device, "CMakeLists.txt", sources=" ".join(n for n in own if n.endswith(".c"))),
     }
 
 
-TARGET = Target("c", "C99 without heap, files and globals: header, controller, layout, replay, CMake file", _files)
+def _processor(folder: Path, _: str) -> Sequence[str]:
+    made = folder / "processor"
+    program([path for path in sorted(folder.glob("*.c")) if path.name != "main.c"], made, "-DPROCESSOR")
+    return [str(made)]
+
+
+TARGET = Target(
+    "c",
+    "C99 without heap, files and globals: header, controller, layout, replay, CMake file",
+    _files,
+    processor=_processor,
+)
 
 
 def filled(device: Device, file: str, **more: str) -> str:

@@ -1,6 +1,7 @@
 /* exp, log, pow, sin, cos, tanh, atanh from + - * / and whole numbers alone: the same bits on every machine with IEEE doubles, as long
    as no fused multiply-add is made. Made by fpirhc; errors are below 1.5 units in the last place, for sin and cos up to 1e12. */
 
+#undef casadi_real /* doubles here, whatever the controller computes in */
 #include "@name@_math.h"
 
 #include <string.h>

@@ -1,0 +1,46 @@
+"""Static libraries for Cortex-M7 (double) and Cortex-M4F (float), an example for CMSIS, and programs that run without a board.
+
+The programs answer lines over semihosting, see `processor.c`: in QEMU, in a debugger, or in `fpirhc.export.cortex`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from fpirhc.export.binaries import arm_programs
+from fpirhc.export.device import Device
+from fpirhc.export.samples import recorded
+from fpirhc.export.target import Target
+from fpirhc.export.targets.c import filled, layout_of, sources
+
+
+def _files(device: Device) -> Mapping[str, str | bytes]:
+    name = device.name
+    own, script = sources(device), filled(device, "board.ld")
+    around = {file: filled(device, file) for file in ("processor.c", "board.c")}
+    made = arm_programs(own, around, script)
+    return {
+        **own,
+        **around,
+        "board.ld": script,
+        "example.c": filled(device, "example.c", unit=device.problem.plant.time_unit),
+        "layout.json": json.dumps(layout_of(device), indent=1),
+        "samples.bin": recorded(device),
+        **{(f"{name}_{file}" if file.endswith(".elf") else f"lib{name}_{file}"): data for file, data in made.items()},
+    }
+
+
+def _processor(folder: Path, name: str) -> Sequence[str]:
+    return [sys.executable, "-m", "fpirhc.export.cortex", str(folder / f"{name}_m7.elf")]
+
+
+TARGET = Target(
+    "cortex-m",
+    "libraries for Cortex-M7 and M4F, and programs that run in QEMU or Unicorn",
+    _files,
+    libm="own",
+    processor=_processor,
+)
