@@ -64,11 +64,7 @@ class KnownSignals:
 
     def memory(self, late: int, name: str) -> tuple[Signal, ...]:
         """Return the signals of `late` more cycles before the last one, remembered under a name."""
-        if not (self.reads and late):
-            return ()
-        [one] = self.reads
-        names = tuple(f"{e}@{k}" for k in range(1, late + 1) for e in one.elements)
-        return (Signal(name, names, start=one.start * late),)
+        return tuple(m for one in self.reads for m in Queue(late).memory(name, one.elements, one.start))
 
     def acted(self, s: Signals, late: int, name: str) -> tuple[Expression, dict[str, Expression]]:
         """Return the parameters of the last cycle, or of `late` cycles before it, and what is remembered.
@@ -77,12 +73,8 @@ class KnownSignals:
         """
         if not self.places:
             return s.parameters, {}
-        column, size = getattr(s, ACTED), len(self.places)
-        remembered = {}
-        if late:
-            column = ca.vertcat(column, getattr(s, name))
-            remembered[f"{name}_next"] = column[: size * late]
-        acted = dict(zip(self.places, ca.vertsplit(column[size * late :]), strict=True))
+        then, remembered = Queue(late).arrived(s, name, getattr(s, ACTED))
+        acted = dict(zip(self.places, ca.vertsplit(then), strict=True))
         parameters = ca.vertcat(*(acted.get(k, s.parameters[k]) for k in range(self.plant.parameter.size)))
         return parameters, remembered
 
@@ -157,10 +149,8 @@ class CommandPath:
     @cached_property
     def memory(self) -> tuple[Signal, ...]:
         """Commands on their way, positions of lagging actuators, the number of cycles so far, and older signals."""
-        inputs, length = self.problem.plant.input, self._column.length
-        start = tuple(map(float, self.problem.inputs_before))
-        names = tuple(f"{e}@{k}" for k in range(1, length) for e in inputs.elements)
-        queued = (Signal(f"{self.owner}_commands", names, start=start * (length - 1)),) if length > 1 else ()
+        inputs, start = self.problem.plant.input, tuple(map(float, self.problem.inputs_before))
+        queued = self._column.memory(f"{self.owner}_commands", inputs.elements, start)
         lagging = (Signal(f"{self.owner}_actuators", inputs.elements, inputs.units, start),) if self._lags else ()
         counted = (scalar(f"{self.owner}_cycles"),) if self.counts else ()
         return (*queued, *lagging, *counted, *self._known.memory(self.late, f"{self.owner}_signals"))
@@ -189,15 +179,11 @@ class CommandPath:
         return self._known.acted(s, self.late, f"{self.owner}_signals")
 
     def _arrived(self, s: Signals, queue: Queue) -> tuple[Expression, dict[str, Expression]]:
-        size, column, remembered = self.last.size, getattr(s, self.last.name), dict[str, Expression]()
+        column, remembered = self._column.column(s, f"{self.owner}_commands", getattr(s, self.last.name))
         if self.counts:
             most = self.late + (2 if self.fraction else 1)
             remembered[f"{self.owner}_cycles_next"] = ca.fmin(self.cycles(s) + 1, most)
-        length = self._column.length
-        if length > 1:
-            column = ca.vertcat(column, getattr(s, f"{self.owner}_commands"))
-            remembered[f"{self.owner}_commands_next"] = column[: size * (length - 1)]
-        return queue.delayed(column, size), remembered
+        return queue.delayed(column, self.last.size), remembered
 
     @cached_property
     def _column(self) -> Queue:

@@ -12,8 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import casadi as ca
-
 from fpirhc.controllers.mirror import MEASURED, measured_output, measured_state
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import ceil, larger
@@ -75,12 +73,12 @@ class ResponsePairs:
     def memory(self) -> tuple[Signal, ...]:
         """Past states and commands."""
         problem = self.problem
-        states = _past(_STATES, problem.plant.state.elements, problem.start_state.tolist(), self._states.length)
-        commands = _past(_COMMANDS, problem.plant.input.elements, problem.inputs_before.tolist(), self._commands.length)
+        states = self._states.memory(_STATES, problem.plant.state.elements, problem.start_state.tolist())
+        commands = self._commands.memory(_COMMANDS, problem.plant.input.elements, problem.inputs_before.tolist())
         if not self.with_outputs:
             return (*states, *commands)
-        first = problem.start_output.tolist()
-        return (*states, *commands, *_past(_OUTPUTS, problem.plant.output.elements, first, self._states.length))
+        outputs = self._states.memory(_OUTPUTS, problem.plant.output.elements, problem.start_output.tolist())
+        return (*states, *commands, *outputs)
 
     @property
     def gaps(self) -> bool:
@@ -97,11 +95,11 @@ class ResponsePairs:
 
     def waited(self, s: Signals, newest: Expression) -> tuple[Expression, dict[str, Expression]]:
         """Return the command of the response in a cycle without a sample, and what is remembered: the last state once more."""
-        command, remembered = _queued(s, _COMMANDS, self._commands, newest)
+        command, remembered = self._commands.arrived(s, _COMMANDS, newest)
         plant = self.problem.plant
         for name, size in ((_STATES, plant.state.size), (_OUTPUTS, plant.output.size)):
             if self.gaps and (name == _STATES or self.with_outputs):
-                remembered |= _queued(s, name, self._states, getattr(s, name)[:size])[1]
+                remembered |= self._states.arrived(s, name, getattr(s, name)[:size])[1]
         return command, remembered
 
     def pair(self, s: Signals, newest: Expression) -> tuple[Expression, Expression, dict[str, Expression]]:
@@ -112,15 +110,15 @@ class ResponsePairs:
             newest: command of the last cycle.
         """
         state = getattr(s, MEASURED if self.waiting else self.problem.plant.state.name)
-        state, states = _queued(s, _STATES, self._states, state)
-        command, commands = _queued(s, _COMMANDS, self._commands, newest)
+        state, states = self._states.arrived(s, _STATES, state)
+        command, commands = self._commands.arrived(s, _COMMANDS, newest)
         return state, command, {**states, **commands}
 
     def output(self, s: Signals) -> tuple[Expression | None, dict[str, Expression]]:
         """Return the measured outputs of that instant, and what is remembered; None where they do not belong to a pair."""
         if not self.with_outputs:
             return None, {}
-        return _queued(s, _OUTPUTS, self._states, getattr(s, self.seen.name))
+        return self._states.arrived(s, _OUTPUTS, getattr(s, self.seen.name))
 
     @cached_property
     def _delay(self) -> float:
@@ -139,18 +137,3 @@ class ResponsePairs:
     def _cycles(self, late: DeadTime) -> tuple[float, ...]:
         waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)
         return tuple(wait / self.problem.period + self._delay for wait in waits)
-
-
-def _queued(s: Signals, name: str, queue: Queue, now: Expression) -> tuple[Expression, dict[str, Expression]]:
-    """The value that left the queue, and what the queue remembers."""
-    if queue.length <= 1:
-        return now, {}
-    column, size = ca.vertcat(now, getattr(s, name)), now.numel()
-    return queue.delayed(column, size), {f"{name}_next": column[: size * (queue.length - 1)]}
-
-
-def _past(name: str, elements: tuple[str, ...], first: list[float], length: int) -> tuple[Signal, ...]:
-    if length < 2:
-        return ()
-    names = tuple(f"{e}@{k}" for k in range(1, length) for e in elements)
-    return (Signal(name, names, start=tuple(first) * (length - 1)),)

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.symbolic.expression import total
+from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.functions import ceil, entry_at
-from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.live import expressed, is_live, live_numbers, nominal, not_live
 
 MOST = 1000  # cycles of dead time; the memory has a fixed size
@@ -76,6 +76,29 @@ class Queue:
         # Not an empty slice: CasADi's [:0] of one entry is that entry.
         remembered = newest.numel() * (self.length - 1)
         return ca.vertcat(newest, queue[:remembered]) if remembered else newest
+
+    def memory(self, name: str, elements: Sequence[str], start: Sequence[float]) -> tuple[Signal, ...]:
+        """Return what is remembered of a signal of every cycle; nothing where no entry waits.
+
+        Args:
+            name: of the memory.
+            elements: of the signal.
+            start: its values before the run.
+        """
+        names = tuple(f"{e}@{k}" for k in range(1, self.length) for e in elements)
+        return (Signal(name, names, start=tuple(start) * (self.length - 1)),) if names else ()
+
+    def arrived(self, s: Signals, name: str, now: Expression) -> tuple[Expression, dict[str, Expression]]:
+        """Return the entries whose wait is over in a cycle, and what is remembered under the name of the memory."""
+        column, remembered = self.column(s, name, now)
+        return (self.delayed(column, now.numel()) if remembered else now), remembered
+
+    def column(self, s: Signals, name: str, now: Expression) -> tuple[Expression, dict[str, Expression]]:
+        """Return all values of a cycle, the newest first, and what is remembered under the name of the memory."""
+        if self.length <= 1:
+            return now, {}
+        column = ca.vertcat(now, getattr(s, name))
+        return column, {f"{name}_next": column[: now.numel() * (self.length - 1)]}
 
     def delayed(self, queue: Expression, size: int) -> Expression:
         """Return what was pushed `cycles` ago, entry by entry; `size` is the number of entries."""
