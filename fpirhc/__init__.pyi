@@ -47,10 +47,9 @@ from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
-from .plant.algebraic import Algebraic
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
-from .plant.motion import Output
+from .plant.motion import Algebraic, Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
 from .plant.plant import Parameter, Plant
 from .plant.regressor import linear_parameters

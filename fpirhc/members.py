@@ -75,6 +75,12 @@ class Example:
     left: float | None = None
 
 
+def within(package: str) -> Iterator[ModuleType]:
+    """Every module of a package, in order of their names."""
+    for info in pkgutil.iter_modules(importlib.import_module(package).__path__, f"{package}."):
+        yield importlib.import_module(info.name)
+
+
 def modules(*packages: str) -> Iterator[ModuleType]:
     """Every module below the packages, and every module that another distribution names in the entry-point group."""
     foreign = tuple(entry.value for entry in entry_points(group=GROUP))
@@ -191,7 +197,7 @@ FORMER = {  # names of earlier versions, and names that have left the top level
     "LyapunovView": "simulation.lyapunov_view.LyapunovView",
     "Metrics": "simulation.metrics.Metrics",
     "OpenPlan": "FromPlan",
-    "OutputChain": "plant.relative_order.OutputChain",
+    "OutputChain": "controllers.slots.slot.OutputChain",
     "Path": "PathConstraint",
     "Pid": "PID",
     "Prediction": "review.response_prediction.Prediction",
@@ -220,7 +226,7 @@ FORMER = {  # names of earlier versions, and names that have left the top level
     "floquet_radius": "controllers.slots.slotted.floquet_radius",
     "leaky_margin": "deformation.leaky.leaky_margin",
     "leaky_pole": "deformation.leaky.leaky_pole",
-    "output_chain": "plant.relative_order.output_chain",
+    "output_chain": "controllers.slots.slot.output_chain",
     "response_jacobian": "contraction.spectrum.response_jacobian",
     "spectrum_over_box": "contraction.spectrum.spectrum_over_box",
     "spectrum_over_run": "contraction.spectrum.spectrum_over_run",

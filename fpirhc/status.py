@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+STOPPED = "stopped"  # signal of a policy that stops: NaN where it does, which ends a run by this name
+
 
 class Status(IntEnum):
     """Outcome of one control cycle or one solve; the numbers are those of saved runs, `severity` is the order."""

@@ -6,12 +6,10 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
-from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from pkgutil import iter_modules
 
-from fpirhc.cli import verbs as package
 from fpirhc.cli.verb import Verb
+from fpirhc.members import within
 
 GROUP = "fpirhc.verbs"
 
@@ -36,7 +34,7 @@ class Known:
 @cache
 def shipped() -> dict[str, Verb]:
     """Return the commands of this package by name: the value `VERB` of every module of the package `verbs`."""
-    verbs = [import_module(f"{package.__name__}.{m.name}").VERB for m in iter_modules(package.__path__)]
+    verbs = [module.VERB for module in within("fpirhc.cli.verbs")]
     return {verb.name: verb for verb in sorted(verbs, key=lambda verb: verb.name)}
 
 

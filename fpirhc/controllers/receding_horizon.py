@@ -48,7 +48,7 @@ from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
-from fpirhc.status import Status
+from fpirhc.status import STOPPED, Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.functions import nan_where, numbers
@@ -56,8 +56,6 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, live_numbers, nominal, not_live, settled
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
-
-STOPPED = "stopped"  # signal of a policy that stops: NaN where it does, which ends a run by this name
 
 
 class OnFailure(Checked, ABC):

@@ -27,9 +27,8 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing
+from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, discrete
 from fpirhc.deformation.leaky import check_cycles, check_longest, check_pole, check_uncertainty, chosen_pole
-from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.expression import is_finite

@@ -8,17 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import InvalidName, NotSupported, OutputError, nearest
-from fpirhc.export import targets as package
 from fpirhc.export.device import Device, check_name, default_name
 from fpirhc.export.processor import Processor
+from fpirhc.members import within
 from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.task.problem import Problem
@@ -47,7 +45,7 @@ class Target:
 @cache
 def targets() -> dict[str, Target]:
     """Return all targets by name."""
-    members = [import_module(f"{package.__name__}.{m.name}").TARGET for m in iter_modules(package.__path__)]
+    members = [module.TARGET for module in within("fpirhc.export.targets")]
     return {target.name: target for target in sorted(members, key=lambda one: one.name)}
 
 

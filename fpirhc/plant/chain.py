@@ -12,9 +12,8 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 
 from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression
-from fpirhc.plant.motion import controlled_places, followed_units, outside_names
+from fpirhc.plant.motion import controlled_places, derivative_unit, followed_units, outside_names
 from fpirhc.plant.plant import Plant
-from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.symbolic.layout import Expression, Signal
 

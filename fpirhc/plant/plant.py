@@ -22,7 +22,6 @@ from typing import Self
 import casadi as ca
 
 from fpirhc.errors import Mistakes
-from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.inverse import affine, inverse_function
 from fpirhc.plant.lie_derivatives import (
     believed_disturbance,
@@ -33,10 +32,17 @@ from fpirhc.plant.lie_derivatives import (
     structural_order,
 )
 from fpirhc.plant.maps import Differences, check_map
-from fpirhc.plant.motion import Motion, MotionEquations, Output, controlled_places, followed_units
+from fpirhc.plant.motion import (
+    Algebraic,
+    Motion,
+    MotionEquations,
+    Output,
+    controlled_places,
+    derivative_unit,
+    followed_units,
+)
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
-from fpirhc.plant.units import derivative_unit
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.layout import Expression, Signal, vector
 

@@ -6,11 +6,9 @@ point of the group `fpirhc.questions`.
 
 from __future__ import annotations
 
-import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
-from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TypeVar, cast
 
@@ -21,7 +19,7 @@ from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError, InvalidValue
-from fpirhc.review import questions
+from fpirhc.members import within
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops, LoopsByGain, loops_by_gain
@@ -190,7 +188,6 @@ def asked(question: ProblemQuestion | ControllerQuestion, about: ReviewGrid | Ca
 @cache
 def known_questions(kind: type[Kind]) -> tuple[Kind, ...]:
     """Return the questions of one kind in their order, those of installed packages included."""
-    modules = (import_module(f"{questions.__name__}.{m.name}") for m in pkgutil.iter_modules(questions.__path__))
-    known = [question for module in modules for question in module.QUESTIONS]
+    known = [question for module in within("fpirhc.review.questions") for question in module.QUESTIONS]
     known += [point.load() for point in entry_points(group=GROUP)]
     return tuple(sorted((q for q in known if type(q) is kind), key=lambda q: q.order))

@@ -11,13 +11,12 @@ from fpirhc.controllers.contract import checked, resolved, with_lateness
 from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.review.answer import Answer, Review, Verdict
+from fpirhc.review.answer import Answer, Review, Verdict, decided
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import loops_along
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, asked, known_questions
 from fpirhc.review.questions.convergence import CONVERGES
-from fpirhc.review.schedule import schedule_stable
 from fpirhc.simulation.model_as_plant import behind_stated_lag
 from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.task.problem import Problem
@@ -89,3 +88,35 @@ def _of(grid: ReviewGrid, controller: Controller, general: tuple[Answer, ...], r
 def _present(answers: Iterable[Answer | None]) -> tuple[Answer, ...]:
     """Those questions that have an answer."""
     return tuple(answer for answer in answers if answer is not None)
+
+
+QUESTION = "Is the schedule of slots stable?"
+
+
+def schedule_stable(problem: Problem, controller: Controller) -> Answer | None:
+    """Return the Floquet radius of one period; None without slots.
+
+    Gains of the wrong sign do not reach this question: the controller refuses them.
+    """
+    while controller.inner is not None:
+        problem, controller = controller.inner_problem(problem), controller.inner
+    if not hasattr(controller, "floquet"):
+        return None
+    try:
+        floquet = controller.floquet(problem)
+    except FpirhcError as error:
+        return Answer(QUESTION, Verdict.UNKNOWN, str(error))
+    if floquet.radius is None:
+        return Answer(QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {floquet.reason}", "Use a periodic schedule.")
+    text = (
+        f"near the set-point errors change by {floquet.radius:.3g} per period of {floquet.period:g} {problem.time_unit}"
+    )
+    text += ", with ideal deformations"
+    change = "" if floquet.radius < 1 else "Change the slots' durations or rates; see floquet_radius."
+    return Answer(
+        QUESTION,
+        decided(floquet.radius < 1),
+        text,
+        change,
+        {"floquet_radius": floquet.radius, "period": floquet.period},
+    )

@@ -28,8 +28,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.fields.checked import checked_call
-from fpirhc.plant.motion import followed_units
-from fpirhc.plant.units import derivative_unit, with_space
+from fpirhc.plant.motion import derivative_unit, followed_units, with_space
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Feedback

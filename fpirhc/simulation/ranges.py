@@ -10,8 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fpirhc.controllers.receding_horizon import STOPPED
-from fpirhc.status import Status
+from fpirhc.status import STOPPED, Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem

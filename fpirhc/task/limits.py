@@ -18,8 +18,8 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.motion import derivative_unit
 from fpirhc.plant.plant import Plant
-from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.expression import Expression, Value, total
 from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.live import nominal

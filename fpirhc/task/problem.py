@@ -20,10 +20,9 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of
-from fpirhc.plant.motion import followed, followed_units, with_exact_parameters, words
+from fpirhc.plant.motion import derivative_unit, followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
-from fpirhc.plant.units import derivative_unit
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.latest import Latest

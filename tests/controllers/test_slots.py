@@ -16,9 +16,9 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.slots.schedules import Schedule
+from fpirhc.controllers.slots.slot import output_chain
 from fpirhc.controllers.slots.slotted import floquet_radius
 from fpirhc.errors import FpirhcError, InvalidValue
-from fpirhc.plant.relative_order import output_chain
 from fpirhc.status import Status
 
 # Slots and schedules of shipped controllers are read and changed, which the contract of controllers says nothing about.

@@ -21,8 +21,7 @@ from fpirhc.conformance import check_deformation
 from fpirhc.conformance.deformation_facts import check_deformation_facts
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, rename
 from fpirhc.controllers.contract import resolved, with_optimiser, without_deformation
-from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Reach, automatic
-from fpirhc.deformation.wrappers.base import Wrapper
+from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Reach, Wrapper, automatic
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.simulation.lyapunov_view import lyapunov_view
 from fpirhc.studies.comparison.optimality import measure_optimality
@@ -420,7 +419,7 @@ GENERIC_FILES: tuple[str, ...] = (
     "controllers/demands.py",
     "controllers/gain_check.py",
 )
-GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/wrappers/base.py", "tracking/base.py")
+GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/base.py", "tracking/base.py")
 # Values that generic code builds for itself; it asks nobody whether he is one.
 BUILDS = {
     "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.controllers.slots.slot import output_chain
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.plant.maps import over
-from fpirhc.plant.relative_order import output_chain
-from fpirhc.report.series import chart_data
+from fpirhc.report.html import chart_data
 
 T = 10.0  # s, one step
 RATE = 0.04  # 1/s

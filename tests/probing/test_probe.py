@@ -14,8 +14,8 @@ import fpirhc as fp
 from fpirhc.deformation.base import Deformation
 from fpirhc.probing.excitation import excited, sequence
 from fpirhc.probing.identification import Channel, identify
+from fpirhc.probing.probe import Trial, best, tried
 from fpirhc.probing.rule import Rule
-from fpirhc.probing.trials import Trial, best, tried
 
 KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (1.0, 0, 0.0, 0.05),

@@ -12,7 +12,7 @@ import reviewed
 from test_reality import lagged, slow_sensor, task
 
 import fpirhc as fp
-from fpirhc.report.series import chart_data
+from fpirhc.report.html import chart_data
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
 from fpirhc.review.nominal_runs import null_problem, null_runs

@@ -18,8 +18,7 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.errors import OutputError
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.html import blocks, render, write_report
-from fpirhc.report.series import INTERVALS, chart_data
+from fpirhc.report.html import INTERVALS, blocks, chart_data, render, write_report
 from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.view import to_json

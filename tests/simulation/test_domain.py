@@ -19,8 +19,7 @@ from gaps import gone_on
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import FAILED, PATIENCE
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.wrappers.base import Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Wrapper, discrete
 from fpirhc.members import Example, examples
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.ranges import Dropped

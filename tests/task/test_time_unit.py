@@ -15,8 +15,7 @@ from fpirhc.errors import InvalidProblem
 from fpirhc.plant.motion import forcing_units
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.figures import pair_figures, plan_figure
-from fpirhc.report.html import headline_pair, render, render_scenarios
-from fpirhc.report.series import chart_data
+from fpirhc.report.html import chart_data, headline_pair, render, render_scenarios
 from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.comparison import Comparison

@@ -15,9 +15,8 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
-from fpirhc.plant.motion import places
+from fpirhc.plant.motion import derivative_unit, places
 from fpirhc.plant.regressor import Combination, Regressor
-from fpirhc.plant.units import derivative_unit
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers

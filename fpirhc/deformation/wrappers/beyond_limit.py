@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from fpirhc.deformation.base import Deformation, Iteration
-from fpirhc.deformation.wrappers.base import Wrapper
+from fpirhc.deformation.base import Deformation, Iteration, Wrapper
 from fpirhc.symbolic.layout import Expression, Layout
 
 

@@ -22,8 +22,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.wrappers.base import Wrapper, discrete, forget, growing_in_a_row
+from fpirhc.deformation.base import Deformation, Wrapper, discrete, forget, growing_in_a_row
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _OSCILLATES = -0.9

@@ -31,9 +31,8 @@ from typing import NamedTuple, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Pairing
+from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, discrete
 from fpirhc.deformation.leaky import check_cycles, check_longest, check_pole, check_uncertainty, chosen_pole
-from fpirhc.deformation.wrappers.base import Wrapper, discrete
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.functions import largest, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar

@@ -16,8 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from fpirhc.deformation.base import Deformation, Iteration
-from fpirhc.deformation.wrappers.base import Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Iteration, Wrapper, discrete
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 

@@ -22,8 +22,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, smooth_norm
-from fpirhc.deformation.wrappers.base import Wrapper, discrete, forget, start_of_map
+from fpirhc.deformation.base import Deformation, Wrapper, discrete, forget, smooth_norm, start_of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar

@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Pairing
-from fpirhc.deformation.wrappers.base import Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, discrete
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar

@@ -33,8 +33,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.wrappers.base import Wrapper, discrete, growing_in_a_row, returning_in_a_row
+from fpirhc.deformation.base import Deformation, Wrapper, discrete, growing_in_a_row, returning_in_a_row
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.functions import asin, larger, power, sqrt
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar

@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import response_units
-from fpirhc.plant.units import with_space
+from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.nominal_runs import TRIED, null_runs
 from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, response_errors

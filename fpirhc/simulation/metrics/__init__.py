@@ -4,8 +4,6 @@ A file of the folder `entries` that defines `METRICS`, a tuple of `Metric`, adds
 `fpirhc.metrics` of another package, and `metrics = (...)` in a problem file.
 """
 
-from fpirhc.simulation.metrics import figures
-from fpirhc.simulation.metrics.base import Better, Metric
-from fpirhc.simulation.metrics.measuring import Metrics, known_metrics, measure, with_own_metrics
+import lazy_loader as _lazy
 
-__all__ = ["Better", "Metric", "Metrics", "figures", "known_metrics", "measure", "with_own_metrics"]
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

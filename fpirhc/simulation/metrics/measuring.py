@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-import pkgutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 from importlib.metadata import entry_points
 
 from fpirhc.broken import attempted
 from fpirhc.by_name import ByName, FoundByName
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked import checked_call
-from fpirhc.simulation.metrics import entries
+from fpirhc.members import within
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
@@ -34,8 +32,9 @@ def known_metrics() -> tuple[Metric, ...]:
     Raises:
         InvalidName: two metrics have the same name.
     """
-    modules = (import_module(f"{entries.__name__}.{m.name}") for m in pkgutil.iter_modules(entries.__path__))
-    shipped = [metric for module in modules for metric in getattr(module, "METRICS", ())]
+    shipped = [
+        metric for module in within("fpirhc.simulation.metrics.entries") for metric in getattr(module, "METRICS", ())
+    ]
     installed = [metric for point in entry_points(group=GROUP) for metric in _several(point.load())]
     return _ordered([*shipped, *installed])
 

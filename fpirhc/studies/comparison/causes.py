@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.plant.units import with_space
+from fpirhc.plant.motion import with_space
 from fpirhc.review.questions.horizon import EFFORT_CHANGE, EFFORT_FACT, MANY
 from fpirhc.review.questions.slew import SPARE
 from fpirhc.status import Status

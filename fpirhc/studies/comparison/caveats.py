@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from fpirhc.errors import FpirhcError
-from fpirhc.plant.units import with_space
+from fpirhc.plant.motion import with_space
 from fpirhc.simulation.held_input import HeldInput
 from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.simulate import judged_run, simulator

@@ -22,8 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fpirhc.by_name import FoundByName
-from fpirhc.plant.motion import followed_units
-from fpirhc.plant.units import with_space
+from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.metrics.base import by_name
 from fpirhc.simulation.metrics.entries.commands import at_limit

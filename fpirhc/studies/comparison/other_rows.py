@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from fpirhc.plant.units import with_space
+from fpirhc.plant.motion import with_space
 from fpirhc.review.questions.margins import SLOWER
 from fpirhc.studies.comparison.changes import HELPS, HURTS, ROUNDING, times
 from fpirhc.studies.comparison.outcome import Finding

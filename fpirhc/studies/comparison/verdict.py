@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fpirhc.plant.units import with_space
+from fpirhc.plant.motion import with_space
 from fpirhc.studies.comparison.causes import causes, effort_cause, movement, stuck_cause
 from fpirhc.studies.comparison.caveats import Yardstick, caveats, leaves_reference, left_alone_is_better, not_followed
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times

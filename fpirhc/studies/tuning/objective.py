@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
-from fpirhc.plant.units import with_space
+from fpirhc.plant.motion import with_space
 from fpirhc.simulation.metrics import Metric
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem

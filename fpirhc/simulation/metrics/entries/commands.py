@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.plant.units import derivative_unit
+from fpirhc.plant.motion import derivative_unit
 from fpirhc.simulation.metrics.base import Metric, by_name, input_unit, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
