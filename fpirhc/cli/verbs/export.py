@@ -16,7 +16,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
         "--to",
         metavar="TARGET",
         default="c",
-        help="c: C99 for every compiler (default); cortex-m: boards; fmu, fmu2: units for other simulators; wasm: web pages",
+        help="c: C99 for every compiler (default); cortex-m: boards; library: LabVIEW, MATLAB, ctypes; simulink: S-function; "
+        "ros2_control: plugin; fmu, fmu2: units for other simulators; wasm: web pages",
     )
     parser.add_argument("--out", metavar="FOLDER", required=True, help="folder for the files, new or empty")
     text = "prefix of everything in C (default: made of the names of problem and controller)"

@@ -1,0 +1,28 @@
+"""Shared libraries whose functions take arrays: for LabVIEW, MATLAB, Python's ctypes, C#, Rust."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+from fpirhc.export.binaries import ENDINGS, shared_libraries
+from fpirhc.export.device import Device
+from fpirhc.export.target import Target
+from fpirhc.export.targets.c import filled, layout_of, sources
+
+
+def _files(device: Device) -> Mapping[str, str | bytes]:
+    name = device.name
+    change = f"  return {name}_set(({name}_controller*)controller, ({name}_setting)setting, value);"
+    nothing = "  (void)controller, (void)setting, (void)value;\n  return 0;"
+    own = {
+        **sources(device),
+        f"{name}_library.c": filled(device, "library.c", change=change if device.bounds else nothing),
+    }
+    made = {f"{name}_{at}{ENDINGS[at.split('-')[1]]}": data for at, data in shared_libraries(own).items()}
+    return {**own, **made, "layout.json": json.dumps(layout_of(device), indent=1)}
+
+
+TARGET = Target(
+    "library", "shared libraries whose functions take arrays, for LabVIEW, MATLAB, ctypes and others", _files
+)

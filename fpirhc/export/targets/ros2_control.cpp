@@ -1,0 +1,85 @@
+// @title@ as a controller of ros2_control. Made by fpirhc.
+//
+// State interfaces are the numbers of a sample after the time, command interfaces those of a command, in the order of layout.json. Their
+// names are parameters; the defaults are made of the names of the plant. Settings are parameters that are read when it is configured.
+// update() allocates nothing. The controller manager must run at the rate of the period.
+
+#include <cmath>
+#include <cstddef>
+#include <cstring>
+#include <string>
+#include <vector>
+
+#include <controller_interface/controller_interface.hpp>
+#include <pluginlib/class_list_macros.hpp>
+#include <rclcpp/rclcpp.hpp>
+#include <rclcpp_lifecycle/state.hpp>
+
+#include "@name@.h"
+
+namespace @name@_ros {
+
+using Return = controller_interface::CallbackReturn;
+
+class Controller : public controller_interface::ControllerInterface {
+ public:
+  Return on_init() override {
+    auto_declare<std::vector<std::string>>("state_interfaces", {@states@});
+    auto_declare<std::vector<std::string>>("command_interfaces", {@commands@});
+@declared@    @name@_init(&controller_);
+    return Return::SUCCESS;
+  }
+
+  controller_interface::InterfaceConfiguration state_interface_configuration() const override { return named("state_interfaces"); }
+
+  controller_interface::InterfaceConfiguration command_interface_configuration() const override { return named("command_interfaces"); }
+
+  Return on_configure(const rclcpp_lifecycle::State&) override {
+    const double rate = SECONDS_PER_UNIT * @NAME@_PERIOD * get_update_rate();
+    if (std::abs(rate - 1) > 1e-6) return failed("the update rate must be one cycle per period");
+    if (named("state_interfaces").names.size() != @NAME@_INPUTS - 1) return failed("state_interfaces: expected @given@ names");
+    if (named("command_interfaces").names.size() != @NAME@_COMMANDS) return failed("command_interfaces: expected @sent@ names");
+@set@    return Return::SUCCESS;
+  }
+
+  Return on_activate(const rclcpp_lifecycle::State&) override {
+    @name@_reset(&controller_);
+    begun_ = false;
+    return Return::SUCCESS;
+  }
+
+  controller_interface::return_type update(const rclcpp::Time& time, const rclcpp::Duration&) override {
+    @name@_inputs in;
+    @name@_command out;
+    casadi_real *sample = reinterpret_cast<casadi_real*>(&in), *command = reinterpret_cast<casadi_real*>(&out);
+    if (!begun_) begin_ = time, begun_ = true;
+    sample[0] = (time - begin_).seconds() / SECONDS_PER_UNIT;
+    for (std::size_t k = 1; k < @NAME@_INPUTS; ++k) sample[k] = state_interfaces_[k - 1].get_value();
+    status_ = @name@_step(&controller_, &in, &out);
+    for (std::size_t k = 0; k < @NAME@_COMMANDS; ++k) command_interfaces_[k].set_value(command[k]);
+    return controller_interface::return_type::OK;
+  }
+
+  @name@_status status() const { return status_; }
+
+ private:
+  static constexpr double SECONDS_PER_UNIT = @seconds@;  // of the period
+
+  controller_interface::InterfaceConfiguration named(const char* parameter) const {
+    return {controller_interface::interface_configuration_type::INDIVIDUAL, get_node()->get_parameter(parameter).as_string_array()};
+  }
+
+  Return failed(const char* why) const {
+    RCLCPP_ERROR(get_node()->get_logger(), "%s", why);
+    return Return::ERROR;
+  }
+
+  @name@_controller controller_;
+  @name@_status status_ = @NAME@_OK;
+  rclcpp::Time begin_;
+  bool begun_ = false;
+};
+
+}  // namespace @name@_ros
+
+PLUGINLIB_EXPORT_CLASS(@name@_ros::Controller, controller_interface::ControllerInterface)

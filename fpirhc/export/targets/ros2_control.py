@@ -1,0 +1,82 @@
+"""A package of ros2_control: the controller as a plugin of the controller manager."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from xml.sax.saxutils import escape
+
+from fpirhc.errors import NotSupported
+from fpirhc.export.device import Device, identifiers
+from fpirhc.export.target import Target
+from fpirhc.export.targets.c import filled, layout_of, sources
+
+_DERIVATIVES = ("position", "velocity", "acceleration", "jerk")
+_SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+
+
+def _files(device: Device) -> Mapping[str, str | bytes]:
+    name, own = device.name, sources(device)
+    unit = device.problem.plant.time_unit
+    if unit not in _SECONDS:
+        raise NotSupported(
+            f"ros2_control runs in real time: a period in {', '.join(_SECONDS)} was expected, got one in {unit}"
+        )
+    states, commands = _states(device), [f"{one}/effort" for one in device.problem.plant.inputs]
+    controller = filled(
+        device,
+        "ros2_control.cpp",
+        states=_texts(states),
+        commands=_texts(commands),
+        declared=_declared(device),
+        set=_set(device),
+        given=str(len(states)),
+        sent=str(len(commands)),
+        seconds=repr(_SECONDS[unit]),
+    )
+    words = {"sources": " ".join(file for file in own if file.endswith(".c")), "text": escape(device.title)}
+    return {
+        **own,
+        f"{name}_controller.cpp": controller,
+        f"{name}_plugin.xml": filled(device, "ros2_plugin.xml", **words),
+        "package.xml": filled(device, "ros2_package.xml", **words),
+        "CMakeLists.txt": filled(device, "ros2_CMakeLists.txt", **words),
+        "layout.json": json.dumps(layout_of(device), indent=1),
+    }
+
+
+TARGET = Target("ros2_control", "package with a plugin of the controller manager", _files)
+
+
+def _states(device: Device) -> list[str]:
+    """Default names of the interfaces: q1' is q1/velocity, a response of order 2 is q1/acceleration."""
+    orders, names = device.problem.plant.response_orders, []
+    for signal in device.inputs.signals:
+        if signal.name == "time":
+            continue
+        for element in signal.elements:
+            base = element.rstrip("'")
+            order = orders.get(element, 0) if signal.name == "realised" else len(element) - len(base)
+            names.append(f"{base}/{_DERIVATIVES[order] if order < len(_DERIVATIVES) else f'derivative_{order}'}")
+    return names
+
+
+def _texts(names: list[str]) -> str:
+    return ", ".join(json.dumps(name) for name in names)
+
+
+def _declared(device: Device) -> str:
+    numbers = device.stepper.numbers
+    return "".join(f'    auto_declare<double>("{path}", {float(numbers[path])!r});\n' for path in device.bounds)
+
+
+def _set(device: Device) -> str:
+    """Lines that put the settings in force."""
+    items = [f"{device.name.upper()}_SET_{one.upper()}" for one in identifiers(list(device.bounds))]
+    lines = []
+    for path, item in zip(device.bounds, items, strict=True):
+        value = f'get_node()->get_parameter("{path}").as_double()'
+        lines.append(
+            f'    if (!{device.name}_set(&controller_, {item}, {value}))\n      return failed("{path} is outside its bounds");\n'
+        )
+    return "".join(lines)

@@ -1,0 +1,91 @@
+/* @title@ as a level-2 S-function. Made by fpirhc.
+
+       mex -I. @name@_sfun.c @sources@
+
+   Input ports, in this order: @ports@. Output ports: the command, its status (0: OK).
+   Parameters of the block, in this order: @settings@.
+   The command follows from the inputs of its own sample; the memory moves on in mdlUpdate. */
+
+#define S_FUNCTION_NAME @name@_sfun
+#define S_FUNCTION_LEVEL 2
+
+#include "simstruc.h"
+
+#include "@name@.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+enum { PORTS = @count@, SETTINGS = @live@ };
+static const int WIDTHS[PORTS] = {@widths@};
+
+typedef struct {
+  @name@_controller c;
+  @name@_memory before; /* the memory at the beginning of the cycle */
+} block;
+
+static void mdlInitializeSizes(SimStruct* S) {
+  int k;
+  ssSetNumSFcnParams(S, SETTINGS);
+  if (ssGetNumSFcnParams(S) != ssGetSFcnParamsCount(S)) return;
+  for (k = 0; k < SETTINGS; ++k) ssSetSFcnParamTunable(S, k, 0);
+  if (!ssSetNumInputPorts(S, PORTS) || !ssSetNumOutputPorts(S, 2)) return;
+  for (k = 0; k < PORTS; ++k) {
+    ssSetInputPortWidth(S, k, WIDTHS[k]);
+    ssSetInputPortRequiredContiguous(S, k, 1);
+    ssSetInputPortDirectFeedThrough(S, k, 1);
+  }
+  ssSetOutputPortWidth(S, 0, @NAME@_COMMANDS);
+  ssSetOutputPortWidth(S, 1, 1);
+  ssSetNumSampleTimes(S, 1);
+  ssSetNumPWork(S, 1);
+}
+
+static void mdlInitializeSampleTimes(SimStruct* S) {
+  ssSetSampleTime(S, 0, @NAME@_PERIOD);
+  ssSetOffsetTime(S, 0, 0.0);
+}
+
+#define MDL_START
+static void mdlStart(SimStruct* S) {
+  block* b = (block*)calloc(1, sizeof *b);
+  ssSetPWorkValue(S, 0, b);
+  if (!b) {
+    ssSetErrorStatus(S, "@name@: there is no memory for the controller");
+    return;
+  }
+  @name@_init(&b->c);
+@set@  b->before = b->c.memory;
+}
+
+static void mdlOutputs(SimStruct* S, int_T tid) {
+  block* b = (block*)ssGetPWorkValue(S, 0);
+  @name@_inputs in;
+  @name@_command out;
+  casadi_real *sample = (casadi_real*)&in, *command = (casadi_real*)&out;
+  int k, j;
+  (void)tid;
+  *sample++ = ssGetT(S);
+  for (k = 0; k < PORTS; ++k) {
+    const real_T* port = ssGetInputPortRealSignal(S, k);
+    for (j = 0; j < WIDTHS[k]; ++j) *sample++ = port[j];
+  }
+  b->c.memory = b->before;
+  *ssGetOutputPortRealSignal(S, 1) = @name@_step(&b->c, &in, &out);
+  for (k = 0; k < @NAME@_COMMANDS; ++k) ssGetOutputPortRealSignal(S, 0)[k] = command[k];
+}
+
+#define MDL_UPDATE
+static void mdlUpdate(SimStruct* S, int_T tid) {
+  block* b = (block*)ssGetPWorkValue(S, 0);
+  (void)tid;
+  b->before = b->c.memory;
+}
+
+static void mdlTerminate(SimStruct* S) { free(ssGetPWorkValue(S, 0)); }
+
+#ifdef MATLAB_MEX_FILE
+#include "simulink.c"
+#else
+#include "cg_sfun.h"
+#endif
