@@ -17,6 +17,7 @@ import numpy as np
 
 from fpirhc.controllers.model_inputs import NONE, CommandPath
 from fpirhc.deformation.base import Deformation
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import controlled_places, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names, values_of
@@ -58,14 +59,12 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
     mirror = deformation.mirror
     if mirror is None:
         return [], []
-    estimated = not problem.sensing.estimator.shows_response or mirror.measurement % 1 > NONE
+    estimator, part = problem.sensing.estimator, mirror.measurement % 1 > NONE
     inputs = problem.plant.input
     last, waits = Signal("_command_before", inputs.elements, inputs.units), Queue(mirror.cycles, longest=mirror.longest)
     path = CommandPath(problem, "mirror", last, waits, mirror.measurement, mirror.lag, counts=False)
-    if problem.plant.step is not None:
-        return [map_mirror(path)], []
-    if not estimated:
-        return [_instant_block(path)], []
+    if estimator.of_steps or (estimator.shows_response and not part):
+        return [instant_mirror(path)], []
     path = replace(path, counts=True)
     if problem.plant.outputs:
         return [twin_of_outputs(path)], []
@@ -97,66 +96,53 @@ def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
     return tuple([signal for signal in every if signal.name in read])
 
 
-def map_mirror(path: CommandPath, *, lost: bool = False) -> Block:
+def instant_mirror(path: CommandPath, *, lost: bool = False) -> Block:
     """Return the block (measured state, last command, parameters) -> the model's response that is measured in this cycle.
 
-    A response of relative order r is complete r cycles after its command. The model's response to the same command, from the same
-    measured state, waits as long:  modelled_k = y^_r(x_{k-r}, u_{k-r}), u the input that acted then according to the beliefs. There
-    is no twin that could drift, because a map has no motion between two measurements.
+    There is no twin that could drift. The model answers from the measured state, or on a map from that of the cycle before. A response
+    of relative order r of a map is complete r cycles after its command, so the model's waits as long:
+    modelled_k = y^_r(x_{k-r}, u_{k-r}), u the input that acted then according to the beliefs.
 
     Args:
         path: of the commands to the model.
         lost: whether samples may be lost; the state of the last cycle is then on the line over the gap.
     """
     plant = path.problem.plant
-    orders = [plant.chains[name] for name in plant.controlled_names]
-    start = tuple(map(float, path.problem.start_state))
-    before = Signal(_BEFORE, plant.state.elements, plant.state.units, start)
-    names = zip(plant.controlled_names, orders, strict=True)
-    waiting = tuple(f"{name}@{i}" for name, order in names for i in range(1, order))
+    age, start = response_age(plant), tuple(map(float, path.problem.start_state))
+    before = (Signal(_BEFORE, plant.state.elements, plant.state.units, start),) * age
+    waits = [age * (plant.chains[name] - 1) for name in plant.controlled_names]
+    waiting = tuple(
+        f"{name}@{i}" for name, cycles in zip(plant.controlled_names, waits, strict=True) for i in range(1, cycles + 1)
+    )
     queues = (Signal(_ANSWERS, waiting),) if waiting else ()
 
     def step(s: Signals) -> dict[str, Expression]:
         acting, _, remembered = path.acted(s)
-        last = getattr(s, _BEFORE)
-        last = straightened(last, getattr(s, MEASURED), s.gap) if lost else last
+        at = getattr(s, _BEFORE if age else MEASURED)
+        at = straightened(at, getattr(s, MEASURED), s.gap) if lost else at
         parameters, signals = path.parameters(s)
-        answers = ca.vertsplit(plant.equations.controlled_response(last, acting, parameters))
+        answers = ca.vertsplit(plant.equations.controlled_response(at, acting, parameters))
         past = ca.vertsplit(getattr(s, _ANSWERS)) if waiting else []
-        modelled, later, at = [], [], 0
-        for answer, order in zip(answers, orders, strict=True):
-            queue = [answer, *past[at : at + order - 1]]
-            at += order - 1
+        modelled, later = [], []
+        for answer, cycles in zip(answers, waits, strict=True):
+            queue, past = [answer, *past[:cycles]], past[cycles:]
             modelled.append(queue[-1])
             later += queue[:-1]
-        remembered |= {f"{_BEFORE}_next": getattr(s, MEASURED), **signals}
+        remembered |= {f"{one.name}_next": getattr(s, MEASURED) for one in before} | signals
         if later:
             remembered[f"{_ANSWERS}_next"] = ca.vertcat(*later)
         return {"_modelled": ca.vertcat(*modelled), **remembered}
 
     reads = measured_state(plant), *path.reads
-    writes, memory = Layout((plant.response_signal("_modelled"),)), Layout((*path.memory, before, *queues))
-    if not lost:
-        return Block("mirror", Layout(reads), writes, step, memory, bridged=lambda: map_mirror(path, lost=True))
-    waits = unseen(map_mirror(path), (MEASURED,))
-    held = replace(waits, step=lambda s: {**waits.step(s), f"{_BEFORE}_next": getattr(s, _BEFORE)})
-    return Block("mirror", Layout((*reads, GAP)), writes, step, memory, waits=held)
-
-
-def _instant_block(path: CommandPath) -> Block:
-    """Block (measured state, last command, parameters) -> the model's response at this instant."""
-    plant = path.problem.plant
-    x, u, p = plant.symbols()
-    response = ca.Function("fpirhc_modelled", [x, u, p], [plant.equations.controlled_response(x, u, p)])
-
-    def step(s: Signals) -> dict[str, Expression]:
-        end, _, remembered = path.acted(s)
-        parameters, signals = path.parameters(s)
-        return {"_modelled": response(getattr(s, MEASURED), end, parameters), **remembered, **signals}
-
     writes = Layout((plant.response_signal("_modelled"),))
-    block = Block("mirror", Layout((measured_state(plant), *path.reads)), writes, step, Layout(path.memory))
-    return replace(block, waits=unseen(block, (MEASURED,))) if path.memory else block
+    block = Block("mirror", Layout(reads), writes, step, Layout((*path.memory, *before, *queues)))
+    if not age:
+        return replace(block, waits=unseen(block, (MEASURED,))) if path.memory else block
+    if not lost:
+        return replace(block, bridged=lambda: instant_mirror(path, lost=True))
+    unmoved = unseen(instant_mirror(path), (MEASURED,))
+    held = replace(unmoved, step=lambda s: {**unmoved.step(s), f"{_BEFORE}_next": getattr(s, _BEFORE)})
+    return replace(block, reads=Layout((*reads, GAP)), waits=held)
 
 
 BEFORE = "_deformation_before"

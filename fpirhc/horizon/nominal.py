@@ -33,6 +33,12 @@ def known_on_reference(plant: Plant) -> bool:
     return min(plant.equations.known_by_outputs) >= 0
 
 
+def filled(plant: Plant, outputs: np.ndarray) -> np.ndarray:
+    """Return states that are known by their outputs, shape (m, nx), from the outputs, shape (m, ny); NaN where they are not."""
+    places = np.array(plant.equations.known_by_outputs)
+    return np.where(places >= 0, outputs[:, places], np.nan)
+
+
 def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
     """Return the state on the reference.
 

@@ -138,11 +138,13 @@ def response_age(plant: Motion) -> int:
     return 0 if plant.step is None else 1
 
 
-def step_of(plant: Motion, matrix: np.ndarray, cycle: float) -> np.ndarray:
-    """Return the matrix by which x' = A x moves in one control cycle, or delta x = A x in that of a map."""
+def step_of(plant: Motion, matrix: np.ndarray, time: float) -> np.ndarray:
+    """Return the matrix by which x' = A x moves in that time, or delta x = A x in the whole cycles of a map."""
     from scipy.linalg import expm  # only here: the import takes longer than that of the whole package
 
-    return np.asarray(expm(matrix * cycle)) if plant.step is None else np.eye(len(matrix)) + sampling(plant) * matrix
+    if plant.step is None:
+        return np.asarray(expm(matrix * time))
+    return np.linalg.matrix_power(np.eye(len(matrix)) + sampling(plant) * matrix, round(time / sampling(plant)))
 
 
 def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:

@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.reference_states import nominal_motion
+from fpirhc.horizon.nominal import filled
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.review.inner import inner_motion, inner_places
 from fpirhc.task.problem import Problem
@@ -73,8 +74,8 @@ class ReviewGrid:
     def states_at(self, times: np.ndarray) -> np.ndarray:
         """Return states of the reference with the plant's own inner states, shape (k, nx)."""
         plant = self.problem.plant
-        states = np.asarray(self.problem.reference.function(plant).map(len(times))(times[None, :])[0].full()).T
-        states = np.full((len(times), plant.state.size), np.nan) if plant.outputs else states
+        followed = np.asarray(self.problem.reference.function(plant).map(len(times))(times[None, :])[0].full()).T
+        states = filled(plant, followed)
         if self.inner:
             grid, motion = self._fine
             for place, column in zip(self.inner, motion.T, strict=True):
@@ -127,8 +128,8 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _POINTS)
     nominal = nominal_motion(problem).map(_POINTS)(times[None, :])
-    states, responses = (np.asarray(v.full()).T for v in nominal)
-    states = np.full((_POINTS, plant.state.size), np.nan) if plant.outputs else states
+    followed, responses = (np.asarray(v.full()).T for v in nominal)
+    states = filled(plant, followed)
     ranges = exact_ranges(plant, mismatch)
     lower, upper = (np.array([ranges[name][k] for name in plant.parameters]) for k in (0, 1))
     inner = inner_places(problem)

@@ -116,14 +116,13 @@ def _on_reference(problem: Problem, places: list[int]) -> tuple[Expression, ...]
     matrix = kind(problem.reference.opaque or plant.equations.inverse_opaque)
     t, p, inner = matrix.sym("t"), matrix.sym("p", plant.parameter.size), matrix.sym("z", len(places))
     nominal, response = problem.reference.function(plant)(t)
-    rows = [inner[0]] * plant.state.size if plant.outputs else [nominal[k] for k in range(plant.state.size)]
+    rows = [nominal[place] if place >= 0 else inner[0] for place in plant.equations.known_by_outputs]
     for place, entry in zip(places, range(len(places)), strict=True):
         rows[place] = inner[entry]
     state = ca.vertcat(*rows)
     wanted = nominal_responses(plant, nominal, response)
-    if plant.outputs:
-        decay = min(_DECAYS / problem.duration, _FASTEST / problem.period)
-        wanted = wanted + output_feedback(plant, state, nominal, p, decay)
+    decay = min(_DECAYS / problem.duration, _FASTEST / problem.period)
+    wanted = wanted + output_feedback(plant, state, nominal, p, decay)  # of states on the reference there is no error
     return t, p, inner, state, plant.equations.inverse(state, wanted, p)
 
 

@@ -158,8 +158,6 @@ def _places(problem: Problem) -> list[int]:
 def _followed(problem: Problem, states: np.ndarray) -> np.ndarray:
     """What follows the reference: the states, or the outputs and their derivatives, shape (m, ny)."""
     plant = problem.plant
-    if not plant.outputs:
-        return states
     count = len(states)
     held = (np.zeros((count, plant.input.size)), np.tile(plant.exact, (count, 1)), np.zeros((count, len(plant.names))))
     return each(plant.equations.output, states, *held)

@@ -31,6 +31,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import identity
 from fpirhc.errors import NotSupported
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
@@ -187,7 +188,7 @@ _RECURSIONS: Latest[tuple[Composite, Evaluator]] = Latest(
 def _answer_block(plant: Plant) -> Block:
     """Block (state, command before, exact parameters) -> realised; that of a map begins at the state before."""
     reads = (plant.state, like(plant.input, "_command_before"), like(plant.parameter, "_exact"))
-    before = () if plant.step is None else (like(plant.state, "state_answered"),)
+    before = (like(plant.state, "state_answered"),) * response_age(plant)
 
     def step(s: Any) -> dict[str, Expression]:
         at = s.state_answered if before else s.state

@@ -86,6 +86,9 @@ class Mover(ABC):
     late: Collection[str] = ()
     """Inputs whose dead time it has itself."""
 
+    parameters: str = "_exact"
+    """Signal of the parameters with which it moves in a cycle."""
+
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
 
@@ -139,6 +142,11 @@ class Equations(Mover):
 
     doubted, sent = False, ()
 
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem)
+        if real_values(problem.real_plant, problem.signals) is not None:
+            self.parameters = _REAL_NOW
+
     @property
     def states(self) -> tuple[str, ...]:
         """Those of the same names, or seen in their place."""
@@ -164,7 +172,7 @@ class Equations(Mover):
             Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
             Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
             Delay(_forcing(plant, "_forcing_before"), "_forcing"),
-            Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), real_name(problem)),
+            Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), self.parameters),
         ]
 
     def sense(self, motion: Sequence[Signal], response: Response) -> Block:
@@ -197,7 +205,7 @@ class Equations(Mover):
         """Block of the plant that moves over one period with the arriving command held."""
         problem, plant = self.problem, self.problem.real_plant
         advance = problem.real_integrator.step(plant, problem.period)
-        state, exact = like(plant.state, "_state_before"), like(plant.parameter, real_name(problem))
+        state, exact = like(plant.state, "_state_before"), like(plant.parameter, self.parameters)
         reads = (state, arriving, exact, *disturbed)
         writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
@@ -410,16 +418,7 @@ def _difference(samples: Sequence[Expression], order: int) -> Expression:
     return combine(backward_difference(order), samples)
 
 
-_REAL_HELD, _REAL_NOW = "_exact", "_exact_now"
-
-
-def real_name(problem: Problem) -> str:
-    """Return the signal of the parameters with which the plant moves in this cycle."""
-    return (
-        _REAL_HELD
-        if problem.foreign is not None or real_values(problem.real_plant, problem.signals) is None
-        else _REAL_NOW
-    )
+_REAL_NOW = "_exact_now"
 
 
 def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
@@ -427,10 +426,10 @@ def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
     real, known = problem.real_plant, controller.plant_model(problem)
     model = known.plant
     blocks = []
-    if real_name(problem) == _REAL_NOW:
+    if moving(problem).parameters == _REAL_NOW:
         values = real_values(real, problem.signals)
         assert values is not None
-        blocks.append(_block("outside", problem, real, values, "signals", (_REAL_HELD, _REAL_NOW)))
+        blocks.append(_block("outside", problem, real, values, "signals", (Mover.parameters, _REAL_NOW)))
     if outside_names(model):
         believed = model_values(model, known.signals) or _unchanged(model)
         blocks.append(_block("told", problem, model, believed, "signals_told", ("parameters", "")))

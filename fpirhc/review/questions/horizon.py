@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import with_optimiser, without_deformation
@@ -20,8 +19,8 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.plant.maps import growth_of
-from fpirhc.plant.motion import controlled_places, sampling
+from fpirhc.plant.maps import growth_of, step_of
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
@@ -182,17 +181,10 @@ def _growth(grid: ReviewGrid, feedback: np.ndarray) -> float:
     a, b = _model(grid)
     nx, nu = b.shape
     rates = np.block([[a, b], [np.zeros((nu, nx + nu))]])
-    held = _transition(grid.problem.plant, rates, step)[:nx]
+    held = step_of(grid.problem.plant, rates, step)[:nx]
     stage = np.vstack([held[:, :nx] @ np.eye(nx, nx + nu) + held[:, nx:] @ feedback, feedback])
     radius = float(np.abs(np.linalg.eigvals(stage)).max())
     return 0.0 if abs(radius - 1) < _STILL else math.log(radius) / step
-
-
-def _transition(plant: Plant, rates: np.ndarray, time: float) -> np.ndarray:
-    """The matrix by which x' = rates x moves in that time; of a map (1 + T rates)^n in n cycles."""
-    if plant.step is None:
-        return np.asarray(scipy.linalg.expm(time * rates))
-    return np.linalg.matrix_power(np.eye(len(rates)) + sampling(plant) * rates, round(time / sampling(plant)))
 
 
 def _model(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:
