@@ -99,8 +99,8 @@ def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
 def instant_mirror(path: CommandPath, *, lost: bool = False) -> Block:
     """Return the block (measured state, last command, parameters) -> the model's response that is measured in this cycle.
 
-    There is no twin that could drift. The model answers from the measured state, or on a map from that of the cycle before. A response
-    of relative order r of a map is complete r cycles after its command, so the model's waits as long:
+    There is no twin that could drift. The model answers from the measured state, or on a map from that of the cycle before. A
+    response of relative order r of a map is complete r cycles after its command, so the model's waits as long:
     modelled_k = y^_r(x_{k-r}, u_{k-r}), u the input that acted then according to the beliefs.
 
     Args:
