@@ -89,6 +89,7 @@ from .simulation.stepper import Stepper
 from .status import Status
 from .studies.comparison.compare import compare
 from .studies.information import compare_information
+from .studies.operating_limits import operating_limits
 from .studies.scenarios.scenario_study import compare_scenarios
 from .studies.tuning.tune import tune
 from .symbolic.functions import signed_power
@@ -246,6 +247,7 @@ __all__ = [
     "load_run",
     "lyapunov_view",
     "measure",
+    "operating_limits",
     "outside",
     "predict_response",
     "probe",

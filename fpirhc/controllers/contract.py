@@ -6,6 +6,7 @@ controller is built for, unless it overrides them. So the facts pass through any
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
@@ -284,10 +285,18 @@ def with_lateness(problem: Problem, controller: Controller) -> Controller:
     return controller if told is own else controller.with_deformation(told)
 
 
-def _late(deformation: Deformation, problem: Problem) -> Deformation:
-    """The deformation with open dead times and lags filled in; inputs that are not one per coordinate have the longest one."""
+def believing(problem: Problem, controller: Controller) -> Controller:
+    """Return the resolved controller whose deformation believes this problem's dead times and lags in every other one too."""
+    ready = resolved(problem, controller)
+    own = ready.deformation
+    told = _late(own, problem, least=0)
+    return ready if told is own else ready.with_deformation(told)
+
+
+def _late(deformation: Deformation, problem: Problem, least: float = math.ulp(0.0)) -> Deformation:
+    """The deformation with open dead times and lags of at least `least`; inputs not one per coordinate have the longest."""
     if deformation.inner is not None:
-        inner = _late(deformation.inner, problem)
+        inner = _late(deformation.inner, problem, least)
         deformation = deformation if inner is deformation.inner else with_inner(deformation, inner)
     if not is_dataclass(deformation):
         return deformation
@@ -301,7 +310,7 @@ def _late(deformation: Deformation, problem: Problem) -> Deformation:
         f.name for f in fields(deformation) if f.metadata.get("of_problem") and getattr(deformation, f.name) is None
     ]
     square = len(inputs) == len(problem.plant.controlled_names)
-    late = [name for name in left_open if any(known[name])]
+    late = [name for name in left_open if max(known[name]) >= least]
     values = {n: tuple(known[n]) if square and len({*known[n]}) > 1 else max(known[n]) for n in late}
     return replace(deformation, **values) if values else deformation
 

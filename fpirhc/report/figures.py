@@ -36,11 +36,13 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Contraction, Entry
     from fpirhc.studies.open_loop import Solved
+    from fpirhc.studies.operating_limits import OperatingLimit, OperatingLimits
     from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
     from fpirhc.task.problem import Problem
 
     Draw: TypeAlias = Callable[[Axes, Run, Sequence[str]], None]
 
+_PANELS = 3  # of a figure, side by side
 _GROUPS = 6  # of scenarios with similar mismatch, whose medians are joined by a line
 _WIDE = 16.5  # inches, of a picture as wide as the page
 _CYCLES = 150  # of the decay of a response error
@@ -322,6 +324,43 @@ def mismatch_figure(comparison: ScenarioComparison) -> Drawing:
     axis.grid(visible=True, alpha=0.25)
     axis.legend(fontsize=8, framealpha=0.8)
     return figure
+
+
+def limits_figure(found: OperatingLimits) -> Drawing:
+    """Return the figure of the error against what grows, a panel per quantity and a colour per controller."""
+    colours = dict(
+        zip(dict.fromkeys(one.controller for one in found.limits), PALETTE * len(found.limits), strict=False)
+    )
+    shown = [q for q in found.quantities if any(one.quantity is q for one in found.limits)]
+    columns = min(len(shown), _PANELS)
+    rows = -(-len(shown) // columns)
+    figure = new_figure(5.5 * columns, 3.8 * rows, f"{found.problem}: error against what grows")
+    axes = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+    finite = [p.error for one in found.limits for p in one.points if np.isfinite(p.error)]
+    edge = 10 * max(10 * found.fails, min(max(finite, default=1.0), 1e3 * found.fails))
+    for axis, quantity in zip(axes, shown, strict=False):
+        for one in (one for one in found.limits if one.quantity is quantity):
+            _draw_limit(axis, one, colours[one.controller], edge)
+        axis.axhline(100 * found.fails, color="#777777", ls="--", lw=1)
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+        axis.set_ylim(top=150 * edge)
+        axis.set_xlabel(literal(f"{quantity.name} [{quantity.unit}]"))
+        axis.set_ylabel("rms error [% of the reference's range]")
+        axis.grid(visible=True, alpha=0.25)
+    draw_legend(axes[0])
+    for axis in axes[len(shown) :]:
+        axis.remove()
+    return figure
+
+
+def _draw_limit(axis: Axes, one: OperatingLimit, colour: str, edge: float) -> None:
+    values = [max(p.value, one.quantity.first / 2) for p in one.points]  # zero has no place on the axis
+    errors = [100 * min(p.error, edge) for p in one.points]
+    axis.plot(values, errors, "-", color=colour, lw=1.5, label=literal(one.controller))
+    for style, failed in (("o", False), ("x", True)):
+        places = [k for k, p in enumerate(one.points) if bool(p.why) is failed]
+        axis.plot([values[k] for k in places], [errors[k] for k in places], style, color=colour, ms=4)
 
 
 def _medians(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import InvalidName
-from fpirhc.report.figures import contraction_figure, lyapunov_figure, mismatch_figure, pair_figures
+from fpirhc.report.figures import contraction_figure, limits_figure, lyapunov_figure, mismatch_figure, pair_figures
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
 from fpirhc.simulation.log import shown_motion
 from fpirhc.studies.comparison.outcome import Outcome
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Entry
+    from fpirhc.studies.operating_limits import OperatingLimits
     from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
     from fpirhc.studies.view import View
 
@@ -54,6 +55,10 @@ _MISMATCH = (
     "One point per scenario and controller; lines join medians of scenarios with similar mismatch, crosses at the upper edge "
     "are runs that ended early. Mismatch: rms over the parameters of the relative distance between the model and the drawn "
     "plant. Error: rms error divided by the reference's range, root mean square over the coordinates."
+)
+_LIMITS = (
+    "One point per run, crosses are failed ones: above the dashed line by their error, at the upper edge they ended early, below "
+    "the line they left a limit of a state. The first point of a line is the problem as it stands."
 )
 
 
@@ -188,6 +193,17 @@ def render_scenarios(comparison: ScenarioComparison) -> str:
     figure = mismatch_figure(comparison) if comparison.summaries else None
     chart = Image(figure.address, "Error against mismatch", _MISMATCH) if figure else None
     return render_page("scenarios.html", comparison.view, chart=chart)
+
+
+def write_limits(found: OperatingLimits, path: Path) -> None:
+    """Write the report, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    figure = limits_figure(found) if found.limits else None
+    chart = Image(figure.address, "Error against what grows", _LIMITS) if figure else None
+    write_whole(render_page("scenarios.html", found.view, chart=chart), path, "report")
 
 
 def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:

@@ -304,6 +304,11 @@ JOURNEYS: dict[str, Any] = {
         (tunable, "line.py --trials 2 --out tuned", 0),
         (stale, "line.py --trials 2 --out tuned", 3),
     ],
+    "limits": [
+        (None, "line.py --over latency --controllers CTC --no-compile", 0),
+        (None, "line.py --over latncy", 2),
+        (taken, "line.py --out taken/results", 3),
+    ],
     "export": [
         (None, "line.py CTC --out device --cycles 50", 0),
         (None, "line.py CTC --out device", 3),

@@ -1,0 +1,96 @@
+"""`fpirhc limits PROBLEM`: the mismatch, latency, noise, lost samples and period at which each controller fails."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+
+from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_out, add_problem, add_seed
+from fpirhc.cli.output import RESULTS, results_folder
+from fpirhc.cli.verb import ExitCode, Verb
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    add_problem(parser)
+    add_controllers(parser)
+    text = "what grows: mismatch, latency, noise, lost, period, or names of parameters (default: these five)"
+    parser.add_argument("--over", nargs="+", metavar="NAME", help=text)
+    text = "rms error from which a run has failed, as a share of the reference's range (default: 0.5)"
+    parser.add_argument("--fails", type=float, metavar="SHARE", help=text)
+    add_seed(parser, "noise and lost samples")
+    add_out(parser, "results/PROBLEM/limits")
+    add_no_compile(parser)
+    add_json(parser, "the table")
+
+
+def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.problem_files.problem_file import load_problem
+
+    task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
+    from fpirhc.report.figures import limits_figure, save_figure
+    from fpirhc.report.html import write_limits
+    from fpirhc.report.terminal import progress_bars, show
+    from fpirhc.studies.operating_limits import FAILS, operating_limits
+    from fpirhc.studies.view import to_json
+    from fpirhc.whole_file import write_whole
+
+    folder = results_folder(options.out, task.name, "limits")
+    with progress_bars() as progress:
+        found = operating_limits(
+            task,
+            over=options.over,
+            controllers=options.controllers,
+            fails=FAILS if options.fails is None else options.fails,
+            seed=options.seed,
+            compiled=not options.no_compile,
+            command=_command(options),
+            progress=progress,
+        )
+    write_limits(found, folder / "report.html")
+    write_whole(f"{to_json(found.view.facts)}\n", folder / RESULTS, "report")
+    if found.limits:
+        save_figure(limits_figure(found), folder / "limits.png")
+    if options.json:
+        print(to_json(found.view.facts))
+    else:
+        show(found.view, folder / "report.html")
+    return ExitCode.FINISHED if found.limits else ExitCode.BAD_INPUT
+
+
+def _command(options: argparse.Namespace) -> str:
+    words = ["fpirhc", "limits", options.problem, "--seed", str(options.seed)]
+    words += ["--controllers", *options.controllers] if options.controllers else []
+    words += ["--over", *options.over] if options.over else []
+    words += [] if options.fails is None else ["--fails", f"{options.fails:g}"]
+    return shlex.join([*words, *(["--no-compile"] if options.no_compile else [])])
+
+
+VERB = Verb(
+    name="limits",
+    summary="find the mismatch, latency, noise, lost samples and period at which each controller fails",
+    group="run",
+    add=_add,
+    run=_run,
+    codes={
+        ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or nothing could be tried",
+        ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
+    },
+    examples=(
+        ("fpirhc limits two_mass", "all five, for every controller"),
+        ("fpirhc limits two_mass --controllers RHC RHC+FPI --over latency noise", "two controllers, two quantities"),
+        (
+            "fpirhc limits two_mass --over m1 k2 --fails 0.2",
+            "factors of two exact parameters, up and down, by a stricter limit",
+        ),
+    ),
+    notes="""
+A run fails if it ends early, leaves a limit of a state by more than 2 % of its width, or has an rms error above SHARE of the
+reference's range. Each quantity grows from the problem as it stands until a run fails; a bisection then goes on to 5 %, or to
+one cycle of latency.
+  mismatch  exact = approximate (exact / approximate)^f for all parameters; f = 1 is the problem's own
+  latency   commands arrive later; only what reads the problem's dead time (learners, observers) knows
+  noise     deviation on every measured quantity, as a share of its range along the reference
+  lost      probability that a measured quantity has no sample in a cycle
+  period    of the control cycle; settings stay, and stages of the horizon keep their length where whole cycles allow
+""",
+)
