@@ -8,7 +8,9 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.latest import Latest
 from fpirhc.task.exogenous import really_known, signals_of
 from fpirhc.task.problem import Problem
 
@@ -39,9 +41,8 @@ class ExactModel(Controller):
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
         model = self.plant_model(problem)
-        plant, signals = model.plant, signals_of(model.plant, model.signals)
-        exact = {name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()}
-        return replace(problem, plant=replace(plant, parameters=exact), reality=None, signals=signals)
+        plant = _EXACT.of((model.plant,), (), lambda: _exact(model.plant))
+        return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
 
     def plant_model(self, problem: Problem) -> PlantModel:
         """Return the plant that a run moves, its exact parameters, and the signals as they really are."""
@@ -53,6 +54,13 @@ class ExactModel(Controller):
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of the wrapped controller."""
         return self.controller.blocks(self.inner_problem(problem))
+
+
+def _exact(plant: Plant) -> Plant:
+    return replace(plant, parameters={name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()})
+
+
+_EXACT: Latest[Plant] = Latest(4)  # so that plans of it are built once
 
 
 def examples(inner: Controller) -> tuple[Controller, ...]:

@@ -21,7 +21,7 @@ from fpirhc.controllers.gain_check import any_gain
 from fpirhc.errors import NotSupported
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 from fpirhc.simulation.linearise.linear_map import GAIN
-from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, reached
+from fpirhc.simulation.linearise.slopes import Directions, Step, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
@@ -156,7 +156,8 @@ class AskedLoop:
         for k in range(cycles):
             memory_next, trace = memories[k + 1], traces[k]
             self._step.into(memories[k], 0.0, memory_next, trace)
-            if not (_below(memory_next, _AWAY) and _below(trace[self._arriving], math.inf)):
+            # A scalar product takes less time than a look at every entry.
+            if not (memory_next.dot(memory_next) < _AWAY**2 or (np.abs(memory_next) < _AWAY).all()):
                 end = k
                 break
             if led is not None and leads is not None:
@@ -168,13 +169,16 @@ class AskedLoop:
                 if at_rest is not None:
                     end = at_rest
                     break
+        sent = np.isfinite(traces[:end, self._arriving]).all(axis=1)
+        end = end if sent.all() else int(np.argmin(sent))
         return Passage(memories[: end + 1], traces[:end])
 
     def _at_rest(self, traces: np.ndarray) -> int | None:
         """The number of cycles after which commands have been still for longer than they may take; None: they have not."""
         commands, n, first = traces[:, self._command], self.repeats, self.warm + 1
         now, before = commands[first:], commands[first - n : len(commands) - n]
-        still = (np.abs(now - before) <= _STILL * np.abs(now).max(axis=1, keepdims=True)).all(axis=1)
+        with np.errstate(invalid="ignore"):
+            still = (np.abs(now - before) <= _STILL * np.abs(now).max(axis=1, keepdims=True)).all(axis=1)
         counts = np.convolve(still, np.ones(self._longest + 1), "valid") if len(still) > self._longest else still[:0]
         rests = np.flatnonzero(counts > self._longest)
         return first + int(rests[0]) + self._longest + 1 if rests.size else None
@@ -237,19 +241,19 @@ class AskedLoop:
         if self.quick:
             directions = [along(some, np.eye(len(scales))[:, self._free], self._inputs) for some in ways]
         else:
-            directions = reached(ways, self._free, places, self._inputs, self._known.get(names[-1]))
+            with np.errstate(invalid="ignore", over="ignore"):  # a loop that runs away is infinite on both sides
+                directions = reached(ways, self._free, places, self._inputs, self._known.get(names[-1]))
         if len(periods) == 1:
             self._known[names[0]] = directions
-        return tuple(self._linear([at[k] for at in ways], directions, k, scales[places]) for k in range(len(periods)))
+        return tuple(self._linear(directions, k, scales[places]) for k in range(len(periods)))
 
-    def _linear(self, ways: list[Way], directions: list[Directions], number: int, scales: np.ndarray) -> LinearLoop:
+    def _linear(self, directions: list[Directions], number: int, scales: np.ndarray) -> LinearLoop:
         """The linear loop of one of the ways of every cycle."""
-        cycles, nothing = [], np.zeros((self.loop.memory.size, self._inputs))
-        for way, at, later in zip(ways, directions, [*directions[1:], directions[0]], strict=True):
-            entry = way(nothing, np.eye(self._inputs))[0]
+        cycles = []
+        for at, later in zip(directions, [*directions[1:], directions[0]], strict=True):
             state, arriving = at.basis[self._state] * scales[:, None], at.traces[number][self._arriving]
             onto = later.basis.T
-            cycles.append(LinearCycle(onto @ at.moved[number], onto @ entry, arriving, state))
+            cycles.append(LinearCycle(onto @ at.moved[number], onto @ at.kicked[number], arriving, state))
         first = directions[0]
         placed = (first.basis[self._state] / scales[:, None]).T
         return LinearLoop(tuple(cycles), first.traces[number][self._errors], placed, self.problem.period)
@@ -322,11 +326,6 @@ class AskedLoop:
         for k, column in enumerate(self.loop.memory.columns):
             groups.setdefault(column.split("@")[0], []).append(k)
         return [places for places in groups.values() if len(places) > 1]
-
-
-def _below(values: np.ndarray, end: float) -> bool:
-    """Whether all values (n,) are numbers of a size below an end."""
-    return bool(values.dot(values) < _AWAY**2) or bool((np.abs(values) < end).all())
 
 
 def _started(problem: Problem, state: Mapping[str, float] | None, before: Mapping[str, float] | None) -> Problem:

@@ -81,10 +81,9 @@ class Step:
             some = np.flatnonzero(sizes)
             h = _STEP / sizes[some, None]
             by_memory, by_input = h * scales * deviations.T[some], h * w.T[some]
-            with np.errstate(invalid="ignore", over="ignore"):  # a loop that runs away is infinite on both sides
-                ahead, behind = self._each(memory + by_memory, by_input), self._each(memory - by_memory, -by_input)
-                moved[:, some] = ((ahead[0] - behind[0]) / (2 * h * scales)).T
-                traces[:, some] = ((ahead[1] - behind[1]) / (2 * h)).T
+            ahead, behind = self._each(memory + by_memory, by_input), self._each(memory - by_memory, -by_input)
+            moved[:, some] = ((ahead[0] - behind[0]) / (2 * h * scales)).T
+            traces[:, some] = ((ahead[1] - behind[1]) / (2 * h)).T
             if not np.isfinite(moved).all():
                 raise NotSupported("the loop has no finite slope at a point of its run")
             return np.where(np.abs(moved) > _ROUNDING * sizes, moved, 0.0), traces
@@ -107,17 +106,24 @@ class Directions:
         basis: orthonormal directions (n, m) at its beginning, in scales.
         moved: by way, the next deviations (n, m).
         traces: by way, the deviations of the trace (columns, m).
+        kicked: by way, the next deviations (n, nu) after inputs alone.
     """
 
     basis: np.ndarray
     moved: list[np.ndarray]
     traces: list[np.ndarray]
+    kicked: list[np.ndarray]
 
 
 def along(ways: Sequence[Way], basis: np.ndarray, inputs: int) -> Directions:
     """Return given directions (n, m) of a cycle, moved."""
     images = [way(basis, np.zeros((inputs, basis.shape[1]))) for way in ways]
-    return Directions(basis, [moved for moved, _ in images], [trace for _, trace in images])
+    kicked = [_kicked(way, len(basis), inputs) for way in ways]
+    return Directions(basis, [moved for moved, _ in images], [trace for _, trace in images], kicked)
+
+
+def _kicked(way: Way, size: int, inputs: int) -> np.ndarray:
+    return way(np.zeros((size, inputs)), np.eye(inputs))[0]
 
 
 def reached(
@@ -139,8 +145,8 @@ def reached(
     Raises:
         NotSupported: more directions than a loop should need.
     """
-    count, kicks, fixed = len(ways), (np.zeros((free.size, inputs)), np.eye(inputs)), ~free
-    parts = [_Part(some, free.size, None if begun is None else begun[k]) for k, some in enumerate(ways)]
+    count, fixed = len(ways), ~free
+    parts = [_Part(some, free.size, inputs, None if begun is None else begun[k]) for k, some in enumerate(ways)]
     waiting: list[list[np.ndarray]] = [[] for _ in ways]  # of each cycle, what is to be looked at
     if begun is None:
         waiting[0].extend(np.eye(free.size)[first])
@@ -150,33 +156,34 @@ def reached(
         waiting[(place + 1) % count].extend(moved.T)
 
     for k, part in enumerate(parts):
-        for way in ways[k] if begun is None else ways[k][:-1]:
-            moved = way(*kicks)[0]
-            passed(k, moved / (np.linalg.norm(moved * free[:, None], axis=0) + 1e-300))
-        for moved in part.caught_up(inputs):
+        for kicked in part.kicked if begun is None else part.kicked[:-1]:
+            passed(k, kicked / (np.linalg.norm(kicked * free[:, None], axis=0) + 1e-300))
+        for moved in part.caught_up():
             passed(k, moved)
     while any(waiting):
         for place, part in enumerate(parts):
             some, waiting[place] = waiting[place], []
-            passed(place, part.moved(part.joined(some), inputs))
+            passed(place, part.moved(part.joined(some)))
     return [part.directions for part in parts]
 
 
 class _Part:
     """The directions of one cycle while they are sought."""
 
-    def __init__(self, ways: Sequence[Way], size: int, begun: Directions | None) -> None:
-        self.ways, self.count, self._begun = ways, 0, begun
+    def __init__(self, ways: Sequence[Way], size: int, inputs: int, begun: Directions | None) -> None:
+        self.ways, self.count, self._inputs, self._begun = ways, 0, inputs, begun
+        others = ways if begun is None else ways[:-1]
+        self.kicked = [_kicked(way, size, inputs) for way in others] + ([] if begun is None else begun.kicked)
         self.basis = np.zeros((size, 0))
         self._images: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in ways]
 
-    def caught_up(self, inputs: int) -> list[np.ndarray]:
+    def caught_up(self) -> list[np.ndarray]:
         """Take over the directions that are known of the last way; return what the other ways make of them."""
         if self._begun is None:
             return []
         self._append(self._begun.basis)
         self._images[-1].append((self._begun.moved[0], self._begun.traces[0]))
-        calm = np.zeros((inputs, self.count))
+        calm = np.zeros((self._inputs, self.count))
         for way, known in zip(self.ways[:-1], self._images, strict=False):
             known.append(way(self._begun.basis, calm))
         return [known[0][0].copy() for known in self._images[:-1]]
@@ -195,12 +202,12 @@ class _Part:
                 self._append((one / length)[:, None])
         return self.basis[:, before : self.count].copy()
 
-    def moved(self, directions: np.ndarray, inputs: int) -> np.ndarray:
+    def moved(self, directions: np.ndarray) -> np.ndarray:
         """Return what every way makes of directions (n, m) that were added, direction by direction."""
         if not directions.size:
             return directions
         for way, known in zip(self.ways, self._images, strict=True):
-            known.append(way(directions, np.zeros((inputs, directions.shape[1]))))
+            known.append(way(directions, np.zeros((self._inputs, directions.shape[1]))))
         return np.stack([known[-1][0] for known in self._images], axis=2).reshape(len(directions), -1)
 
     def _append(self, directions: np.ndarray) -> None:
@@ -216,7 +223,7 @@ class _Part:
     def directions(self) -> Directions:
         """Those that were found, and what each way makes of them."""
         moved, traces = ([np.hstack([one[k] for one in known]) for known in self._images] for k in (0, 1))
-        return Directions(self.basis[:, : self.count].copy(), moved, traces)
+        return Directions(self.basis[:, : self.count].copy(), moved, traces, self.kicked)
 
 
 def _derivative(function: ca.Function) -> ca.Function:
