@@ -33,6 +33,7 @@ _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 _DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
 _STEPS, _TOGETHER = 60, 5
+_ITERATIONS = 60  # of a root
 SLOWER = "Let it learn more slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
 
 
@@ -116,13 +117,13 @@ def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
     nyquist = math.pi / loop.period
     frequencies = np.append(nyquist * np.geomspace(_LOWEST, 0.9999, _FREQUENCIES), nyquist)
     opened = _response(loop, place)
-    values = np.array([opened(w) for w in frequencies])
-    turned = [opened(w) for w in _roots(lambda w: opened(w).imag, frequencies[:-1], values[:-1].imag)]
+    values = opened(frequencies)
+    turned = opened(_roots(lambda w: opened(w).imag, frequencies[:-1], values[:-1].imag))
     # At the Nyquist frequency, where most sampled loops leave the unit circle, L is real and crosses no phase.
     gains = [-1 / value.real for value in (*turned, values[-1]) if value.real < 0]
     factors = [max(gain, 1 / gain) for gain in gains]
-    crossings = _roots(lambda w: abs(opened(w)) - 1, frequencies, np.abs(values) - 1)
-    phases = [np.angle(-opened(w)) for w in crossings]
+    crossings = _roots(lambda w: np.abs(opened(w)) - 1, frequencies, np.abs(values) - 1)
+    phases = np.angle(-opened(crossings))
     delays = [(phase % (2 * math.pi)) / w for phase, w in zip(phases, crossings, strict=True)]
     least = min((abs(math.degrees(phase)) for phase in phases), default=math.inf)
     return min(factors, default=math.inf), least, min(delays, default=math.inf)
@@ -145,28 +146,48 @@ def _up_to(end: float, most: float) -> np.ndarray:
     return np.append(steps[steps < end], end)
 
 
-def _roots(function: Callable[[float], float], at: np.ndarray, values: np.ndarray) -> list[float]:
+def _roots(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Arguments at which a function is zero, one between each pair of neighbours of different signs."""
     changes = np.flatnonzero(np.sign(values[1:]) * np.sign(values[:-1]) < 0)
-    return [_root(function, at[k], at[k + 1], 1e-9) for k in changes]
+    ends = at[changes], at[changes + 1]
+    return _between(function, ends, (values[changes], values[changes + 1]), 1e-9)
 
 
-def _root(function: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
-    from scipy.optimize import brentq  # it takes longer to import than a problem to load
+def _between(
+    function: Callable[[np.ndarray], np.ndarray],
+    ends: tuple[np.ndarray, np.ndarray],
+    values: tuple[np.ndarray, np.ndarray],
+    tolerance: float,
+) -> np.ndarray:
+    """Roots between ends (m,) of different signs, together, by false position with half a value at an end that stays.
 
-    return float(brentq(function, low, high, rtol=tolerance))
+    G. Dahlquist, A. Bjorck, Numerical Methods, 1974, section 6.6, the Illinois method. That of scipy takes one root at a time, and
+    its import takes longer than a review's margins.
+    """
+    (old, new), (f_old, f_new) = ends, values
+    for _ in range(_ITERATIONS):
+        if (np.abs(new - old) <= tolerance * np.abs(new)).all():
+            break
+        between = new - f_new * (new - old) / np.where(f_new == f_old, 1.0, f_new - f_old)
+        f = function(between)
+        crossed = np.sign(f) * np.sign(f_new) <= 0
+        old, f_old = np.where(crossed, new, old), np.where(crossed, f_new, f_old / 2)
+        new, f_new = between, f
+    return new
 
 
-def _response(loop: LinearLoop, place: int) -> Callable[[float], complex]:
-    """Function frequency -> L_i; from the matrices, because polynomials of so many states lose all digits."""
+def _response(loop: LinearLoop, place: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Function frequencies -> L_i; from the matrices, because polynomials of so many states lose all digits."""
     [one] = loop.cycles
     g, c = one.entry[:, place], one.arriving[place]
     form, turn = scipy.linalg.schur(loop.dynamics - np.outer(g, c), output="complex")
-    left, right, unit = c @ turn, turn.conj().T @ g, np.eye(len(form))
+    left, right = c @ turn, turn.conj().T @ g
 
-    def opened(frequency: float) -> complex:
-        point = np.exp(1j * frequency * loop.period)
-        return complex(-left @ scipy.linalg.solve_triangular(point * unit - form, right))
+    def opened(frequencies: np.ndarray) -> np.ndarray:
+        points, states = np.exp(1j * frequencies * loop.period), np.zeros((len(form), len(frequencies)), dtype=complex)
+        for k in reversed(range(len(form))):
+            states[k] = (right[k] + form[k, k + 1 :] @ states[k + 1 :]) / (points - form[k, k])
+        return np.asarray(-left @ states)
 
     return opened
 
@@ -221,12 +242,15 @@ def _first(poles: Callable[[np.ndarray], np.ndarray], most: float) -> float:
     def outside(x: np.ndarray) -> np.ndarray:
         return np.asarray(np.abs(poles(x)).max(axis=1, initial=0.0)) - 1
 
-    steps = np.linspace(0, most, _STEPS + 1)
-    for k in range(0, len(steps), _TOGETHER):
-        beyond = np.flatnonzero(outside(steps[k : k + _TOGETHER]) >= 0)
+    steps, values = np.linspace(0, most, _STEPS + 1), np.empty(0)
+    while len(values) < len(steps):
+        values = np.append(values, outside(steps[len(values) : len(values) + _TOGETHER]))
+        beyond = np.flatnonzero(values >= 0)
         if beyond.size:
-            k += int(beyond[0])
-            return _root(lambda x: float(outside(np.array([x]))[0]), steps[k - 1], steps[k], 1e-6) if k else 0.0
+            k = int(beyond[0])
+            some = slice(k - 1, k), slice(k, k + 1)
+            ends, sizes = (steps[some[0]], steps[some[1]]), (values[some[0]], values[some[1]])
+            return float(_between(outside, ends, sizes, 1e-6)[0]) if k else 0.0
     return math.inf
 
 
