@@ -321,6 +321,16 @@ class LoopsByGain:
         radius = self.at(gain, pair).radius
         return radius < 1 + NEUTRAL or radius < min(self._most, self._floor(pair) + _ROUNDING)
 
+    def all_stable(self, gain: float, pairs: Sequence[Pair]) -> bool:
+        """Whether they are all stable; the last one that was not is looked at first."""
+        for pair in sorted(pairs, key=lambda one: one is not self._unstable):
+            if not self.stable(gain, pair):
+                self._unstable = pair
+                return False
+        return True
+
+    _unstable: Pair | None = None
+
     def _least(self, pair: Pair) -> float:
         return min(self.at(share * self.gains[1], pair).radius for share in _SHARES)
 

@@ -21,8 +21,7 @@ from fpirhc.review.prediction import NominalRun, exactly, nominal_of, nominal_ru
 from fpirhc.simulation.error_pair import ErrorPair
 from fpirhc.simulation.model_as_plant import shortened, with_believed_way
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import simulator
-from fpirhc.simulation.trials import Trials
+from fpirhc.simulation.trials import Trials, loop_of
 from fpirhc.task.exogenous import as_known
 from fpirhc.task.problem import Problem
 
@@ -118,7 +117,7 @@ def null_runs(problem: Problem, controller: Controller, runs: NominalRuns | None
 def _run(problem: Problem, model: Problem, controller: Controller) -> Run:
     """The run of the model by the loop of the problem's plant, whose plans are built already."""
     own = model if model.reality is not None else replace(model, plant=problem.plant)
-    return simulator(own, controller, compiled=False).run(seed=0, variant=model)
+    return loop_of(own, controller).run(seed=0, variant=model)
 
 
 def null_problem(problem: Problem, controller: Controller) -> Problem:
@@ -126,7 +125,7 @@ def null_problem(problem: Problem, controller: Controller) -> Problem:
     ready = resolved(problem, controller)
     known = ready.plant_model(problem)
     plant = exactly(problem.plant, known.parameters(problem.plant))
-    sensing = replace(problem.sensing, sensors={})
+    sensing = replace(problem.sensing, sensors={}) if problem.sensing.sensors else problem.sensing
     signals = as_known(problem.plant, known.signals)
     model = replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
     return with_believed_way(shortened(model, CYCLES), ready.deformation)

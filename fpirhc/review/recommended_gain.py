@@ -157,7 +157,7 @@ def _pole_limit(loops: LoopsByGain, sign: float, most: float) -> float | None:
 
 
 def _stable(loops: LoopsByGain, gain: float) -> bool:
-    return all(loops.stable(gain, pair) for pair in (*loops.along(_ALONG), *loops.over_box(_DRAWN)))
+    return loops.all_stable(gain, (*loops.along(_ALONG), *loops.over_box(_DRAWN)))
 
 
 def _with_margins(loops: LoopsByGain, gain: float) -> float:

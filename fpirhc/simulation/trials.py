@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
 from functools import cached_property
 
 from fpirhc.controllers.base import Controller
+from fpirhc.describe import identity
 from fpirhc.simulation.error_pair import ErrorPair, errors_of
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import simulator
+from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.symbolic.latest import Latest
 from fpirhc.task.problem import Problem
 
 
@@ -36,6 +39,19 @@ def harm_in(real: ErrorPair | None, null: ErrorPair) -> str:
     return ""
 
 
+def loop_of(problem: Problem, controller: Controller) -> Simulator:
+    """Return the closed loop for runs of any duration; it is the same one for problems that differ in their times alone."""
+    values = [getattr(problem, field.name) for field in fields(Problem) if field.name not in _TIMES]
+    same = tuple(None if isinstance(value, Mapping) and not value else value for value in values)
+    build = lambda: simulator(problem, controller, compiled=False)  # noqa: E731
+    loop = _LOOPS.of(same, (identity(controller),), build)
+    return build() if loop.remembers else loop
+
+
+_LOOPS: Latest[Simulator] = Latest(8)
+_TIMES = {"duration", "measure_from"}  # of a problem, which are no part of its loop
+
+
 class Trials:
     """Runs beside one controller without adaptation, whose own runs are made once. A plant outside is not run."""
 
@@ -57,11 +73,11 @@ class Trials:
         later = goes_on and 2 * problem.measure_from > cycles * problem.period and problem.foreign is None
         self._later = replace(problem, duration=end) if later else None
         self._model = ModelAsPlant(self.problem, seed=0)
-        self._bare = simulator(self.problem, bare, compiled=False)
+        self._bare = loop_of(self.problem, bare)
 
     @cached_property
     def _plain(self) -> Run:
-        return self._bare.run(seed=0)
+        return self._bare.run(seed=0, variant=self.problem)
 
     @cached_property
     def _plain_later(self) -> Run:
@@ -73,13 +89,13 @@ class Trials:
         Raises:
             FpirhcError: every error that the controller raises about the problem.
         """
-        loop = simulator(self.problem, controller, compiled=False)
+        loop = loop_of(self.problem, controller)
         names = weighed(self.problem, loop.controller)
         model = self._model.behind(loop.controller.deformation)
         null = errors_of(model.problem, (model.run(self._bare), model.run(loop)), names)
         if self.problem.foreign is not None:
             return None, null
-        real = errors_of(self.problem, (self._plain, loop.run(seed=0)), names)
+        real = errors_of(self.problem, (self._plain, loop.run(seed=0, variant=self.problem)), names)
         if self._later is not None and not real.passes:
             real = errors_of(self._later, (self._plain_later, loop.run(seed=0, variant=self._later)), names)
         return real, null

@@ -366,6 +366,20 @@ def test_puma_learns_its_load():
     assert np.abs(run["error"][1500:]).max() < 1.5e-3
 
 
+def test_the_regressor_of_a_plant_is_built_once(monkeypatch):
+    """Checks and blocks of every controller that learns the same parameters of a plant ask for the same one."""
+    problem, built, checked = task(), [], Regressor.__post_init__
+
+    def counted(self):
+        built.append(self)
+        checked(self)
+
+    monkeypatch.setattr(Regressor, "__post_init__", counted)
+    for controller in (AID, NLMS, NLMS_FPI, SLOTINE_LI):
+        compose_controller(problem, controller)
+    assert len(built) == 1
+
+
 # Every combination compiles, and runs compiled as it runs interpreted.
 
 

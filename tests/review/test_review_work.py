@@ -30,6 +30,8 @@ def test_controllers_that_differ_in_their_deformation_share_what_a_review_builds
     fp.review(task.problem, pair, mismatch=0.0, seed=0)
     assert len(plans) == 1  # exact parameters are numbers of the plant, and no other horizon
     assert len(asked) == 2  # without adaptation, and with a map of any gain
-    assert len(loops) <= 7  # with those of the runs: one of the model each, and one of each map that is tried
+    assert (
+        len(loops) <= 6
+    )  # two that are asked, and one for all runs of each map: none, its own, and two that are tried
     assert len(linear) <= 32
     assert len(steps) <= 19_000

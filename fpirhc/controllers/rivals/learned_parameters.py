@@ -23,6 +23,7 @@ from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, pair
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
@@ -47,8 +48,10 @@ class Learning:
     combinations: dict[str, Combination] = field(default_factory=dict)
 
     def regressor(self, problem: Problem) -> Regressor:
-        """Return the plant's regressor for the learned parameters."""
-        return Regressor(problem.plant, tuple(self.bounds), self.combinations)
+        """Return the plant's regressor for the learned parameters; the same one for the same plant."""
+        same, names = (problem.plant, *self.combinations.values()), tuple(self.bounds)
+        build = lambda: Regressor(problem.plant, names, self.combinations)  # noqa: E731
+        return _REGRESSORS.of(same, (names, tuple(self.combinations)), build)
 
     def check(self, problem: Problem, *, inverts: bool) -> None:
         """Raise if plant, bounds, or rule do not fit each other.
@@ -120,6 +123,9 @@ class Learning:
         return Block(
             "learn", Layout(reads), Layout((regressor.signal, believed)), step, Layout((learned, *pairs.memory))
         )
+
+
+_REGRESSORS: Latest[Regressor] = Latest(4)  # checks, blocks and other compositions of a controller ask for the same one
 
 
 def learning_delays() -> list[Delay]:
