@@ -66,15 +66,15 @@ class KnownSignals:
         """Return the signals of `late` more cycles before the last one, remembered under a name."""
         return tuple(m for one in self.reads for m in Queue(late).memory(name, one.elements, one.start))
 
-    def acted(self, s: Signals, late: int, name: str) -> tuple[Expression, dict[str, Expression]]:
-        """Return the parameters of the last cycle, or of `late` cycles before it, and what is remembered.
+    def acted(self, s: Signals, late: int, oldest: int, name: str) -> tuple[Expression, dict[str, Expression]]:
+        """Return the parameters of `late` cycles before the last one, and what is remembered: the signals back to the oldest.
 
         They are the parameters of this cycle, with the signals of that one.
         """
         if not self.places:
             return s.parameters, {}
-        then, remembered = Queue(late).arrived(s, name, getattr(s, ACTED))
-        acted = dict(zip(self.places, ca.vertsplit(then), strict=True))
+        column, remembered = Queue(oldest).column(s, name, getattr(s, ACTED))
+        acted = dict(zip(self.places, ca.vertsplit(Queue(late).delayed(column, len(self.places))), strict=True))
         parameters = ca.vertcat(*(acted.get(k, s.parameters[k]) for k in range(self.plant.parameter.size)))
         return parameters, remembered
 
@@ -153,7 +153,7 @@ class CommandPath:
         queued = self._column.memory(f"{self.owner}_commands", inputs.elements, start)
         lagging = (Signal(f"{self.owner}_actuators", inputs.elements, inputs.units, start),) if self._lags else ()
         counted = (scalar(f"{self.owner}_cycles"),) if self.counts else ()
-        return (*queued, *lagging, *counted, *self._known.memory(self.late, f"{self.owner}_signals"))
+        return (*queued, *lagging, *counted, *self._known.memory(self._oldest, f"{self.owner}_signals"))
 
     def cycles(self, s: Signals) -> Expression:
         """Return the number of cycles so far; it stops where no sample shows the time before the run."""
@@ -176,7 +176,11 @@ class CommandPath:
 
     def parameters(self, s: Signals) -> tuple[Expression, dict[str, Expression]]:
         """Return the model's parameters with the signals from outside that acted, and what is remembered."""
-        return self._known.acted(s, self.late, f"{self.owner}_signals")
+        return self._known.acted(s, self.late, self._oldest, f"{self.owner}_signals")
+
+    def parameters_before(self, s: Signals) -> Expression:
+        """Return the same with the signals that acted one cycle earlier."""
+        return self._known.acted(s, self._oldest, self._oldest, f"{self.owner}_signals")[0]
 
     def _arrived(self, s: Signals, queue: Queue) -> tuple[Expression, dict[str, Expression]]:
         column, remembered = self._column.column(s, f"{self.owner}_commands", getattr(s, self.last.name))
@@ -188,7 +192,12 @@ class CommandPath:
     @cached_property
     def _column(self) -> Queue:
         """How late the oldest commands are on which an interpolated sample depends."""
-        return self.inputs.later(self.late + 1) if self.fraction else self.queue
+        return self.inputs.later(self._oldest)
+
+    @property
+    def _oldest(self) -> int:
+        """Whole cycles by which the older of two interpolated samples is late."""
+        return self.late + 1 if self.fraction else self.late
 
     @property
     def _lags(self) -> bool:

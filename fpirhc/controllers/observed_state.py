@@ -35,7 +35,6 @@ from fpirhc.symbolic.gap import GAP
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import Queue
-from fpirhc.task.exogenous import known_places
 from fpirhc.task.problem import Problem, nominal_start
 
 
@@ -146,6 +145,8 @@ class Believing:
             whole = cycles > path.late + 1.5
             mean = (1 - path.fraction) * command + path.fraction * path.acted_before(s)
             command, moves = ca.if_else(whole, mean, command), ca.if_else(whole, 1, (1 - path.fraction) * moves)
+            mixed = (1 - path.fraction) * parameters + path.fraction * path.parameters_before(s)
+            parameters = ca.if_else(whole, mixed, parameters) if signals else parameters
         evidence = Evidence(shown, {}, command, parameters, moves, cycles > path.late - 0.5)
         return evidence, {**commands, **signals}
 
@@ -185,9 +186,9 @@ def sample_path(problem: Problem) -> CommandPath:
 
         z_k = (1 - phi) x_{k-d} + phi x_{k-d-1},
 
-    and moves as the plant does with the mean of the commands that acted, (1 - phi) u_{k-d-1} + phi u_{k-d-2}. For a linear plant
-    this is exact; else the error is of second order in the cycle, as that of the interpolation. The first sample that moves is a
-    mean with the start, so it moves by 1 - phi of a cycle.
+    and moves as the plant does with the mean of the commands that acted, (1 - phi) u_{k-d-1} + phi u_{k-d-2}, and
+    of the signals from outside. For a linear plant this is exact; else the error is of second order in the cycle, as that of the
+    interpolation. The first sample that moves is a mean with the start, so it moves by 1 - phi of a cycle.
     """
     inputs, period = problem.plant.input, problem.period
     last = Signal("_commanded", inputs.elements, inputs.units, tuple(map(float, problem.inputs_before)))
@@ -259,9 +260,8 @@ def check_believed(problem: Problem, controller: Controller) -> None:
     """Raise if a controller cannot be given believed states, or the observer cannot be right.
 
     Raises:
-        NotSupported: an adaptive controller whose response nobody measures; a measurement that is late by a fraction of a cycle
-            beside signals from outside; a model with other parameters than the problem's; errors that are neither observed nor
-            decay.
+        NotSupported: an adaptive controller whose response nobody measures; a model with other parameters than the problem's;
+            errors that are neither observed nor decay.
     """
     sensing, plant = problem.sensing, problem.plant
     if sensing.observer is None:
@@ -273,7 +273,6 @@ def check_believed(problem: Problem, controller: Controller) -> None:
             "the model's own response is the request, from which nothing can be learned. Measure it, or choose an estimator of "
             f"what is measured ({', '.join(sensing.measures(plant))})"
         )
-    _check_late(problem)
     model = controller.plant_model(problem).plant
     if model.parameter.elements != plant.parameter.elements:
         raise NotSupported(
@@ -281,16 +280,6 @@ def check_believed(problem: Problem, controller: Controller) -> None:
             "problem's; leave the observer out, or give both the same parameters"
         )
     check_observed(problem)
-
-
-def _check_late(problem: Problem) -> None:
-    """Raise where the signals of the time of the samples are not known."""
-    if sample_path(problem).fraction and known_places(problem.plant, problem.signals):
-        late, unit = problem.dead_time.measurement, problem.time_unit
-        raise NotSupported(
-            f"believed states beside signals from outside need a measurement that is late by whole cycles, and {late:g} {unit} are "
-            f"{late / problem.period:.4g} cycles; use {sample_path(problem).late * problem.period:g} {unit}"
-        )
 
 
 def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:

@@ -15,7 +15,6 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported
 from fpirhc.horizon.nominal import known_on_reference, nominal_run
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.block import Block
@@ -54,12 +53,7 @@ def preview_of(problem: Problem) -> ca.Function | None:
     """Function (own signals) -> (states, responses) at the nodes of the horizon; None without own signals."""
     if problem.horizon is None:
         return None
-    preview = problem.reference.preview(problem.plant, problem.horizon.stages, problem.horizon.step)
-    if preview is not None and problem.horizon.lengths:
-        raise NotSupported(
-            "Horizon(lengths=...) needs a reference that is known ahead; leave lengths out with set-points"
-        )
-    return preview
+    return problem.reference.preview(problem.plant, problem.horizon.nodes)
 
 
 def with_reference(problem: Problem, blocks: Sequence[Block]) -> list[Block]:

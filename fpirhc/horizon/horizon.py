@@ -26,8 +26,8 @@ class Horizon(Checked):
             map has none: a stage is a whole number of its steps.
         terminal: names of states that must meet the reference at the end of the horizon.
         lengths: of the stages, as multiples of `step`, which is that of the first one: fine stages first. One number of at least
-            1 for every stage; empty: all stages are equal. Every stage counts with its length in the cost, and limits and costs of
-            input changes count with the time since the change before. Prices of limits count every node alike.
+            1 for every stage, a whole one on a map; empty: all stages are equal. Every stage counts with its length in the cost,
+            limits and costs of input changes with the time since the change before. Prices of limits count every node alike.
         blocks: lengths of blocks of stages over which the inputs are held (move blocking); they add up to the stages. Empty: every
             stage has inputs of its own.
         margins: by name of a state, the distances by which a plan stays inside the state's limits after stages 1 ... N, in the

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType, SimpleNamespace
-from typing import cast
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidName, InvalidProblem, Mistakes, NotSupported
+from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
 from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.constraint_states import (
     ConstraintState,
@@ -194,7 +193,8 @@ def _stage_expressions(
     try:
         advance = _advance(plant, horizon)
         if horizon.lengths:
-            x_next = _stretched(plant, horizon)(x, applied, ca.vertcat(view.parameters.vector, length))
+            stretched = horizon.discretisation.stretched(plant, horizon.step, max(horizon.lengths))
+            x_next = stretched(x, applied, view.parameters.vector, length)
         else:
             x_next = advance(x, applied, view.parameters.vector)
         written = _written(plant, horizon, limits, limited_view, x_next, data)
@@ -337,24 +337,6 @@ def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
     step = horizon.discretisation.step(plant, horizon.step)
     x, u, p = plant.symbols()
     return ca.Function("fpirhc_advance", [x, u, p], [step(x, u, p, ca.SX.zeros(len(plant.names)))])
-
-
-def _stretched(plant: Plant, horizon: Horizon) -> ca.Function:
-    """Function (x, u, (p, length)) -> x after so many steps at once: f times the length, over one step."""
-    if plant.step is not None:
-        raise NotSupported(
-            "Horizon(lengths=...): the stages of a map are whole steps of it, all equal; leave lengths out"
-        )
-    rate = plant.equations.forced_rate
-    x, u, p, w = (ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
-    p_length = ca.vertcat(p, ca.SX.sym("length"))
-    slow = ca.Function(
-        "fpirhc_stretched", [x, u, p_length, w], [p_length[-1] * rate(x, u, p, w)], ["x", "u", "p", "w"], ["dx"]
-    )
-    step = horizon.discretisation.step(
-        cast(Plant, SimpleNamespace(equations=SimpleNamespace(forced_rate=slow))), horizon.step
-    )
-    return ca.Function("fpirhc_advance", [x, u, p_length], [step(x, u, p_length, ca.SX.zeros(w.numel()))])
 
 
 def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca.Function) -> Linearisation:

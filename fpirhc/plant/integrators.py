@@ -11,6 +11,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from types import SimpleNamespace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -49,6 +51,23 @@ class Integrator(Checked, ABC):
     @abstractmethod
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
+
+    def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:  # noqa: ARG002
+        """Function (state, input, parameters, length) -> state after so many steps at once: f times the length, over one step.
+
+        Args:
+            plant: the plant.
+            step: time of one step.
+            longest: largest length.
+        """
+        rate, length = plant.equations.forced_rate, ca.SX.sym("length")
+        x, u, p, w = _symbols(rate)
+        p_length = ca.vertcat(p, length)
+        slow = ca.Function(
+            "fpirhc_slow", [x, u, p_length, w], [length * rate(x, u, p, w)], ["x", "u", "p", "w"], ["dx"]
+        )
+        one = self.step(cast(Plant, SimpleNamespace(equations=SimpleNamespace(forced_rate=slow))), step)
+        return ca.Function("fpirhc_stretched", [x, u, p, length], [one(x, u, p_length, ca.SX.zeros(w.numel()))])
 
 
 @dataclass(frozen=True)
@@ -155,6 +174,15 @@ class MapSteps(Integrator):
     def steps_maps(self) -> bool:
         """Whether it moves maps: it does."""
         return True
+
+    def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:
+        """Function (state, input, parameters, length) -> state after a whole number of steps, up to the longest."""
+        (x, u, p), length = plant.symbols(), ca.SX.sym("length")
+        one, after = self.step(plant, step), x
+        for k in range(round(longest)):
+            later = one(after, u, p, ca.SX.zeros(len(plant.names)))
+            after = ca.if_else(length > k, later, after) if k else later
+        return ca.Function("fpirhc_stretched", [x, u, p, length], [after])
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period`, a whole number of the plant's cycles."""

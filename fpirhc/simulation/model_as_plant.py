@@ -11,7 +11,6 @@ from dataclasses import replace
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Mirror
-from fpirhc.errors import NotSupported
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.run import Run
@@ -57,12 +56,10 @@ def _with_lag(problem: Problem, mirror: Mirror) -> Problem:
 
 
 def _behind(problem: Problem, lags: Sequence[float]) -> Problem:
-    if not any(lags):
+    plant = problem.plant
+    if not any(lags) or plant.step is not None or plant.algebraic is not None:
         return problem
-    try:
-        plant = behind_actuators(problem.plant, lags)
-    except NotSupported:
-        return problem
+    plant = behind_actuators(plant, lags)
     finer = problem.integrator.finer(math.ceil(problem.period / min(t for t in lags if t)))
     return replace(problem, reality=Reality(plant, integrator=finer or problem.integrator))
 
@@ -120,12 +117,7 @@ def behind_actuators(plant: Plant, lags: Sequence[float]) -> Plant:
     Args:
         plant: given by differential equations, without algebraic states.
         lags: time constant of every input's actuator, in the plant's unit of time; 0: the input acts at once.
-
-    Raises:
-        NotSupported: a map, or a plant with algebraic states.
     """
-    if plant.step is not None or plant.algebraic is not None:
-        raise NotSupported("a lag before the inputs of a map, or of a plant with algebraic states, is not covered")
     taus = {name: tau for name, tau in zip(plant.inputs, lags, strict=True) if tau > 0}
     acting = {name: _free(f"{name}_acting", plant) for name in taus}
 

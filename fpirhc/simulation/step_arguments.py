@@ -54,8 +54,8 @@ def set_point_table(problem: Problem, setpoints: Setpoints | None, cycles: int) 
         return np.zeros((cycles, 0))
     names = list(problem.plant.chains)
     windows = signals[0].size // len(names)
-    step = problem.horizon.step if problem.horizon is not None else 0.0
-    times = (np.arange(cycles) * problem.period)[:, None] + step * np.arange(windows)
+    nodes = problem.horizon.nodes[:windows] if problem.horizon is not None else 0.0
+    times = (np.arange(cycles) * problem.period)[:, None] + nodes
     columns = [_values(problem, name, steps[name], times) for name in names]
     check_values(problem.plant, problem.limits, {n: c.ravel().tolist() for n, c in zip(names, columns, strict=True)})
     return np.stack(columns, axis=2).reshape(cycles, -1)

@@ -63,6 +63,8 @@ def settled_maps(
         if horizon is not None:
             discretisation = _steps("horizon: discretisation", horizon.discretisation, mistakes)
             settled["horizon"] = replace(horizon, discretisation=discretisation)
+            if any(length % 1 for length in horizon.lengths):
+                mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {horizon.lengths}")
         if sensing.estimator.measures_all and not _instant(plant):
             settled["sensing"] = replace(sensing, estimator=StepDifference())
     elif integrator.steps_maps:

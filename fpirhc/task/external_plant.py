@@ -17,7 +17,7 @@ import time as wall
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, TypeVar
+from typing import NoReturn, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -142,6 +142,14 @@ class ExternalPlant(Checked):
                 "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare without scenarios"
             )
         return replace(self, parameters=with_exact_values(self.parameters, exact))
+
+    def as_model(self, model: Plant) -> NoReturn:  # noqa: ARG002
+        """Raise: it has no equations.
+
+        Raises:
+            NotSupported: always.
+        """
+        raise NotSupported("a foreign reality has no equations that could be the exact model; leave ExactModel out")
 
     @property
     def drawn(self) -> ExternalPlant:

@@ -117,9 +117,9 @@ class Reference(Checked, ABC):
         del plant, stages
         return self.derivatives(coordinate, order)
 
-    def preview(self, plant: Plant, stages: int, step: float) -> ca.Function | None:
-        """Function (own signals) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes; None without own signals."""
-        del plant, stages, step
+    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
+        """Function (own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from now on; None without own signals."""
+        del plant, nodes
         return None
 
     def rests(self, until: float) -> bool:

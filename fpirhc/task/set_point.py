@@ -112,16 +112,18 @@ class FilterBank:
         whole = self._chains(z, points[:, 0], rate)[list(self.orders).index(coordinate)]
         return ca.Function("fpirhc_reference_chain", [ca.SX.sym("t"), own], [ca.densify(whole[: order + 1])])
 
-    def preview(self, stages: int, step: float) -> ca.Function:
+    def preview(self, times: np.ndarray) -> ca.Function:
         """Function (own signal) -> (states (nx, N + 1), responses (n, N + 1)): free motion, the set-points of every node held."""
         own = ca.SX.sym("own", self.own.size)
         z, points, rate = self._parts(own)
-        phis = [transition(rate, step, order) for order in self.orders.values()]
+        lengths = np.round(np.diff(times) / times[1], 12)  # equal stages are equal to the last bit
+        phis = {n: [transition(rate, times[1] * n, order) for order in self.orders.values()] for n in lengths.tolist()}
         columns = []
-        for node in range(stages + 1):
+        for node in range(len(times)):
             held = points[:, min(node, self.nodes - 1)]
             columns.append(arranged(self.plant, self._chains(z, held, rate)))
-            z = [_after_motion(phi, z[k], held[k]) for k, phi in enumerate(phis)]
+            stage = phis[lengths[min(node, len(lengths) - 1)]]
+            z = [_after_motion(phi, z[k], held[k]) for k, phi in enumerate(stage)]
         tables = [ca.densify(ca.horzcat(*parts)) for parts in zip(*columns, strict=True)]
         return ca.Function("fpirhc_reference_preview", [own], tables, ["own"], ["states", "responses"])
 
@@ -337,9 +339,9 @@ class Setpoint(Reference):
             )
         return self._bank(plant, stages).chain(coordinate, order)
 
-    def preview(self, plant: Plant, stages: int, step: float) -> ca.Function:
+    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
         """Function (own signal) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
-        return self._bank(plant, stages).preview(stages, step)
+        return self._bank(plant, len(nodes) - 1).preview(nodes)
 
     def rests(self, until: float) -> bool:
         """Return whether no set-point changes up to some time, and the filter begins at the first ones."""

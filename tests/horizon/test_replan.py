@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from chains import chain
 from plants import pendulum
+from scipy.optimize import minimize
 
 import fpirhc as fp
 from fpirhc.controllers.contract import with_optimiser
@@ -174,13 +175,50 @@ def test_wrong_lengths_are_named(lengths):
         fp.Horizon(STAGES, STEP, lengths=lengths)
 
 
-def test_stages_of_a_map_are_equal():
-    problem = fp.load_problem("fishery").problem
-    assert problem.horizon is not None
-    lengths = tuple(1.0 + k for k in range(problem.horizon.stages))
-    problem = replace(problem, horizon=replace(problem.horizon, lengths=lengths))
-    with pytest.raises(FpirhcError, match="the stages of a map are whole steps of it"):
-        planning().check(problem)
+def pond(lengths):
+    """x+ = x + 0.3 (u - x |x|) from 0.2 along 1 + 0.4 sin(0.5 t), with steps of 1."""
+    plant = fp.Plant.discrete(
+        states={"x": "m"},
+        inputs={"u": "m/s"},
+        parameters={"a": fp.Parameter(0.3, 0.3, "1")},
+        next=lambda x, u, p: {"x": x.x + p.a * (u.u - x.x * ca.fabs(x.x))},
+        step=1.0,
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"x": 1 + 0.4 * ca.sin(0.5 * t)}),
+        start={"x": 0.2},
+        period=1.0,
+        duration=6.0,
+        limits=fp.Limits(inputs={"u": (-3.0, 3.0)}),
+        horizon=fp.Horizon(len(lengths), 1.0, lengths=lengths),
+        cost=fp.Quadratic(states={"x": 2.0}, effort={"u": 0.1}),
+    )
+
+
+@pytest.mark.parametrize("optimiser", [fp.FixedPoint(iterations=200, tolerance=1e-10), fp.Ipopt(tolerance=1e-9)])
+def test_long_stages_of_a_map_hold_the_input_over_whole_steps(optimiser):
+    """The first plan is the minimum of the cost over whole steps, by a general optimiser on plain arithmetic."""
+    lengths = (1.0, 2.0, 1.0, 3.0)
+    problem = pond(lengths)
+    run = fp.simulate(problem, planning(optimiser), seed=0, compiled=False)
+
+    def cost(inputs):
+        x, t, value = 0.2, 0.0, 0.0
+        for u, length in zip(inputs, lengths, strict=True):
+            value += length * (2.0 * (x - 1 - 0.4 * np.sin(0.5 * t)) ** 2 + 0.1 * u**2)
+            for _ in range(int(length)):
+                x += 0.3 * (u - x * abs(x))
+            t += length
+        return value + lengths[-1] * 2.0 * (x - 1 - 0.4 * np.sin(0.5 * t)) ** 2
+
+    best = minimize(cost, np.ones(4), bounds=[(-3.0, 3.0)] * 4, options={"ftol": 1e-15, "gtol": 1e-10})
+    assert run["command"][0, 0] == pytest.approx(best.x[0], abs=1e-4)
+
+
+def test_stages_of_a_map_are_whole_steps():
+    with pytest.raises(FpirhcError, match=r"the stages of a map are whole steps of it, got lengths \(1.0, 1.5\)"):
+        pond((1.0, 1.5))
 
 
 @pytest.mark.parametrize("name", sorted(OPTIMISERS.keys() - {"full space"}))  # which needs thousands of iterations

@@ -63,9 +63,8 @@ def test_inputs_act_through_their_lags():
 
 def test_a_map_has_no_lag():
     """It has no time between two steps."""
-    yearly = fp.load_problem(str(GALLERY / "fishery.py")).problem.plant
-    with pytest.raises(fp.errors.NotSupported, match="of a map"):
-        behind_actuators(yearly, (1.0,))
+    yearly = fp.load_problem(str(GALLERY / "fishery.py")).problem
+    assert with_believed_way(yearly, fp.ModelReferenced(MAP, lag=1.0)) is yearly
 
 
 @pytest.mark.parametrize("reality", [None, fp.Reality(behind_actuators(plant(1.0), (LAG,)))])

@@ -131,6 +131,21 @@ def test_steps_within_a_run_equal_the_trajectory(controller):
         np.testing.assert_allclose(ours[signal], theirs[signal], rtol=0, atol=1e-11 if signal == "desired" else 1e-12)
 
 
+@pytest.mark.parametrize("controller", ["RHC", "RHC+FPI"])
+def test_stages_of_several_lengths_see_the_motion_of_the_filter(controller):
+    """The filter's free motion at uneven nodes is its closed form, so plans are those of the trajectory."""
+    starts, steps = {"q1": 2.2, "q2": 5.4}, {"q1": [(0.0, 2.5)], "q2": [(0.0, 5.0)]}
+    known = closed_form(10.0, 2, starts, {"q1": [(0.0, 2.2), (0.0, 2.5)], "q2": [(0.0, 5.4), (0.0, 5.0)]})
+    runs = []
+    for problem in (two_mass(values=steps, start=starts), on(TWO_MASS.problem, known)):
+        lengths = tuple(1.0 + 0.5 * (k // 3) for k in range(problem.horizon.stages))
+        task = replace(problem, horizon=replace(problem.horizon, lengths=lengths), duration=0.1)
+        runs.append(fp.simulate(task, TWO_MASS.controllers[controller], seed=0, compiled=False))
+    ours, theirs = runs
+    assert np.abs(ours["reference"] - ours["reference"][0]).max() > 0.05
+    np.testing.assert_allclose(ours["planned"], theirs["planned"], rtol=0, atol=1e-8)
+
+
 def test_a_horizon_knows_announced_set_points_and_no_others():
     """Announced steps at nodes of the horizon equal the trajectory; unannounced ones move nothing before their time."""
     controller, starts = TWO_MASS.controllers["RHC+FPI"], {"q1": 2.2, "q2": 5.4}

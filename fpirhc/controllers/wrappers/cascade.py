@@ -121,17 +121,16 @@ class Shifted(Reference):
             values = values + unit * parts[-2][plant.controlled_names.index(coordinate)]
         return ca.Function("fpirhc_target_chain", [t, own], [values])
 
-    def preview(self, plant: Plant, stages: int, step: float) -> ca.Function:
+    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
         """Function (own signal) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
-        _, own, parts, places = self._symbols(plant, stages)
-        known = self.reference.preview(plant, stages, step)
+        _, own, parts, places = self._symbols(plant, len(nodes) - 1)
+        known = self.reference.preview(plant, nodes)
         if known is not None:
             states, responses = known(*parts[:-2])
         else:
-            times = [parts[-1] + step * node for node in range(stages + 1)]
-            nodes = [self.reference.function(plant)(time) for time in times]
-            states, responses = (ca.horzcat(*columns) for columns in zip(*nodes, strict=True))
-        shifted = states + ca.repmat(places @ parts[-2], 1, stages + 1)
+            at_nodes = [self.reference.function(plant)(parts[-1] + float(time)) for time in nodes]
+            states, responses = (ca.horzcat(*columns) for columns in zip(*at_nodes, strict=True))
+        shifted = states + ca.repmat(places @ parts[-2], 1, len(nodes))
         return ca.Function("fpirhc_target_preview", [own], [shifted, responses], ["own"], ["states", "responses"])
 
     def rests(self, until: float) -> bool:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.latest import Latest
@@ -46,9 +45,7 @@ class ExactModel(Controller):
 
     def plant_model(self, problem: Problem) -> PlantModel:
         """Return the plant that a run moves, its exact parameters, and the signals as they really are."""
-        if problem.foreign is not None:
-            raise NotSupported("a foreign reality has no equations that could be the exact model; leave ExactModel out")
-        plant = problem.truth.as_model(problem.plant)
+        plant = problem.moves.as_model(problem.plant)
         return PlantModel(plant, really_known(problem.signals), exact=True)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
