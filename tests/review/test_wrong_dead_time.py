@@ -19,7 +19,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_at
 from fpirhc.review.questions.convergence import box_converges
-from fpirhc.review.questions.dead_time import bears_wrong_dead_time, pays_when_late
+from fpirhc.review.questions.dead_time import bears_latency, bears_wrong_dead_time, pays_when_late
 from fpirhc.review.review import predict
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING
@@ -219,6 +219,40 @@ def test_no_question_without_dead_time():
         one = case(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), form))
         assert (bears_wrong_dead_time(one) is not None) == applies
         assert pays_when_late(one) is None
+
+
+@pytest.mark.parametrize("gain", [-0.8, -1.6, -2.4])
+def test_the_latency_that_a_loop_bears_and_the_gain_that_bears_three_cycles(gain):
+    """Runs are stable up to the latency of the answer and not one cycle beyond; with the share of the gain they bear three."""
+    problem = replace(mass(0), duration=20.0, reference=fp.Trajectory(lambda t: {"q": 0 * t}), start={"q": 0.1})
+    law = fp.ComputedTorque(fp.Exponential(rate=RATE))
+    adaptive = law.with_deformation(fp.ModelReferenced(fp.Affine(gain=gain)))
+    answer = bears_latency(case(problem, adaptive))
+    assert answer is not None
+    borne, share = int(answer.numbers["borne"]), answer.numbers["share"]
+    assert answer.verdict == "unknown"
+    assert f"{share:.2g} times the gain bears them" in answer.change
+
+    def most(controller: Controller) -> int:
+        late = (
+            fp.simulate(replace(problem, dead_time=fp.DeadTime({"u": k * PERIOD})), controller, seed=0)
+            for k in range(1, 6)
+        )
+        return next((k for k, run in enumerate(late) if run.stop is not None or abs(run["error.q"][-1]) > 1e-3), 5)
+
+    fixed = replace(adaptive, deformation=fp.ModelReferenced(fp.Affine(gain=gain), cycles=0.0))
+    assert most(fixed) == borne < 3
+    assert most(replace(fixed, deformation=fp.ModelReferenced(fp.Affine(gain=share * gain), cycles=0.0))) >= 3
+
+
+def test_latency_is_asked_where_none_is_stated_and_something_adapts():
+    law = fp.ComputedTorque(fp.Exponential(rate=RATE))
+    gentle = law.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.2)))
+    assert bears_latency(case(mass(20), told(fp.Increment(MAP, cycles=20)))) is None
+    assert bears_latency(case(mass(0), law)) is None
+    answer = bears_latency(case(mass(0), gentle))
+    assert answer is not None
+    assert (answer.verdict, answer.numbers["borne"]) == ("yes", 3.0)
 
 
 def test_scenarios_draw_the_dead_time():

@@ -1,4 +1,4 @@
-"""Does the loop bear a wrong dead time? By a cycle, as its poles say, and by a tenth, as runs say.
+"""Does the loop bear a wrong dead time? By a cycle, as its poles say, by a tenth, as runs say, and one that nobody stated.
 
 A pairing without a leak couples its interleaved iterations as soon as the dead time is wrong: high modes grow at any gain. The true
 dead time is made longer and shorter by 1, 2, 5, ... cycles, for all inputs together and, where they differ, for each alone.
@@ -89,6 +89,53 @@ def _margin_below_one(case: Case) -> float:
     return min(delays)
 
 
+UNSTATED = "Does it bear a latency of three cycles that nobody stated?"
+_LATENCY = 3  # cycles: a link, a driver, a filter
+_SHARES = np.geomspace(0.95, 0.02, 24)  # of the gain
+
+
+def bears_latency(case: Case) -> Answer | None:
+    """Return up to how many cycles of latency the loop is stable, and with which gain up to three.
+
+    None where a dead time is stated or believed, without adaptation, and where the loop is not stable without latency.
+    """
+    deformation, loops = case.controller.deformation, case.loops
+    pairing = deformation.iteration.pairing
+    late = is_late(case.problem) or (pairing is not None and pairing.cycles != 0)
+    if late or not deformation.adapts or not loops.loops or loops.radii.max() >= 1:
+        return None
+    inputs = range(len(case.problem.plant.inputs))
+    radii = [_radius(case, [*inputs], cycles) for cycles in range(1, _LATENCY + 1)]
+    borne = next((k for k, radius in enumerate(radii) if radius >= 1), _LATENCY)
+    numbers = {"borne": float(borne)}
+    if borne == _LATENCY:
+        text = f"{_LATENCY} cycles later, the slowest mode is multiplied by {radii[-1]:.6g} per cycle"
+        return Answer(UNSTATED, Verdict.YES, text, "", numbers)
+    later = "1 cycle" if borne == 0 else f"{borne + 1} cycles"
+    text = f"{later} later, the slowest mode is multiplied by {radii[borne]:.6g} per cycle; it bears {borne}"
+    share = _share_that_bears(case)
+    measure = "measure the latency and state it, Problem(dead_time=...)"
+    if share is None:
+        lower = "Lower the gain" if case.by_gain is None else "No lower gain bears them"
+        return Answer(UNSTATED, Verdict.UNKNOWN, text, f"{lower}; {measure}.", numbers)
+    change = f"{share:.2g} times the gain bears them, in this loop of the model; or {measure}."
+    return Answer(UNSTATED, Verdict.UNKNOWN, text, change, {**numbers, "share": share})
+
+
+def _share_that_bears(case: Case) -> float | None:
+    """The largest share of the gain with which the loop is stable up to the latency; None where none is known."""
+    by_gain, inputs = case.by_gain, range(len(case.problem.plant.inputs))
+    if by_gain is None:
+        return None
+    pairs = by_gain.along(len(case.loops.places))
+    for share in map(float, _SHARES):
+        loops = [by_gain.at(share * by_gain.gains[1], pair) for pair in pairs]
+        later = (one.delayed([*inputs], k) for one in loops for k in range(1, _LATENCY + 1))
+        if all(one.radius < 1 for one in (*loops, *later)):
+            return share
+    return None
+
+
 PAYS_LATE = "Does adaptation pay with a dead time that is wrong by a tenth?"
 _PERCENT = 10.0
 
@@ -132,5 +179,6 @@ def _numbers(one: ErrorPair) -> dict[str, float]:
 
 QUESTIONS = (
     ControllerQuestion(bears_wrong_dead_time, WRONG_DEAD_TIME, order=50, of_targets=True),
+    ControllerQuestion(bears_latency, UNSTATED, order=52),
     ControllerQuestion(pays_when_late, PAYS_LATE, order=51, of_targets=True),
 )
