@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fpirhc.conformance.controller_facts import FACTS
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
-from fpirhc.conformance.loops import Trial, anything
+from fpirhc.conformance.loops import REPLAYED, Trial, anything
 from fpirhc.conformance.loops import two_masses as two_masses
 from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked, resolved, with_optimiser
@@ -125,7 +125,7 @@ def same_command_everywhere(trial: Trial, generator: np.random.Generator) -> Non
             steppers["compiled C"] = compiled
     for what, stepper in steppers.items():
         commands = _replayed(stepper, run)
-        missed = np.abs(commands - run["command"]).max(axis=1)
+        missed = np.abs(commands - run["command"][: len(commands)]).max(axis=1)
         worst = int(np.argmax(np.nan_to_num(missed, nan=np.inf)))
         hold(
             within(missed, _SAME * scale),
@@ -134,8 +134,9 @@ def same_command_everywhere(trial: Trial, generator: np.random.Generator) -> Non
 
 
 def _replayed(stepper: Stepper, run: Run) -> Array:
-    memory, commands, measured = stepper.start(), np.empty_like(run["command"]), raw_measurements(run)
-    for k in range(run.cycles):
+    memory, measured = stepper.start(), raw_measurements(run)
+    commands = np.empty_like(run["command"][:REPLAYED])
+    for k in range(len(commands)):
         commands[k], memory = stepper.step_measured(float(run.time[k]), measured[k], memory)
     return commands
 

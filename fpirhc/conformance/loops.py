@@ -33,6 +33,8 @@ from fpirhc.task.reference import Trajectory
 
 Array = npt.NDArray[Any]
 
+REPLAYED = 400  # cycles of a run, at most, that are given to a controller again
+
 
 def two_masses() -> Problem:
     """Return two masses between springs with a model that is wrong in mass and stiffness, for 2 s."""
@@ -159,9 +161,9 @@ class Replay:
     run: Run
 
     def cycles(self) -> Iterator[Cycle]:
-        """Yield the cycles of the run, each from the memory of the one before."""
+        """Yield the first cycles of the run, each from the memory of the one before."""
         memory = self.memory
-        for k in range(self.run.cycles):
+        for k in range(min(self.run.cycles, REPLAYED)):
             cycle = self.cycle(k, memory)
             memory = cycle.memory
             yield cycle
@@ -173,7 +175,7 @@ class Replay:
 
     @cached_property
     def commands(self) -> Array:
-        """The commands of all cycles, a row each."""
+        """The commands of the first cycles, a row each."""
         return np.array([cycle["command"] for cycle in self.cycles()])
 
     def cycle(self, k: int, memory: Array, **instead: Array) -> Cycle:

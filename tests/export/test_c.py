@@ -24,7 +24,7 @@ from fpirhc.symbolic.native import find_compiler
 COMPILERS = [path for path in (shutil.which("gcc"), shutil.which("clang")) if path]
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
-SANITIZED = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SANITIZED = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 CASES = {
     "torque": ("two_mass", "CTC+FPI (eq 6)"),
     "plan": ("two_mass", "RHC+FPI"),
