@@ -65,8 +65,9 @@ def deformation_acts(trial: Trial, generator: np.random.Generator) -> None:  # n
     )
     hold(
         any(differ),
-        f"with half of the effective gain {deformation.effective_gain():.3g} its commands are the same in "
-        f"{len(trial.replay.commands)} cycles of a run with a wrong model; use the deformation, closing_blocks(problem, self.deformation)",
+        f"with half of the effective gain {deformation.effective_gain():.3g} its commands are the same in the first "
+        f"{len(trial.replay.commands)} cycles of a run with a wrong model; use the deformation, "
+        "closing_blocks(problem, self.deformation)",
     )
 
 
