@@ -219,9 +219,9 @@ class Variant:
             return elsewhere.with_exact(exact * (1 + self.nudge)) if exact.size else elsewhere
         if self.finer > 1:
             finer = problem.real_integrator.finer(self.finer) or problem.real_integrator
-            if problem.symbolic_reality is not None:
-                return replace(problem, reality=replace(problem.symbolic_reality, integrator=finer))
-            return replace(problem, integrator=finer)
+            moved = problem.symbolic_reality
+            changes = {"integrator": finer} if moved is None else {"reality": replace(moved, integrator=finer)}
+            return replace(problem, **changes)
         return problem
 
 

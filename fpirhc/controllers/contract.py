@@ -27,7 +27,6 @@ from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked, former_members, unnamed_inner
 from fpirhc.fields.given import described
 from fpirhc.horizon.cost import Cost
-from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
@@ -39,6 +38,9 @@ from fpirhc.symbolic.queue import every
 from fpirhc.task.exogenous import Exogenous
 from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
 from fpirhc.tracking.base import Tracking
+
+if TYPE_CHECKING:
+    from fpirhc.optimisers.base import Optimiser
 
 FORMER = {  # members of earlier versions
     "around": "hold the inner controller in a field",

@@ -73,7 +73,7 @@ class Extra:
 def real_points(grid: ReviewGrid) -> tuple[RealPoint, ...]:
     """Return some points of the reference at which the reality settles, or moves along; none where it nowhere does."""
     assert grid.real is not None
-    reality, model = _reality(grid.real), grid.problem.plant
+    reality, model = grid.real.truth, grid.problem.plant
     known = reality.shared(model)
     carried = _carrying(reality, model) if len(known) < model.state.size else None
     solve = _settling(grid.real, [k for k in range(reality.plant.state.size) if k not in known.values()])
@@ -109,7 +109,7 @@ def real_loops(grid: ReviewGrid, controller: Controller) -> list[LinearLoop]:
 def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Extra:
     """Return the poles of the reality that it has beyond the settled one, and its response Jacobian below them, at a point."""
     assert grid.real is not None
-    reality, model = _reality(grid.real), grid.problem.plant
+    reality, model = grid.real.truth, grid.problem.plant
     plant = reality.plant
     x, u, p = plant.symbols()
     calm = ca.SX.zeros(len(plant.names))
@@ -131,7 +131,7 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
 
 def _settling(problem: Problem, free: list[int]) -> Settling:
     """Function (state, input, response) -> settled state and the input that gives the response, or None."""
-    reality, model = _reality(problem), problem.plant
+    reality, model = problem.truth, problem.plant
     plant = reality.plant
     x, u, p = plant.symbols()
     calm = ca.SX.zeros(len(plant.names))
@@ -166,11 +166,6 @@ def _beyond(every: np.ndarray, settled: np.ndarray) -> np.ndarray:
     paired, _ = linear_sum_assignment(np.abs(every[:, None] - settled[None, :]))
     rest = np.delete(every, paired)
     return rest[np.abs(rest) > _MOVES * max(1.0, float(np.abs(every).max(initial=0.0)))]
-
-
-def _reality(problem: Problem) -> Reality:
-    assert problem.symbolic_reality is not None
-    return problem.symbolic_reality
 
 
 def _carrying(reality: Reality, model: Plant) -> Carrying | None:

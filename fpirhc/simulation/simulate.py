@@ -166,16 +166,14 @@ def simulator(
     long = problem.cycles * (problem.horizon.stages if problem.horizon is not None else 1) > _SHORT_RUN
     backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
     if compiled or (compiled is None and long):
-        calls = CHUNK if problem.foreign is None else 0
+        calls = 0 if problem.foreign else CHUNK
         backend = native(loop.function, flags, required=bool(live), calls=calls)
-    function = backend.function if backend.compiled else _chained(problem, loop)
+    function = backend.function if backend.compiled or problem.foreign else _chained(loop)
     return Simulator(problem, ready, loop, Evaluator(function), backend.compiled, backend.reason, settings)
 
 
-def _chained(problem: Problem, loop: Composite) -> ca.Function:
-    """The loop over `SHORT` cycles; over one beside a foreign reality, which is called in every cycle."""
-    if problem.foreign is not None:
-        return loop.function
+def _chained(loop: Composite) -> ca.Function:
+    """The loop over `SHORT` cycles."""
     return loop.function.mapaccum(f"{loop.function.name()}_run", SHORT, {"base": _CHAIN})
 
 

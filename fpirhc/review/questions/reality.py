@@ -10,6 +10,7 @@ import numpy as np
 
 from fpirhc.contraction.lag import damped_product, resonant_limit
 from fpirhc.controllers.contract import without_deformation
+from fpirhc.deformation.base import pairs_lag
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.question import Case, ControllerQuestion
@@ -33,11 +34,9 @@ def real_pair_converges(case: Case) -> Answer | None:
     numbers = {"radius": adapted, "bare_radius": bare}
     if adapted < 1:
         return Answer(LOOP, Verdict.YES, text, "", numbers)
-    mirror = case.controller.deformation.mirror
-    paired = mirror is not None and mirror.lags
-    change = "Lower the gain, or pair through " + (
-        "the whole lag of the reality." if paired else "the reality's lag: ModelReferenced(map, lag=...)."
-    )
+    whole = pairs_lag(case.controller.deformation)
+    lag = "the whole lag of the reality." if whole else "the reality's lag: ModelReferenced(map, lag=...)."
+    change = f"Lower the gain, or pair through {lag}"
     if bare >= 1:
         change = "Lower the rate of the tracking law: the loop does not converge without adaptation either."
     return Answer(LOOP, Verdict.UNKNOWN if adapted < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
@@ -66,8 +65,9 @@ _REAL = 1e-6  # share of the imaginary part, below which a pole is real
 def leaves_room(case: Case) -> Answer | None:
     """Return N Lambda tau, and the largest a lambda with some damping; None without a reality, an unpaired lag or a known law."""
     law = law_of(case.grid, case.controller) if case.grid.real is not None else None
-    mirror = case.controller.deformation.mirror
-    if law is None or (mirror is not None and mirror.lags):  # paired through it, which the loop with the reality judges
+    if law is None or pairs_lag(
+        case.controller.deformation
+    ):  # paired through it, which the loop with the reality judges
         return None
     rate, poles = law
     extras = [extra_modes(case.grid, point, case.believed) for point in real_points(case.grid)]

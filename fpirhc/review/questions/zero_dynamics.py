@@ -6,7 +6,6 @@ the derivatives below them at zero move by themselves.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.linalg import null_space
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
-from fpirhc.plant.maps import growth_of
+from fpirhc.plant.maps import growth_of, step_of
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import LITTLE, Loops, is_planned
@@ -49,7 +48,7 @@ def of_zero_dynamics(grid: ReviewGrid, radius: float) -> bool:
     rate, period = zero_dynamics_rate(grid), grid.problem.period
     if rate is None or not rate > 0:
         return False
-    grown = rate * period if grid.problem.plant.step is not None else math.expm1(rate * period)
+    grown = float(step_of(grid.problem.plant, np.array([[rate]]), period)[0, 0]) - 1
     return radius - 1 <= _BESIDE * grown
 
 
