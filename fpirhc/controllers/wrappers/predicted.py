@@ -6,6 +6,10 @@ the resulting state and the time at which its command acts. So a receding horizo
 set-point cannot be shifted in time: the state ahead is led along the reference of now, so that the plant follows it later by the
 dead time, and the errors of a run contain this delay.
 
+A prediction by the model alone lacks what the model lacks. Where that is a constant response w, and the prediction reaches over t,
+a law of gains kp, kd leaves the error (1 + kd t + kp t^2 / 2) w / kp in place of w / kp. Adaptation removes w / kp only: it makes
+the response the desired one, and that follows from the predicted state. `ByModel(residual_time=...)` and `ByDesired` mend it.
+
 There are two ways to predict:
 
     ByModel    integrates the approximate model over the commands on their way, optionally with the residual: the low-passed
@@ -33,7 +37,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.reference_states import own_signals
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
@@ -360,6 +364,22 @@ def output_ahead(plant: Plant) -> ca.Function:
         terms = (distance[i] * time**n / math.factorial(n) for i, n in zip(higher, powers, strict=True))
         entries.append(sum(terms, start=ahead[k]))
     return ca.Function("fpirhc_output_ahead", [y, x, later, p, time], [ca.densify(ca.vertcat(*entries))])
+
+
+def other_predictions(controller: Controller) -> dict[str, Controller]:
+    """Return the controller with a residual in its prediction, and with the desired responses, by the text of the prediction.
+
+    None where it does not predict by its model alone.
+    """
+    if isinstance(controller, Predicted):
+        late = controller.inputs + controller.measurement
+        if controller.by != ByModel() or not late:
+            return {}
+        residual = replace(controller, by=ByModel(residual_time=late))
+        return {f"ByModel(residual_time={late:.3g})": residual, "ByDesired()": replace(controller, by=ByDesired())}
+    if controller.inner is None:
+        return {}
+    return {name: with_inner(controller, other) for name, other in other_predictions(controller.inner).items()}
 
 
 def examples(inner: Controller) -> tuple[Example, ...]:

@@ -1,0 +1,81 @@
+"""A prediction by a model that lacks a force: its error in closed form, and what the review says of it."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.wrappers.predicted import Predictor
+from fpirhc.deformation import Deformation
+from fpirhc.review.questions.predicted_state import KNOWS
+from fpirhc.review.review import review
+
+RATE, PERIOD, FORCE = 3.0, 0.01, 1.0  # 1/s, s, m/s^2
+KP, KD = RATE**2, 2 * RATE
+
+
+def mass(late: float) -> fp.Problem:
+    """A mass that a force pushes of which the model knows nothing, to be held at rest."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"u": "m/s^2"},
+        parameters={"w": fp.Parameter(0.0, FORCE, "m/s^2")},
+        response=lambda q, v, u, p: {"q": u.u - p.w},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(0 * t)}),
+        start={"q": 0.1},
+        period=PERIOD,
+        duration=12.0,
+        measure_from=10.0,
+        dead_time=fp.DeadTime(inputs={"u": late}),
+    )
+
+
+def law(late: float, form: Deformation | None = None, by: Predictor | None = None) -> Controller:
+    tracking = fp.Exponential(RATE, integral=False)
+    plain = fp.ComputedTorque(tracking) if form is None else fp.ComputedTorque(tracking, form)
+    return fp.Predicted(plain, inputs=late) if by is None else fp.Predicted(plain, inputs=late, by=by)
+
+
+FORM = fp.ModelReferenced(fp.Affine(gain=-0.4))
+
+
+@pytest.mark.parametrize("late", [0.03, 0.08])
+@pytest.mark.parametrize(
+    ("form", "by", "removed"),
+    [(None, None, 0.0), (FORM, None, 1.0), (FORM, fp.ByDesired(), 2.0), (FORM, fp.ByModel(residual_time=0.1), 2.0)],
+    ids=["no adaptation", "adaptation", "what is desired", "a residual"],
+)
+def test_what_the_model_lacks_is_lacking_in_the_prediction(late, form, by, removed):
+    """The error is w (1 + kd t + kp t^2 / 2) / kp; adaptation takes w / kp from it, another prediction the rest."""
+    problem = mass(late)
+    run = fp.simulate(problem, law(late, form, by), seed=0, compiled=False)
+    expected = [FORCE / KP * (1 + KD * late + KP * late**2 / 2), FORCE / KP * (KD * late + KP * late**2 / 2), 0.0]
+    assert run["true_error.q"][-1] == pytest.approx(expected[int(removed)], rel=0.01, abs=1e-6)
+
+
+def test_review_names_a_prediction_that_knows_it():
+    late = 0.08
+    [answer] = about(KNOWS, mass(late), law(late, FORM))
+    assert answer.verdict == "unknown"
+    assert answer.change == "Predict with what acts: Predicted(..., by=ByModel(residual_time=0.08))."
+    assert answer.numbers["error with ByModel(residual_time=0.08)"] < 0.01 * answer.numbers["error"]
+
+
+def test_review_keeps_a_prediction_that_is_right():
+    late = 0.08
+    right = mass(late).with_exact(np.zeros(1))
+    [answer] = about(KNOWS, right, law(late, FORM))
+    assert answer.verdict == "yes"
+    assert not about(KNOWS, mass(late), law(late, FORM, fp.ByDesired()))
+
+
+def about(question: str, problem: fp.Problem, controller: Controller):
+    """The answers to a question."""
+    answers = review(problem, {"law": controller}, mismatch=0.0, seed=0).controllers["law"]
+    return [one for one in answers if one.question == question]
