@@ -3,6 +3,7 @@
 
 root=$(CDPATH= cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
+export OPENBLAS_NUM_THREADS=1 # the processes share the cores already; threads of each one's own matrices wait for one another
 
 say() { printf '%s\n' "$*" >&2; }
 

@@ -338,8 +338,10 @@ def _is_intact(path: Path) -> bool:
 def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path) -> None:
     """Compile into a folder of its own beside the cache entry, files side by side, then link and put the library into place.
 
-    The first file is of this library alone. Others are drivers, whose objects are kept for the libraries that share them.
+    The first file is of this library alone. Others are drivers, whose objects are kept for the libraries that share them. What
+    killed processes left behind is removed here and not where a library is found: a cache of thousands of files is slow to list.
     """
+    _remove_abandoned(path.parent)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=BUILDING, ignore_cleanup_errors=True) as work:
         own = Path(work) / "model.o"
         objects = [own, *(path.parent / f"{unit.key}.o" for unit in units[1:])]
@@ -391,7 +393,7 @@ _ABANDONED = 3600.0  # s; no compilation takes that long, so its process was kil
 
 
 def private_folder(folder: Path) -> Path:
-    """Create the folder where needed, close it to others, and remove what killed processes left behind.
+    """Create the folder where needed, and close it to others.
 
     Raises:
         OSError: it cannot be made, or it belongs to another user.
@@ -402,7 +404,6 @@ def private_folder(folder: Path) -> Path:
         raise PermissionError(f"'{folder}' belongs to another user")
     if os.name == "posix" and stat.S_IMODE(facts.st_mode) & 0o077:
         folder.chmod(0o700)
-    _remove_abandoned(folder)
     return folder
 
 

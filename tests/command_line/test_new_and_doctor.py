@@ -18,6 +18,7 @@ from fpirhc.scaffold.create import create_problem
 from fpirhc.symbolic.native import Native, cache_folder, own_name
 
 pytest_plugins = ["pytester"]
+CACHE = cache_folder()
 
 
 @pytest.fixture
@@ -29,11 +30,12 @@ def folder(tmp_path, monkeypatch):
 # new
 
 
-def test_new_files_work_at_once(pytester, capsys):
+def test_new_files_work_at_once(pytester, monkeypatch, capsys):
     """Adaptation helps, every cycle is solved, and the written test passes.
 
     What it says of the controllers is left out: the laws of controllers are tested on the shipped ones.
     """
+    monkeypatch.setenv("XDG_CACHE_HOME", str(CACHE.parent))  # pytester has a home of its own, without what was compiled
     assert main(["new", "my_arm", "--dir", "arms/left"]) == 0
     assert "fpirhc compare arms/left/my_arm.py" in capsys.readouterr().out
     folder = pytester.path / "arms" / "left"
