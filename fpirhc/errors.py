@@ -127,12 +127,12 @@ def nearest(name: object, valid: Iterable[str]) -> str:
     near = _near(name, names) if isinstance(name, str) else []
     hint = f" Did you mean '{near[0]}'?" if near else ""
     if len(names) <= _MANY:
-        return f"{hint} Valid: {_listed(names)}."
+        return f"{hint} Valid: {listed(names)}."
     shown = get_close_matches(str(name), names, n=_SHOWN, cutoff=0)
-    return f"{hint} Valid: {_listed(shown)} and {len(names) - len(shown)} more."
+    return f"{hint} Valid: {listed(shown)} and {len(names) - len(shown)} more."
 
 
-def _listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str]) -> str:
     """The names of a list, in quotes where a comma inside one would part it."""
     return ", ".join(f"'{one}'" for one in names) if any("," in one for one in names) else ", ".join(names)
 

@@ -192,6 +192,8 @@ FORMER = {  # names of earlier versions, and names that have left the top level
     "General": "CustomCost",
     "Informed": "ExactModel",
     "InteriorPoint": "Ipopt",
+    "floquet": "controllers.slots.slotted.floquet_radius",
+    "linear_around": "simulation.linearise.asked_loop.AskedLoop",
     "LqrTerminal": "LQRTerminal",
     "LyapunovMrac": "LyapunovMRAC",
     "LyapunovView": "simulation.lyapunov_view.LyapunovView",

@@ -205,7 +205,9 @@ def accept(
     """
     require_reason(reason)
     if seeds < 2 or seed < 0:
-        raise InvalidValue(f"seed {seed} with {seeds} seeds: expected at least 0 and at least 2; 8 seeds are usual")
+        raise InvalidValue(
+            f"accept: expected a seed of at least 0 and at least 2 seeds, got seed={seed} and seeds={seeds}; 8 seeds are usual"
+        )
     project = working or Path.cwd()
     check_inside(baseline_path(task.path, baselines), project)
     expectations = measure_expected(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,18 @@ def add_optimisers(parser: Parser) -> None:
 
 def add_seed(parser: Parser, use: str) -> None:
     """--seed K."""
-    parser.add_argument("--seed", type=int, default=0, metavar="K", help=f"seed of {use} (default: 0)")
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="K", help=f"seed of {use} (default: 0)")
+
+
+def whole(least: int) -> Callable[[str], int]:
+    """Return the type of an option: a whole number of at least `least`."""
+
+    def number(text: str) -> int:
+        if text.strip().isdecimal() and int(text) >= least:
+            return int(text)
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least {least}, got '{text}'")
+
+    return number
 
 
 def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:

@@ -16,6 +16,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError
+from fpirhc.plant.motion import followed_units
 from fpirhc.review.grid import each
 from fpirhc.review.prediction import NominalRun, exactly, nominal_of, nominal_run
 from fpirhc.simulation.error_pair import ErrorPair
@@ -111,7 +112,8 @@ def null_runs(problem: Problem, controller: Controller, runs: NominalRuns | None
     without, ranges = _errors_along(model, run["plant_state"]), _ranges(model, run["plant_state"])
     run = _run(problem, model, controller)
     lost = dict.fromkeys(without, float("inf"))
-    return ErrorPair(without, lost if run.stop is not None else _errors_along(model, run["plant_state"]), ranges)
+    adapted = lost if run.stop is not None else _errors_along(model, run["plant_state"])
+    return ErrorPair(without, adapted, ranges, followed_units(model.plant))
 
 
 def _run(problem: Problem, model: Problem, controller: Controller) -> Run:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.metrics.base import measured_errors
 from fpirhc.simulation.metrics.entries.errors import rms_error
@@ -28,11 +29,17 @@ class ErrorPair:
         without: rms tracking error by judged coordinate without adaptation, in the unit of the coordinate.
         adapted: the same with the deformation; infinite where the run ended early.
         ranges: range of the reference, or the largest error without adaptation where that is larger, by coordinate.
+        units: of the coordinates.
     """
 
     without: Mapping[str, float]
     adapted: Mapping[str, float]
     ranges: Mapping[str, float]
+    units: Mapping[str, str]
+
+    def unit(self, name: str) -> str:
+        """The unit of a coordinate as it stands behind a number."""
+        return with_space(self.units[name])
 
     @property
     def worst(self) -> str:
@@ -50,19 +57,21 @@ class ErrorPair:
     @property
     def text(self) -> str:
         """Both errors of the worst coordinate in a sentence."""
-        name = self.worst
+        name, rounding = self.worst, beside(0.5 * _ROUNDING, 1.0)
         before, after = (beside(e[name], self.ranges[name]) for e in (self.without, self.adapted))
-        if before == after == beside(0.5 * _ROUNDING, 1.0):
+        if before == after == rounding:
             return f"run on its own model, rms error of {name} {before} without adaptation and with it"
+        before, after = (one if one == rounding else f"{one}{self.unit(name)}" for one in (before, after))
         share = f"{100 * self.added(name):+.2g} % of its range"
         return f"run on its own model, rms error of {name} {before} without adaptation and {after} with it, {share}"
 
     @property
     def sentence(self) -> str:
         """Both errors of the worst coordinate, where a run may have ended early."""
+        unit = self.unit(self.worst)
         before, after = self.without[self.worst], self.adapted[self.worst]
-        rest = f"{after:.3g} with it" if math.isfinite(after) else "a run that ends early with it"
-        return f"the rms error of {self.worst} is {before:.3g} without adaptation, {rest}"
+        rest = f"{after:.3g}{unit} with it" if math.isfinite(after) else "a run that ends early with it"
+        return f"the rms error of {self.worst} is {before:.3g}{unit} without adaptation, {rest}"
 
     @property
     def passes(self) -> bool:
@@ -99,7 +108,7 @@ def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | Non
         }
         for run in runs
     )
-    return ErrorPair(before, after, _ranges(problem, runs[0]))
+    return ErrorPair(before, after, _ranges(problem, runs[0]), followed_units(problem.plant))
 
 
 def _ranges(problem: Problem, run: Run) -> dict[str, float]:

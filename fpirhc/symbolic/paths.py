@@ -47,6 +47,13 @@ def content_at(owner: object, path: str, what: str = "the controller") -> object
             where = f"'{'.'.join(done)}' of {what}" if done else what
             below = [".".join((*done, one)) for one in paths_to(name, value)]
             hint = f" Did you mean '{below[0]}'?" if below else nearest(name, valid)
+            if not valid:
+                others = [one for one in names_in(owner) if names_in(entry(owner, one))]
+                hint = (
+                    f" It has no settings; {what} has settings in: {', '.join(others)}."
+                    if others
+                    else " It has no settings."
+                )
             raise InvalidName(f"setting '{path}': {where} ({type(value).__name__}) has no '{name}'.{hint}")
         value = entry(value, name)
         done.append(name)

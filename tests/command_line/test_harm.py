@@ -172,7 +172,7 @@ def test_a_form_that_loses_with_the_wrong_model_is_not_proposed(tmp_path, monkey
     answers = json.loads(capsys.readouterr().out)["controllers"]["RHC+FPI"]
     [form] = [a for a in answers if "form of the iteration" in a["question"]]
     found = re.search(
-        r"but here with the wrong model the rms error of C_b is (\S+) without adaptation, (\S+) with it$",
+        r"but here with the wrong model the rms error of C_b is (\S+) mol/l without adaptation, (\S+) mol/l with it$",
         form["evidence"],
     )
     assert found

@@ -82,6 +82,18 @@ def test_an_own_error_is_judged_by_the_error_that_it_removes():
     assert "failed, CTC+FPI is worse than CTC although there is nothing to adapt" in harmful.text
 
 
+def test_what_it_adds_is_judged_by_the_range_of_the_run_as_in_a_review():
+    """Ten times the error of the wrong model is no harm where it is a ten-thousandth of the way that the mass has come."""
+    law, far = fp.ComputedTorque(PLAIN.tracking, replace(SIGMOID, gain=-0.05)), {"y": 50.0, "y'": 3.0}
+    near, distant = (
+        null_of(law, cured=1e-6, start=start, duration=6.0, measure_from=4.0) for start in ({"y": 0.0, "y'": 3.0}, far)
+    )
+    assert near.harmful
+    assert distant.after["y"] == pytest.approx(near.after["y"], rel=0.1)
+    assert not distant.harmful
+    assert distant.text.endswith("; it adds less than 0.1 % of the range of the run.")
+
+
 def test_a_null_test_of_rows_mostly_at_a_limit_is_not_informative():
     """The sine needs 14.4 N of the model; with 2 N both commands stand at a limit, where nothing can be told of adaptation."""
     narrow = fp.Limits(inputs={"u": (-2.0, 2.0)})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_baselines, add_no_compile, add_problem, add_processes, add_seed
+from fpirhc.cli.options import add_baselines, add_no_compile, add_problem, add_processes, add_seed, whole
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -14,7 +14,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reason", required=True, metavar="TEXT", help=text)
     add_seed(parser, "the run that is compared")
     text = "number of seeds for the bands (default: 8)"
-    parser.add_argument("--seeds", type=int, default=8, metavar="N", help=text)
+    parser.add_argument("--seeds", type=whole(2), default=8, metavar="N", help=text)
     add_baselines(parser)
     add_processes(parser)
     add_no_compile(parser)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from fpirhc.cli.options import add_problem
+from fpirhc.cli.options import add_problem, whole
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -27,7 +27,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     text = "exp, sin, pow and the like: of the machine, or own ones with the same bits everywhere (default: by target)"
     parser.add_argument("--libm", choices=("system", "own"), help=text)
     text = "cycles that are recorded for the replay, faults among them (default: 2000)"
-    parser.add_argument("--cycles", type=int, default=2000, metavar="N", help=text)
+    parser.add_argument("--cycles", type=whole(1), default=2000, metavar="N", help=text)
     text = "build what was exported, here or for an emulated Cortex-M7, run the plant with it, and say how far apart the runs are"
     parser.add_argument("--check", action="store_true", help=text)
 

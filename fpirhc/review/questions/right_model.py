@@ -163,9 +163,11 @@ def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, 
         trial = case.trial(form) if name != used else "it is in use"
         others += not isinstance(trial, str)
         if not isinstance(trial, str) and not case.harm(form):
-            null = trial[1]
-            sentences.append(f"The {name} form passes: rms error of {null.worst} {null.adapted[null.worst]:.3g}.")
-            numbers["with_form"] = null.adapted[null.worst]
+            null, worst = trial[1], runs.worst
+            sentences.append(
+                f"The {name} form passes: rms error of {worst} {null.adapted[worst]:.3g}{null.unit(worst)}."
+            )
+            numbers["with_form"] = null.adapted[worst]
             break
     grows = bool(case.loops.loops) and case.loops.radii.max() >= 1
     period = None if predicted is None or grows else _period(case, runs, predicted)

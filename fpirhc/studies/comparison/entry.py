@@ -126,8 +126,9 @@ def no_bound_because(
     if any(problem.dead_time.inputs.values()) or problem.dead_time.measurement:
         reasons.append("dead time stands between its model and the plant")
     reasons += _plans_of(problem, controller, metrics, optimality)
-    if not reasons and controller.planner is not None:
-        reasons.append("its cost weighs more than the error, so the best plan has not the smallest error")
+    if not reasons:
+        own = "its cost weighs more than the error, so the best plan has not the smallest error"
+        reasons = ["its law makes this error with a right model too" if controller.planner is None else own]
     return tuple(reasons)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fpirhc.controllers.base import Controller
+from fpirhc.errors import listed
 from fpirhc.plant.chain import measured_signals
 from fpirhc.sensing.base import names_of_responses, response_names
 from fpirhc.symbolic.block import Composite
@@ -93,7 +94,7 @@ def _grouped(verb: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
     if len(groups) == 1:
         [what] = groups
         return [f"every controller {verb}s {what}"]
-    return [f"{', '.join(names)}: {verb if len(names) > 1 else verb + 's'} {what}" for what, names in groups.items()]
+    return [f"{listed(names)}: {verb if len(names) > 1 else verb + 's'} {what}" for what, names in groups.items()]
 
 
 def _used(problem: Problem, loop: Composite) -> tuple[str, ...]:

@@ -4,7 +4,8 @@ It catches what adaptation takes for an error of the model without being one: a 
 that is not paired, the noise of a sensor. Disturbances are left out, because they are an error of the model.
 
 The plain form passes on the changes of the desired response a little late, so some error of its own is usual. It is harmful where
-it is larger than the error that the wrong model causes without adaptation, which adaptation is there to remove.
+it is larger than the error that the wrong model causes without adaptation, which adaptation is there to remove, and adds more
+than a thousandth of the range of the coordinate's run, as in a review.
 
 The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again; where the plant is
 no instance of the model they are composed around the model, and so where the deformation believes a lag or a dead time that the
@@ -23,6 +24,7 @@ import numpy as np
 
 from fpirhc.by_name import FoundByName
 from fpirhc.plant.motion import followed_units, with_space
+from fpirhc.simulation.error_pair import SLIGHT
 from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.metrics.base import by_name
 from fpirhc.simulation.metrics.entries.commands import at_limit
@@ -95,6 +97,7 @@ def null_test(
     begin, null = time.perf_counter(), model.problem
     runs = tuple(model.run(loop) for loop in loops)
     before, after = (_errors(run, null) for run in runs)
+    slight = {name: SLIGHT * size for name, size in _ranges(runs[0], null).items()}
     stuck = {n: at_limit(null, run) for n, run in zip(names, runs, strict=True)}
     if stuck[names[0]] >= _MOSTLY:
         text = _not_informative(stuck)
@@ -103,8 +106,13 @@ def null_test(
         )
     changes = {n: Change(n, before[n], after[n], scales.get(n, 1.0)) for n in before if weighed is None or n in weighed}
     outcome = _outcome(changes)
-    harmful = _harmful(outcome, changes, cured)
-    text = _sentence(names, outcome, changes, null, cured if not harmful and outcome in _LARGER else None)
+    harmful = _harmful(outcome, changes, cured, slight)
+    small = (
+        ""
+        if harmful or outcome not in _LARGER
+        else _smallness(names[0], null, {n: cured[n] for n in changes}, _harmful(outcome, changes, cured, {}))
+    )
+    text = _sentence(names, outcome, changes, null, small)
     return NullTest(names, before, after, outcome, harmful, text, null.cycles, time.perf_counter() - begin)
 
 
@@ -135,19 +143,40 @@ def _outcome(changes: Mapping[str, Change]) -> Outcome:
     return Outcome.WORSE if lost else outcome_of(major(changes))
 
 
-def _harmful(outcome: Outcome, changes: Mapping[str, Change], cured: Mapping[str, float]) -> bool:
+def _harmful(
+    outcome: Outcome, changes: Mapping[str, Change], cured: Mapping[str, float], slight: Mapping[str, float]
+) -> bool:
+    """Whether an error is larger than the wrong model makes without adaptation, by more than is slight for the coordinate."""
     if outcome not in _LARGER:
         return False
     worse = [c for c in major(changes).values() if c.outcome is Outcome.WORSE] or changes.values()
-    return any(not c.after <= cured[c.name] for c in worse)
+    return any(not (c.after <= cured[c.name] or c.after - c.before <= slight.get(c.name, 0.0)) for c in worse)
+
+
+def _ranges(run: Run, null: Problem) -> dict[str, float]:
+    """Range of the reference of a whole run, or its largest error where that is larger."""
+    names, states = null.judged_names, run[judged_motion(run.layout)]
+    if not len(states):
+        return dict.fromkeys(names, 0.0)
+    places = [null.plant.output.elements.index(name) for name in names]
+    reference = np.asarray(null.reference.function(null.plant).map(len(states))(run.time[None, :])[0].full()).T[
+        :, places
+    ]
+    sizes = np.fmax(np.ptp(reference, axis=0), np.abs(reference - states[:, places]).max(axis=0))
+    return by_name(names, np.where(np.isfinite(sizes), sizes, 0.0))
+
+
+def _smallness(plain: str, null: Problem, cured: Mapping[str, float], larger: bool) -> str:
+    """What an error that does no harm is small against."""
+    if larger:
+        return f"it adds less than {in_percent(SLIGHT)} of the range of the run"
+    units = followed_units(null.plant)
+    costs = ", ".join(f"{n} {size:.3g}{with_space(units[n])}" for n, size in cured.items())
+    return f"it is smaller than that of {plain} with the wrong model ({costs})"
 
 
 def _sentence(
-    names: tuple[str, str],
-    outcome: Outcome,
-    changes: Mapping[str, Change],
-    null: Problem,
-    cured: Mapping[str, float] | None,
+    names: tuple[str, str], outcome: Outcome, changes: Mapping[str, Change], null: Problem, small: str
 ) -> str:
     plain, adaptive = names
     head = "Null test (the approximate model as plant"
@@ -162,12 +191,8 @@ def _sentence(
     if outcome in (Outcome.BETTER, Outcome.NO_DIFFERENCE):
         tiny = all(c.size < ROUNDING for c in changes.values())
         return f"{head}passed, {adaptive} is not worse than {plain} ({'rounding only' if tiny else numbers})."
-    if cured is not None:
-        costs = ", ".join(f"{n} {cured[n]:.3g}{units[n]}" for n in changes)
-        return (
-            f"{head}{adaptive} makes a small error of its own ({numbers}); it is smaller than that of {plain} with the wrong model "
-            f"({costs})."
-        )
+    if small:
+        return f"{head}{adaptive} makes a small error of its own ({numbers}); {small}."
     return (
         f"{head}failed, {adaptive} is worse than {plain} although there is nothing to adapt ({numbers}). Its gain, or the "
         "largest step of its map, is too small for its law or its plan, or it takes something else for an error of the model: the "
