@@ -103,6 +103,12 @@ class OutputError(FpirhcError, OSError):
     """A file or folder that cannot be written or read."""
 
 
+def not_writable(folder: object, error: OSError, option: str) -> OutputError:
+    """The error of a folder for results that cannot be written, with the option that chooses another one."""
+    why = "it is a file" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
+    return OutputError(f"cannot write to the folder '{folder}': {why}; choose another with {option}")
+
+
 class BaselineError(FpirhcError, ValueError):
     """A baseline that is missing, damaged, edited by hand, or of another problem or format."""
 

@@ -84,7 +84,7 @@ def add_baselines(parser: Parser) -> None:
 
 def add_processes(parser: Parser) -> None:
     """--processes N."""
-    parser.add_argument("--processes", type=int, default=1, metavar="N", help="number of processes (default: 1)")
+    parser.add_argument("--processes", type=whole(1), default=1, metavar="N", help="number of processes (default: 1)")
 
 
 def add_no_compile(parser: Parser) -> None:

@@ -33,7 +33,7 @@ def output_folder(folder: Path) -> Path:
     Raises:
         OutputError: the folder cannot be written.
     """
-    from fpirhc.errors import OutputError
+    from fpirhc.errors import not_writable
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -41,9 +41,7 @@ def output_folder(folder: Path) -> Path:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise OutputError(
-            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
-        ) from None
+        raise not_writable(folder, error, "--out") from None
     return folder
 
 

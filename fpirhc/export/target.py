@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.errors import InvalidName, NotSupported, OutputError, nearest
+from fpirhc.errors import InvalidName, NotSupported, OutputError, nearest, not_writable
 from fpirhc.export.device import Device, check_name, default_name
 from fpirhc.export.processor import Processor
 from fpirhc.members import within
@@ -116,9 +116,7 @@ def write(device: Device, target: Target, folder: Path) -> list[Path]:
     except OSError as error:
         if isinstance(error, OutputError):
             raise
-        raise OutputError(
-            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
-        ) from None
+        raise not_writable(folder, error, "--out") from None
     return [folder / name for name in contents]
 
 

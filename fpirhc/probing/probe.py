@@ -30,6 +30,7 @@ from fpirhc.simulation.trials import weighed
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
+_FEWEST = 50
 _CLIPPED = 0.2  # share of the cycles at a limit, from which it is said
 
 
@@ -143,6 +144,10 @@ def probe(
         FpirhcError: every error that the controller raises about the problem.
     """
     _check(problem, amplitude, chatter)
+    if recording is None and cycles < _FEWEST:
+        raise InvalidValue(
+            f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least {_FEWEST}, 300 are usual"
+        )
     bare = without_deformation(resolved(problem, controller))
     if recording is not None:
         record = read_recording(Path(recording), problem)

@@ -74,7 +74,9 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             head, *rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    except OSError as error:
+        raise InvalidValue(f"recording '{path}' cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, ValueError) as error:
         raise InvalidValue(f"recording {path}: cannot be read as a CSV file with a line of names ({error})") from None
     values = []
     for number, row in enumerate(rows, start=2):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fpirhc.baselines.check import accept
 from fpirhc.baselines.places import baseline_path
-from fpirhc.errors import InvalidName, OutputError
+from fpirhc.errors import InvalidName, OutputError, not_writable
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.problem_files.shipped import shipped_problems
 
@@ -47,9 +47,7 @@ def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
             path.unlink(missing_ok=True)
         if isinstance(error, FileExistsError) and error.filename != str(folder):
             raise OutputError(f"'{error.filename}' exists already and is kept; choose another name or --dir") from None
-        raise OutputError(
-            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --dir"
-        ) from None
+        raise not_writable(folder, error, "--dir") from None
     return tuple(written)
 
 

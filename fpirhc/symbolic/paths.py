@@ -54,7 +54,8 @@ def content_at(owner: object, path: str, what: str = "the controller") -> object
                     if others
                     else " It has no settings."
                 )
-            raise InvalidName(f"setting '{path}': {where} ({type(value).__name__}) has no '{name}'.{hint}")
+            kind = "" if isinstance(value, Mapping) else f" ({type(value).__name__})"
+            raise InvalidName(f"setting '{path}': {where}{kind} has no '{name}'.{hint}")
         value = entry(value, name)
         done.append(name)
     return value

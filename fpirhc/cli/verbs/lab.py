@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from fpirhc.cli.options import add_problem
+from fpirhc.cli.output import output_folder
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -26,11 +27,12 @@ def _run(options: argparse.Namespace) -> ExitCode:
     task = load_problem(options.problem)
     names = options.controllers or list(task.headline or list(task.controllers)[:2])
     chosen = select(task, names)
+    path = Path(options.out or "results")
+    path = path / f"{task.name}-lab.html" if path.is_dir() or not options.out else path
+    output_folder(path.parent)
     lab = make_lab(
         task.name, task.title, options.problem, task.problem, {name: chosen[name] for name in names}, options.live
     )
-    path = Path(options.out or "results")
-    path = path / f"{task.name}-lab.html" if path.is_dir() or not options.out else path
     write_lab(lab, path)
     print(f"{len(lab.sliders)} sliders for {', '.join(names)}")
     for number, why in lab.without.items():
