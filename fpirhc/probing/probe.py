@@ -30,7 +30,7 @@ from fpirhc.simulation.trials import weighed
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
-_FEWEST = 50
+_FEWEST = 40
 _CLIPPED = 0.2  # share of the cycles at a limit, from which it is said
 
 

@@ -1,6 +1,6 @@
 """Wrong input at the command line: a message says what is wrong and where, what was expected, the nearest name, and what to write.
 
-Every row is a command, its exit code and its message. Nothing runs before the message, there is no traceback, and no file is written.
+Every row is a command, its exit code and its message. Nothing runs before it, there is no traceback, and no file is written.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ ROWS = {
     "fpirhc export two_mass CTC --out o --to fmu --check": (2, "--check is there for c, cortex-m, not for fmu"),
     "fpirhc probe two_mass --cycles 3": (
         2,
-        "probe: 3 cycles are too few to tell a gain from noise; expected at least 50, 300 are usual",
+        "probe: 3 cycles are too few to tell a gain from noise; expected at least 40, 300 are usual",
     ),
     # settings
     "fpirhc run two_mass RHC+FPI --set gain=-1": (

@@ -123,7 +123,7 @@ def test_a_wrong_table_is_named(tmp_path, columns, words):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (None, "cannot be read as a CSV file"),
+        (None, "cannot be read: No such file or directory"),
         ("", "cannot be read as a CSV file"),
         ("time,q1\n0,one\n", "row 2 is not made of numbers: 0, one"),
         ("time,q1\n0\n", "row 2 has 1 entries, the first one 2"),

@@ -79,7 +79,7 @@ def test_lines_stand_in_every_form_of_a_comparison(everything):
     first, *others = everything.information
     assert first == "all controllers are given y, y', y'' in every cycle of 0.01 s"
     assert "CTC, RHC, offset-free: use y, y'" in others
-    assert "CTC+FPI, RHC+FPI, offset-free, at once: use y, y', y''" in others
+    assert "'CTC+FPI', 'RHC+FPI', 'offset-free, at once': use y, y', y''" in others
     assert "CTC, CTC+FPI: act in every cycle" in others
     document = json.loads(to_json(everything.view.facts))
     assert document["information"] == list(everything.information)
