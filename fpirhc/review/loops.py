@@ -112,6 +112,7 @@ class Points:
         self.grid, self.asked = grid, AskedLoop(problem or grid.problem, near_fixed_point(controller))
         self._loops: dict[tuple[int, int], LinearLoop] = {}
         self._quiets: dict[tuple[int, int], np.ndarray] = {}
+        self._ideals: dict[int, LinearLoop] = {}
 
     def at(self, place: int, draw: int = 0) -> LinearLoop:
         """Return the linear loop at a point, with the parameters of a draw; draw 0 are the exact ones."""
@@ -125,9 +126,11 @@ class Points:
 
     def ideal(self, place: int) -> LinearLoop:
         """Return the linear loop at a point where the plant is the model."""
-        believed = self.asked.controller.plant_model(self.grid.problem).parameters(self.grid.problem.plant)
-        quiet = self._quiet(place, self.grid.states[place], self.grid.needed(believed)[place], believed)
-        return self.asked.at(quiet)
+        if place not in self._ideals:
+            believed = self.asked.controller.plant_model(self.grid.problem).parameters(self.grid.problem.plant)
+            quiet = self._quiet(place, self.grid.states[place], self.grid.needed(believed)[place], believed)
+            self._ideals[place] = self.asked.at(quiet)
+        return self._ideals[place]
 
     def quiet(self, place: int, draw: int = 0) -> np.ndarray:
         """Return the memory at a point, with the parameters of a draw."""

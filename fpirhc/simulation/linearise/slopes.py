@@ -191,7 +191,7 @@ class _Part:
     def joined(self, some: Sequence[np.ndarray]) -> np.ndarray:
         """Add what is new in some deviations (n,); return these directions (n, m)."""
         before = self.count
-        for one in some:
+        for one in _new(some, self.basis[:, :before]) if len(some) > 1 else some:
             basis = self.basis[:, : self.count]
             for _ in range(2):  # the second time for the rounding of the first
                 one = one - basis @ (one @ basis)
@@ -224,6 +224,13 @@ class _Part:
         """Those that were found, and what each way makes of them."""
         moved, traces = ([np.hstack([one[k] for one in known]) for known in self._images] for k in (0, 1))
         return Directions(self.basis[:, : self.count].copy(), moved, traces, self.kicked)
+
+
+def _new(some: Sequence[np.ndarray], basis: np.ndarray) -> Sequence[np.ndarray]:
+    """Those deviations (n,) of which orthonormal directions (n, m) leave more than rounding, looked at together."""
+    deviations = np.array(some)
+    rests = deviations - (deviations @ basis) @ basis.T
+    return deviations[np.linalg.norm(rests, axis=1) > _NEW]
 
 
 def _derivative(function: ca.Function) -> ca.Function:
