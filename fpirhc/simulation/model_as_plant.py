@@ -15,6 +15,7 @@ from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.exogenous import as_known
@@ -104,11 +105,18 @@ class ModelAsPlant:
 
 
 def shortened(problem: Problem, cycles: int) -> Problem:
-    """Return the problem with at most so many cycles; where it is shortened, errors count from its middle on at the latest."""
+    """Return the problem with at most so many cycles; where it is shortened, errors count from its middle on at the latest.
+
+    It is the same one for the same problem, so that what is computed of it is shared.
+    """
     if problem.cycles <= cycles:
         return problem
     duration = cycles * problem.period
-    return replace(problem, duration=duration, measure_from=min(problem.measure_from, 0.5 * duration))
+    measured = min(problem.measure_from, 0.5 * duration)
+    return _SHORTENED.of((problem,), (cycles,), lambda: replace(problem, duration=duration, measure_from=measured))
+
+
+_SHORTENED: Latest[Problem] = Latest(8)
 
 
 def behind_actuators(plant: Plant, lags: Sequence[float]) -> Plant:

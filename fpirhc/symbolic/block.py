@@ -163,8 +163,13 @@ class Composite:
     reads: Layout
     memory: Layout
     trace: Layout
-    function: ca.Function
+    graph: ca.Function
     outputs: tuple[str, ...] = ()
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """The step; scalar code where every block is."""
+        return self.graph if self.opaque else scalar_code(self.graph)
 
     @property
     def settings(self) -> Layout:
@@ -254,16 +259,14 @@ def compose(
     for delay in delays:
         next_memory[delay.now.name] = _lookup(f"delay '{delay.now.name}'", delay.now, delay.source, known)
     returned = [memory.join(next_memory), trace.join(known), *[known[o] for o in outputs]]
-    function = ca.Function(
+    graph = ca.Function(
         PREFIX + name,
         [remembered, *inputs.values()],
         [ca.densify(ca.MX(r)) for r in returned],
         ["memory", *_identifiers(inputs)],
         ["memory_next", "trace", *outputs],
     )
-    if not any(b.opaque for b in blocks):
-        function = scalar_code(function)
-    return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, function, tuple(outputs))
+    return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, graph, tuple(outputs))
 
 
 def scalar_code(function: ca.Function) -> ca.Function:

@@ -2,9 +2,12 @@
 
 import fpirhc as fp
 from fpirhc.controllers import replanning
+from fpirhc.review.nominal_runs import null_problem
 from fpirhc.simulation import loop
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.slopes import Step
+from fpirhc.simulation.model_as_plant import shortened
+from fpirhc.symbolic import block
 
 
 def counted(monkeypatch, owner, name):
@@ -35,3 +38,19 @@ def test_controllers_that_differ_in_their_deformation_share_what_a_review_builds
     )  # two that are asked, and one for all runs of each map: none, its own, and two that are tried
     assert len(linear) <= 32
     assert len(steps) <= 19_000
+
+
+def test_only_steps_that_are_called_are_written_out_as_scalar_code(monkeypatch):
+    """Those are the controller as it is where samples may be lost, and the loop."""
+    task = fp.load_problem("two_mass")
+    written = counted(monkeypatch, block, "scalar_code")
+    loop.close_loop(task.problem, task.controllers["CTC"])
+    assert len(written) == 2
+
+
+def test_what_differs_in_nothing_is_the_same_problem():
+    task = fp.load_problem("two_mass")
+    problem, controller = task.problem, task.controllers["RHC+FPI"]
+    assert shortened(problem, 100) is shortened(problem, 100)
+    assert null_problem(problem, controller) is null_problem(problem, controller)
+    assert null_problem(problem, task.controllers["RHC"]) is not null_problem(problem, controller)
