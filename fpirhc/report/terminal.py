@@ -174,8 +174,8 @@ def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Path) -> No
         say(f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
         say(f"ended early: {run.stop}")
-    if run.depends_on_rounding:
-        say(run.depends_on_rounding)
+    for text in run.remarks:
+        say(text)
     say(f"saved: {saved}", wrap=False)
 
 

@@ -71,8 +71,7 @@ class Run(Log):
         how = "compiled C" if self.compiled else "virtual machine"
         ended = f"ended early: {self.stop}" if self.stop else "complete"
         about = f"{self.cycles} cycles of {self.period:g} {self.time_unit}", f"seed {self.seed}", how, ended
-        doubt = (self.depends_on_rounding,) if self.depends_on_rounding else ()
-        return *about, *self._faults(), *doubt
+        return *about, *self._faults(), *self.remarks
 
     def _faults(self) -> tuple[str, ...]:
         """What was worse in some cycles than a plan that had not converged, with the first time."""
@@ -85,6 +84,21 @@ class Run(Log):
                 first = f"{at[0] * self.period:g} {self.time_unit}"
                 faults.append(f"{status.name} in {at.size} cycles, first at {first}")
         return tuple(faults)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader of its numbers should know, in sentences."""
+        return tuple(filter(None, (self.depends_on_rounding, self.never_paired)))
+
+    @property
+    def never_paired(self) -> str:
+        """Why a deformation that pairs by an estimated dead time did nothing: a sentence where it identified none in the whole run."""
+        if "paired_cycles" not in self.layout or not self.cycles or (self["paired_cycles"] >= 0).any():
+            return ""
+        return (
+            "no dead time was identified in the whole run, so adaptation never began: a smooth task shows none; "
+            "Increment.within(map, most) needs none"
+        )
 
     @property
     def depends_on_rounding(self) -> str:

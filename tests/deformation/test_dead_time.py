@@ -281,6 +281,17 @@ def test_smooth_requests_tell_no_dead_time():
     assert np.all(memory["pair_cycles"] == -1)
 
 
+@pytest.mark.parametrize(("size", "says"), [(0.0, True), (0.3, False)])
+def test_a_run_in_which_no_dead_time_was_found_says_so(size, says):
+    """A sine tells none; with noise in the velocities, and so in the request, one is found, and nothing needs to be said."""
+    noisy = fp.Sensing({f"{n}'": fp.Sensor(fp.Noise(size)) for n in ("q1", "q2")}) if size else fp.Sensing()
+    problem = replace(TWO_MASS, sensing=noisy, duration=2.0, measure_from=1.0)
+    run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.SelfPaired(SIGMOID, most=5)), seed=0, compiled=False)
+    assert bool((run["paired_cycles"] < 0).all()) == says
+    assert any("no dead time was identified in the whole run" in text for text in run.remarks) == says
+    assert ("adaptation never began" in repr(run)) == says
+
+
 def test_watching_changes_nothing():
     """The estimate beside a map leaves the run as it is, and is in the run by name."""
     square = replace(LATE, duration=2.0, measure_from=0.0)

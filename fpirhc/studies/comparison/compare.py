@@ -205,7 +205,7 @@ def _entries(
 
 
 def _told_of_run(view: LyapunovView | None, run: Run) -> tuple[str, ...]:
-    return (*([view.text] if view else []), *([run.depends_on_rounding] if run.depends_on_rounding else []))
+    return (*([view.text] if view else []), *run.remarks)
 
 
 def _entry(
