@@ -44,7 +44,7 @@ def test_only_steps_that_are_called_are_written_out_as_scalar_code(monkeypatch):
     """Those are the controller as it is where samples may be lost, and the loop."""
     task = fp.load_problem("two_mass")
     written = counted(monkeypatch, block, "scalar_code")
-    loop.close_loop(task.problem, task.controllers["CTC"])
+    assert loop.close_loop(task.problem, task.controllers["CTC"]).function.is_a("SXFunction")
     assert len(written) == 2
 
 
