@@ -92,7 +92,7 @@ class Run(Log):
 
     @property
     def never_paired(self) -> str:
-        """Why a deformation that pairs by an estimated dead time did nothing: a sentence where it identified none in the whole run."""
+        """Why a deformation that pairs by an estimated dead time did nothing: a sentence where it identified none."""
         if "paired_cycles" not in self.layout or not self.cycles or (self["paired_cycles"] >= 0).any():
             return ""
         return (
