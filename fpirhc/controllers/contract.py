@@ -280,6 +280,36 @@ class Controller(Checked, ABC):
             self.inner.check(self.inner_problem(problem))
 
 
+class Undeformed(Controller, ABC):
+    """Contract: a controller that iterates no request."""
+
+    @property
+    def deformation(self) -> Deformation:
+        """Identity(): no request is iterated."""
+        return Identity()
+
+
+@dataclass(frozen=True)
+class ControllerWrapper(Controller, ABC):
+    """Contract: a controller around another one, with its deformation.
+
+    Args:
+        controller: the wrapped one.
+    """
+
+    controller: Controller
+
+    @property
+    def inner(self) -> Controller:
+        """The wrapped controller."""
+        return self.controller
+
+    @property
+    def deformation(self) -> Deformation:
+        """The deformation of the wrapped controller."""
+        return self.controller.deformation
+
+
 def with_lateness(problem: Problem, controller: Controller) -> Controller:
     """Return the controller whose deformation believes the problem's dead times, and an external plant's lag, where it is open."""
     own = controller.deformation

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import commanding_blocks, like, reference_block
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import NotInvertible, NotSupported
 from fpirhc.horizon.nominal import known_on_reference, reference_state
 from fpirhc.members import Example
@@ -27,13 +26,8 @@ _SEEN = "_seen_status"
 
 
 @dataclass(frozen=True)
-class FeedforwardOnly(Controller):
+class FeedforwardOnly(Undeformed):
     """The model's inverse at the reference's state and response; no error is fed back."""
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def check(self, problem: Problem) -> None:
         """Raise if the model has no inverse, or a derivative is prescribed where states have no reference.

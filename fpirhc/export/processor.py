@@ -20,9 +20,8 @@ from typing import Any, Protocol, cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import commanding_blocks, like, reference_block
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import InvalidValue, NotSupported, OutputError
 from fpirhc.fields.kinds import Positive
 from fpirhc.plant.chain import measured_signals
@@ -50,7 +49,7 @@ class Port(Protocol):
 
 
 @dataclass(frozen=True)
-class Processor(Controller):
+class Processor(Undeformed):
     """A controller that runs in another program: u^N and the status of the cycle are its answers to the samples.
 
     Compare it with the controller that it was exported from: commands have the same bits where the functions of libm have. A run
@@ -76,11 +75,6 @@ class Processor(Controller):
                 f"got {self.program!r}"
             )
         object.__setattr__(self, "program", tuple(self.program))
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): what the program does is not looked into."""
-        return Identity()
 
     def check(self, problem: Problem) -> None:
         """Raise where a program is given something else than the samples of an export.

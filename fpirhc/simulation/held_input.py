@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import commanding_blocks, like, reference_block
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -16,13 +15,8 @@ HELD_INPUT = "_held_input"  # signal in the memory of the loop, with one entry p
 
 
 @dataclass(frozen=True)
-class HeldInput(Controller):
+class HeldInput(Undeformed):
     """Sends the input that stands in its memory, within the limits."""
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, hold, limit, judge, running."""

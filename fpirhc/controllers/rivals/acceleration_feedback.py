@@ -24,9 +24,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, invert_block, law_blocks
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import invert_block, law_blocks
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
@@ -39,7 +38,7 @@ from fpirhc.tracking.base import Tracking
 
 
 @dataclass(frozen=True)
-class AccelerationFeedback(Controller):
+class AccelerationFeedback(Undeformed):
     """Inverse dynamics of q^Des + kappa (q^Des - q^(n)), with the measured response q^(n).
 
     Args:
@@ -62,11 +61,6 @@ class AccelerationFeedback(Controller):
             raise InvalidValue(
                 f"AccelerationFeedback(time_constant={self.time_constant!r}): expected 0 or more seconds"
             )
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def pole(self, period: float) -> float:
         """Return the pole p of the low-pass for control cycles of that period, s."""

@@ -28,18 +28,9 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import (
-    Controller,
-    command_before,
-    commanding_blocks,
-    input_gain,
-    like,
-    reference_block,
-    rename,
-)
+from fpirhc.controllers.base import command_before, commanding_blocks, input_gain, like, reference_block, rename
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import decay_gains
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotSupported
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
@@ -54,7 +45,7 @@ from fpirhc.tracking.error import check_modes, error_chains, own_errors
 
 
 @dataclass(frozen=True)
-class ADRC(Controller):
+class ADRC(Undeformed):
     """Linear active disturbance rejection control of every controlled coordinate.
 
     Args:
@@ -64,11 +55,6 @@ class ADRC(Controller):
 
     bandwidth: Positive
     observer: Positive
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def check(self, problem: Problem) -> None:
         """Raise for an output of order 0.

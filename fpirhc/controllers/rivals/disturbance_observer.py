@@ -21,9 +21,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, command_before, law_blocks, like
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import command_before, law_blocks, like
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
@@ -35,7 +34,7 @@ from fpirhc.tracking.base import Tracking
 
 
 @dataclass(frozen=True)
-class DisturbanceObserver(Controller):
+class DisturbanceObserver(Undeformed):
     """Inverse dynamics less the observed disturbance at the input.
 
     Args:
@@ -45,11 +44,6 @@ class DisturbanceObserver(Controller):
 
     tracking: Tracking
     bandwidth: Positive
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, observer, limit, judge, running, tracking update."""

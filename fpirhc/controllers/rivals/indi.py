@@ -22,9 +22,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, command_before, input_gain, law_blocks, like
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import command_before, input_gain, law_blocks, like
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.fields.kinds import Accuracy, Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
@@ -36,7 +35,7 @@ from fpirhc.tracking.base import Tracking
 
 
 @dataclass(frozen=True)
-class INDI(Controller):
+class INDI(Undeformed):
     """Increments of the command by the model's input gain.
 
     Args:
@@ -48,11 +47,6 @@ class INDI(Controller):
     tracking: Tracking
     frequency: Positive | None = None
     damping: Accuracy = 0.55
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def filter(self, period: float) -> tuple[float, float]:
         """Return (c_1, c_2) of H for cycles of that period: y_k = (1 - c_1 - c_2) x_k + c_1 y_{k-1} + c_2 y_{k-2}."""

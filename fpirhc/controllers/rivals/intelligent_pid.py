@@ -27,9 +27,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, command_before, law_blocks, like
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import command_before, law_blocks, like
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import Few, finite_number
 from fpirhc.members import Example
@@ -45,7 +44,7 @@ from fpirhc.tracking.error import own_errors
 
 
 @dataclass(frozen=True, eq=False)
-class IntelligentPID(Controller):
+class IntelligentPID(Undeformed):
     """The desired response through an ultra-local model, input k for controlled coordinate k.
 
     Args:
@@ -57,11 +56,6 @@ class IntelligentPID(Controller):
     tracking: Tracking
     alpha: Mapping[str, float]
     window: Few = field(metadata={"structure": True})
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def check(self, problem: Problem) -> None:
         """Raise if the numbers do not fit the plant.

@@ -21,9 +21,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, invert_block, law_blocks
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import invert_block, law_blocks
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import NotSupported
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
@@ -38,7 +37,7 @@ from fpirhc.tracking.error import error_chains
 
 
 @dataclass(frozen=True)
-class L1Adaptive(Controller):
+class L1Adaptive(Undeformed):
     """Inverse dynamics less the low-passed estimate of a fast predictor.
 
     Args:
@@ -50,11 +49,6 @@ class L1Adaptive(Controller):
     tracking: Tracking
     bandwidth: Positive
     predictor: Positive = 1.0
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def check(self, problem: Problem) -> None:
         """Raise for an output of order 0.

@@ -33,11 +33,9 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.controllers.contract import check_derivatives
+from fpirhc.controllers.base import commanding_blocks, like, reference_block
+from fpirhc.controllers.contract import Undeformed, check_derivatives
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
@@ -51,7 +49,7 @@ from fpirhc.tracking.error import error_chains
 
 
 @dataclass(frozen=True)
-class LyapunovMRAC(Controller):
+class LyapunovMRAC(Undeformed):
     """Gains on state, reference and bias, adapted so that the plant becomes the reference model.
 
     Args:
@@ -73,11 +71,6 @@ class LyapunovMRAC(Controller):
                 raise InvalidValue(f"LyapunovMRAC({name}={value!r}): expected a positive number")
         if not 0 <= self.leakage < math.inf:
             raise InvalidValue(f"LyapunovMRAC(leakage={self.leakage!r}): expected 0 or more, 1/s")
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): gains are adapted, and no request is iterated."""
-        return Identity()
 
     @property
     def learns(self) -> bool:

@@ -23,9 +23,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import commanding_blocks, like, reference_block, rename
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
@@ -50,7 +49,7 @@ from fpirhc.tracking.error import (
 
 
 @dataclass(frozen=True, eq=False)
-class PID(Controller):
+class PID(Undeformed):
     """One PID loop per controlled coordinate.
 
     Args:
@@ -64,11 +63,6 @@ class PID(Controller):
     integral: Mapping[str, float] = field(default_factory=dict)
     derivative: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
     bumpless: bool = True
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): the controller has no model, so it makes no request."""
-        return Identity()
 
     def gains(self, name: str, order: int) -> tuple[float, ...]:
         """Return the gains of (e_int, e, e', ...) of a coordinate of that relative order, shape (order + 1,)."""

@@ -22,9 +22,8 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, invert_block, law_blocks
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.base import invert_block, law_blocks
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.fields.kinds import Duration, Positive
 from fpirhc.members import Example
@@ -38,7 +37,7 @@ MOST = 20_000  # cycles of a period: each is one number per coordinate in the co
 
 
 @dataclass(frozen=True)
-class RepetitiveControl(Controller):
+class RepetitiveControl(Undeformed):
     """Inverse dynamics of a request that is learned from period to period.
 
     Args:
@@ -59,11 +58,6 @@ class RepetitiveControl(Controller):
     def __post_init__(self) -> None:
         if not 0 <= self.smoothing <= 0.25:
             raise InvalidValue(f"RepetitiveControl(smoothing={self.smoothing!r}): expected a number from 0 to 0.25")
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated from cycle to cycle."""
-        return Identity()
 
     def cycles(self, problem: Problem) -> int:
         """Return N.

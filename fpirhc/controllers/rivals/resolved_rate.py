@@ -32,12 +32,10 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, commanding_blocks, invert_block, like, reference_block
-from fpirhc.controllers.contract import check_derivatives
+from fpirhc.controllers.base import commanding_blocks, invert_block, like, reference_block
+from fpirhc.controllers.contract import Undeformed, check_derivatives
 from fpirhc.controllers.reference_states import motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.reference_model import decay_gains
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
 from fpirhc.plant.motion import controlled_places, time_signal
@@ -49,7 +47,7 @@ from fpirhc.tracking.error import error_chains
 
 
 @dataclass(frozen=True)
-class ResolvedAccelerationRate(Controller):
+class ResolvedAccelerationRate(Undeformed):
     """Increments of the command with which all modes of the error and its first n derivatives decay as exp(-rate t).
 
     The first cycle has no measured response yet and prescribes (d/dt + rate)^n e = 0.
@@ -66,11 +64,6 @@ class ResolvedAccelerationRate(Controller):
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate > 0):
             raise InvalidValue(f"ResolvedAccelerationRate(rate={self.rate!r}): expected a positive number, 1/s")
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def gains(self, degree: int) -> tuple[float, ...]:
         """Return the coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""

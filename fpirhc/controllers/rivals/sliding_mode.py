@@ -22,10 +22,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
+from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import decay_gains
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
@@ -38,7 +37,7 @@ from fpirhc.tracking.error import check_modes, error_chains
 
 
 @dataclass(frozen=True)
-class SlidingMode(Controller):
+class SlidingMode(Undeformed):
     """Inverse dynamics with the switching term K tanh(S / w).
 
     Args:
@@ -59,11 +58,6 @@ class SlidingMode(Controller):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise InvalidValue(f"SlidingMode({name}={value!r}): expected a positive number")
-
-    @property
-    def deformation(self) -> Deformation:
-        """Identity(): no request is iterated."""
-        return Identity()
 
     def check(self, problem: Problem) -> None:
         """Raise if the loop chatters even with an exact model.

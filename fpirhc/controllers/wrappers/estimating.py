@@ -16,9 +16,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, command_before, compose_controller, embedded, like
-from fpirhc.controllers.contract import Planner, with_setting
+from fpirhc.controllers.contract import ControllerWrapper, Planner, with_setting
 from fpirhc.controllers.response_pairs import ResponsePairs
-from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
@@ -36,7 +35,7 @@ _MODELLED: Latest[Problem] = Latest(8)
 
 
 @dataclass(frozen=True)
-class Estimating(Controller):
+class Estimating(ControllerWrapper):
     """The wrapped controller with the parameters of its model corrected every cycle.
 
     Behind dead time or an estimator, a response belongs to an older state and command; see `fpirhc.controllers.response_pairs`.
@@ -49,20 +48,9 @@ class Estimating(Controller):
             plan, which uses the estimate of the cycle in which it was made.
     """
 
-    controller: Controller
     estimator: ParameterEstimator
     dead_time: DeadTime | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     at_once: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
-
-    @property
-    def inner(self) -> Controller:
-        """The wrapped controller."""
-        return self.controller
-
-    @property
-    def deformation(self) -> Deformation:
-        """The deformation of the wrapped controller."""
-        return self.controller.deformation
 
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the estimator's model of the plant."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import PlantModel
-from fpirhc.deformation.base import Deformation
+from fpirhc.controllers.contract import ControllerWrapper, PlantModel
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.latest import Latest
@@ -15,7 +14,7 @@ from fpirhc.task.problem import Problem
 
 
 @dataclass(frozen=True)
-class ExactModel(Controller):
+class ExactModel(ControllerWrapper):
     """The wrapped controller with the exact model: the plant's exact parameters, or the reality where the problem has one.
 
     Args:
@@ -24,18 +23,6 @@ class ExactModel(Controller):
     Raises:
         NotSupported: a foreign reality, or one whose coordinates or orders are not the model's.
     """
-
-    controller: Controller
-
-    @property
-    def inner(self) -> Controller:
-        """The wrapped controller."""
-        return self.controller
-
-    @property
-    def deformation(self) -> Deformation:
-        """The deformation of the wrapped controller."""
-        return self.controller.deformation
 
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""

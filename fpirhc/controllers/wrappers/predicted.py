@@ -35,9 +35,10 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
+from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.reference_states import own_signals
-from fpirhc.deformation.base import Deformation, with_inner
+from fpirhc.deformation.base import with_inner
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
@@ -171,7 +172,7 @@ class ByDesired(Predictor):
 
 
 @dataclass(frozen=True)
-class Predicted(Controller):
+class Predicted(ControllerWrapper):
     """The wrapped controller on the predicted state.
 
     Args:
@@ -185,7 +186,6 @@ class Predicted(Controller):
         InvalidValue: a dead time that is negative or not finite; a longest one that is shorter than their sum.
     """
 
-    controller: Controller
     inputs: float
     measurement: float = 0.0
     by: Predictor = field(default_factory=ByModel)
@@ -199,16 +199,6 @@ class Predicted(Controller):
         for name, value in (("inputs", self.inputs), ("measurement", self.measurement)):
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidValue(f"Predicted({name}={value!r}): expected a number of seconds of at least 0")
-
-    @property
-    def inner(self) -> Controller:
-        """The wrapped controller."""
-        return self.controller
-
-    @property
-    def deformation(self) -> Deformation:
-        """The deformation of the wrapped controller."""
-        return self.controller.deformation
 
     @property
     def feeds(self) -> Mapping[str, str]:
