@@ -16,13 +16,13 @@ import fpirhc as fp
 from fpirhc.contraction.gains import assess_gain
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
-from fpirhc.review.answer import duration, per_cycle
+from fpirhc.review.answer import Verdict, duration, per_cycle
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
 from fpirhc.review.questions.commands import commands_inside
 from fpirhc.review.questions.convergence import _NEAR, _without, box_converges, converges
 from fpirhc.review.questions.gain import gain_admissible, gain_of_target
-from fpirhc.review.questions.margins import margins_enough
+from fpirhc.review.questions.margins import LEAST_PHASE, MARGINS, margins_enough
 from fpirhc.review.questions.slew import effect, range_enough, slew_enough
 from fpirhc.review.recommended_gain import FAR, recommended_gain
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
@@ -438,3 +438,17 @@ def test_range_of_the_commands():
     )
     none = commands([[math.nan, math.nan]], (-4.0, 8.0))
     assert (none.verdict, none.evidence) == ("unknown", "no finite command is known")
+
+
+def test_a_plain_form_without_margins_is_told_of_a_form_that_has_them():
+    """A lower gain of the plain form is later still, and its plan needs the gain that it has; the other form has the margins."""
+    task = fp.load_problem("leaking_tanks")
+    plain = task.controllers["RHC+FPI"]
+    passing = plain.with_deformation(fp.ModelReferenced(plain.deformation))
+    found = fp.review(task.problem, {"plain": plain, "passing": passing}, seed=0, mismatch=0.0).controllers
+    late, good = (next(a for a in found[name] if a.question == MARGINS) for name in ("plain", "passing"))
+    assert late.numbers["phase_margin"] < LEAST_PHASE
+    assert late.change.startswith(
+        "Use a form that passes the desired response at once (ModelReferenced, Increment), or "
+    )
+    assert (good.verdict, good.change) == (Verdict.YES, "")

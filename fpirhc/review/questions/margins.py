@@ -34,6 +34,10 @@ _LOWEST = 1e-5  # of the Nyquist frequency
 _DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
 _STEPS, _TOGETHER = 60, 5
 _ITERATIONS = 60  # of a root
+_LOWER = "Lower the map's gain"
+_PASSING = (
+    "Use a form that passes the desired response at once (ModelReferenced, Increment)"  # a lower gain is later still
+)
 SLOWER = "Let it learn more slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
 
 
@@ -73,7 +77,7 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         text += "; neutral modes that no judged coordinate shows are left out"
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     gentler = "weigh the inputs more" if planned else "lower the rate"
-    change = "" if good else f"Lower the map's gain, or {gentler}." if adapts else f"{gentler.capitalize()}."
+    change = "" if good else f"{_LOWER}, or {gentler}." if adapts else f"{gentler.capitalize()}."
     return Answer(MARGINS, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
 
 
@@ -256,7 +260,9 @@ def _first(poles: Callable[[np.ndarray], np.ndarray], most: float) -> float:
 
 def _asked(case: Case) -> Answer:
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
-    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
+    answer = margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
+    late = adapts and case.controller.deformation.iteration.slows_desired
+    return replace(answer, change=answer.change.replace(_LOWER, _PASSING, 1)) if late else answer
 
 
 QUESTIONS = (ControllerQuestion(_asked, MARGINS, order=22, adaptive=False),)
