@@ -60,7 +60,8 @@ def faults(path: Path) -> list[ModuleFault]:
 def _without_effect(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
     """Begin and end of annotations, of what stands under `if TYPE_CHECKING`, and of values that no result depends on.
 
-    These are EXAMPLES, whose numbers the laws do not need, `order=`, which sorts columns, and `strict=` of equal lengths.
+    These are EXAMPLES and `examples`, whose numbers the laws do not need, `order=`, which sorts columns, and `strict=` of equal
+    lengths.
     """
     for node in ast.walk(tree):
         parts = [getattr(node, "annotation", None), getattr(node, "returns", None)]
@@ -68,6 +69,8 @@ def _without_effect(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[i
             parts.append(node.value)
         if isinstance(node, ast.Assign) and [getattr(t, "id", "") for t in node.targets] == ["EXAMPLES"]:
             parts.append(node.value)
+        if isinstance(node, ast.FunctionDef) and node.name == "examples":
+            parts.extend(node.body)
         for part in parts:
             if part is not None:
                 yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.deformation.wrappers.guarded import EVENTS
 
 LARGEST = 50.0
@@ -152,3 +153,11 @@ def test_every_event_has_a_description():
     """Six numbers, each with words of its own."""
     assert sorted(EVENTS) == [1, 2, 3, 4, 5, 6]
     assert len(set(EVENTS.values())) == 6
+
+
+@pytest.mark.parametrize("wrapper", [lambda m: fp.Guarded(m, largest_deformation=LARGEST), fp.BeyondLimit])
+def test_a_wrapper_that_changes_no_pair_may_stand_around_a_model_referenced_form(wrapper):
+    """A form compares the response with its own; a filter around it would change one of the two alone."""
+    form = fp.ModelReferenced(fp.Affine(gain=-0.6))
+    assert form_inside(wrapper(form)) is None
+    assert form_inside(wrapper(fp.Increment(form, cycles=0))) is not None

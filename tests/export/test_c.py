@@ -156,10 +156,10 @@ def test_a_number_that_must_follow_from_a_setting_is_not_left_behind():
     """The law's exact step for another rate is computed in Python, so its rate cannot be live on a device."""
     task = fp.load_problem("two_mass")
     law = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=50.0))
-    assert device_of(task.problem, law, "law", live=["tracking.rate"]).bounds["tracking.rate"][0] >= 0
-    fractional = replace(law, tracking=fp.Fractional(rate=6.0, order=0.9))
+    assert device_of(task.problem, law, "law", live=["tracking.rate"], cycles=1).bounds["tracking.rate"][0] >= 0
+    fractional = replace(law, tracking=fp.Fractional(rate=6.0, order=0.9, memory=0.2))
     with pytest.raises(NotSupported, match="must not stay as it was"):
-        device_of(task.problem, fractional, "fractional", live=["tracking.rate"])
+        device_of(task.problem, fractional, "fractional", live=["tracking.rate"], cycles=1)
 
 
 # A solver that fails

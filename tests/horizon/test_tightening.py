@@ -129,7 +129,7 @@ def test_margins_verified_on_a_box_of_parameters_serve_a_plant_in_it():
 
 
 def test_mistakes_are_named():
-    problem = carriage()
+    problem = replace(carriage(), duration=1.2)
     free = replace(problem, limits=fp.Limits())
     with pytest.raises(InvalidProblem, match="no hard limits of states"):
         fp.tightened(free, adaptive())
@@ -140,7 +140,7 @@ def test_mistakes_are_named():
     with pytest.raises(InvalidValue, match="passes=-1"):
         fp.tightened(problem, adaptive(), passes=-1)
     with pytest.raises(NotSupported, match=r"after 1 runs the plant still passes its limits \('q' by"):
-        fp.tightened(replace(problem, duration=1.2), adaptive(), passes=1, widen=0.01)
+        fp.tightened(problem, adaptive(), passes=1, widen=0.01)
     with pytest.raises(InvalidProblem, match="leaves nothing between its limits"):
         fp.tightened(problem, adaptive(), widen=1000.0)
     with pytest.raises(InvalidValue, match="one for every stage"):

@@ -12,6 +12,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import named_in_task
 from fpirhc.errors import FpirhcError, InvalidShape, InvalidValue
 from fpirhc.status import Status
+from fpirhc.symbolic.native import find_compiler
 
 PLANT = fp.Plant(
     coordinates={"y": "m"},
@@ -56,6 +57,7 @@ def test_it_says_what_it_is():
     assert one.deadline is None
     assert "command" in one.signals
     assert repr(stepper(controller=named_in_task(CONTROLLER, "mine"))).startswith(f"Stepper({PROBLEM.name}, mine, ")
+    assert fp.Stepper(PROBLEM, CONTROLLER).compiled == (find_compiler() is not None)
 
 
 def test_results_are_nobody_elses():
@@ -213,3 +215,85 @@ def test_steps_are_timed_where_there_is_a_deadline():
     assert one.deadline is not None
     assert (one.deadline.cycles, one.deadline.late, one.deadline.worst) == (3, 1, 0.5)
     assert str(one.deadline) in repr(one)
+
+
+def test_live_settings_are_named_with_the_interval_that_a_device_may_accept():
+    """Gains from that at which 1 - a J = -1, with J = 1.2, up to none; an attribute that is not there is named."""
+    one = stepper(live=["deformation.gain"])
+    assert one.settings.names == ("setting.deformation.gain",)
+    assert one.bounds()["deformation.gain"] == pytest.approx((-2 * 2 / 1.2, 0.0), abs=1e-5)
+    assert plain().settings.names == ()
+    with pytest.raises(AttributeError, match="Stepper has no attribute 'mesures'"):
+        one.mesures  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_arrays_are_taken_as_they_are_and_anything_else_is_looked_at(monkeypatch):
+    """Of each of the three: a masked array, whose numbers are not all there, is an array to a view."""
+    one, looked = stepper(), []
+    given = (*SAMPLE, one.start())
+    monkeypatch.setattr(one._arguments, "accept", lambda *arguments: looked.append(arguments))
+    one.step(*given)
+    assert not looked
+    for place in (1, 2, 3):
+        time, state, realised, memory = (np.ma.asarray(v) if k == place else v for k, v in enumerate(given))
+        one.step(time, state, realised, memory)  # type: ignore[arg-type]
+        assert len(looked) == place
+
+
+@pytest.mark.parametrize("cycles", [2, 3, 6])
+def test_a_missed_cycle_is_one_without_a_sample(cycles):
+    """The commands and memories after it are those of a caller who came in time and had nothing to show."""
+    one = stepper()
+    _, memory = one.step(*SAMPLE, one.start())
+    by_hand = memory
+    for k in range(1, cycles):
+        _, by_hand = one.step(0.01 * k, np.full(2, np.nan), SAMPLE[2], by_hand)
+    for expected, given in zip(
+        one.step(0.01 * cycles, *SAMPLE[1:], by_hand), one.step(0.01 * cycles, *SAMPLE[1:], memory), strict=True
+    ):
+        np.testing.assert_allclose(given, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("cycles", "stepped"), [(30, 29), (5000, 500)])
+def test_missed_cycles_are_counted_where_they_are_too_many_to_be_stepped_over(cycles, stepped, monkeypatch):
+    """Each once, however often it happens; the time of a step has a bound."""
+    one, evaluated = stepper(), []
+    evaluate = one._evaluate
+    monkeypatch.setattr(one, "_evaluate", lambda: evaluated.append(evaluate()))
+    _, memory = one.step(*SAMPLE, one.start())
+    for turn in (1, 2):
+        evaluated.clear()
+        _, memory = one.step(0.01 * cycles * turn, *SAMPLE[1:], memory)
+        assert one.trace()["skipped"] == turn * (cycles - 1)
+        assert len(evaluated) == stepped + 1
+
+
+def test_a_solver_that_fails_in_a_missed_cycle_fails_the_step():
+    """The command is held, all cycles count, and the stepper is as it was for the next one."""
+    one = stepper()
+    command, memory = one.step(*SAMPLE, one.start())
+    evaluate, one._evaluate = one._evaluate, lambda: None
+    held, after = one.step(0.03, *SAMPLE[1:], memory)
+    one._evaluate = evaluate
+    np.testing.assert_array_equal(held, command)
+    assert (status(one), one.why_failed) == (Status.SOLVER_FAILED, "the compiled solver failed")
+    assert one.trace()["skipped"] == 3
+    one.step(0.04, *SAMPLE[1:], after)
+    assert one.trace()["skipped"] == 3
+    assert status(one) == Status.BRIDGED
+
+
+def test_what_is_no_failure_of_a_solver_is_raised():
+    """An interruption inside compiled code comes as its cause, and the stepper stays usable."""
+    one = stepper()
+    evaluate = one._evaluate
+
+    def interrupted():
+        raise SystemError("in a callback") from KeyboardInterrupt()
+
+    one._evaluate = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        one.step(*SAMPLE, one.start())
+    one._evaluate = evaluate
+    one.step(*SAMPLE, one.start())
+    assert status(one) == Status.OK
