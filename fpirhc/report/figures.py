@@ -292,7 +292,7 @@ def _draw_factor(axis: Axes, name: str, scale: float, entries: Sequence[Entry], 
         sectors.setdefault(round(sector, 3), colour)
     for sector, colour in sectors.items():
         if sector and abs(sector) < 0.999 * abs(limit):
-            axis.axvline(scale * sector, color=colour, lw=0.8, ls=":", label="sector limit")
+            axis.axvline(scale * sector, color=colour, lw=1.6, ls=":", label="sector limit")
     axis.set_ylim(0, 1.6)
     axis.locator_params(axis="x", nbins=7)
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from hand_made_runs import CYCLES, SOLVE
 
+import fpirhc as fp
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
 from fpirhc.studies.comparison.caveats import Yardstick
-from fpirhc.studies.comparison.entry import Entry
+from fpirhc.studies.comparison.entry import Entry, no_bound_because
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.timing import CycleTime, Price
 from fpirhc.studies.comparison.verdict import findings
@@ -370,6 +371,22 @@ def test_an_exact_model_that_is_worse_is_no_bound():
         "does not hold the wind."
     )
     assert len(said(*pair, entry("exact", errors={"y": 0.0105}, facts=exact))) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("cart_pole_slots", "its law makes this error with a right model too"),
+        ("mass_spring_slots", "its law makes this error with a right model too"),
+        ("fishery", "its cost weighs more than the error, so the best plan has not the smallest error"),
+    ],
+)
+def test_why_an_exact_model_is_no_bound_is_always_known(name, why):
+    """Where no disturbance, dead time or plan is the reason, it is the law or the cost."""
+    task = fp.load_problem(name)
+    controller = next(c for c in task.controllers.values() if isinstance(c, fp.ExactModel))
+    metrics = cast("Metrics", SimpleNamespace(statuses={"OK": 10}))
+    assert no_bound_because(task.problem, controller, metrics, None) == (why,)
 
 
 def test_a_learner_that_does_worse_than_its_fixed_model_is_named():
