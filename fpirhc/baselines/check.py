@@ -74,7 +74,7 @@ def check_file(
     try:
         task = load_problem(path)
     except FpirhcError as error:
-        return Judgement(Path(path).stem, broken=str(error))
+        return Judgement(Path(path).stem or path, broken=str(error))
     return check_baseline(task, baselines=baselines, compiled=compiled, processes=processes, progress=progress)
 
 

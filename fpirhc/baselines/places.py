@@ -86,7 +86,7 @@ def check_inside(path: Path, working: Path) -> None:
     """Raise unless `path` lies in the project: the nearest folder above `working` with .git or pyproject.toml, or `working`.
 
     Raises:
-        OutputError: the path lies elsewhere, after links are resolved.
+        OutputError: the path lies elsewhere, after links are resolved, or below a file.
     """
     working = working.resolve()
     marks = (".git", "pyproject.toml")
@@ -96,3 +96,6 @@ def check_inside(path: Path, working: Path) -> None:
             f"'{path}' lies outside of the project '{root}' and is not written; "
             "go to the problem's own project, or give --baselines FOLDER"
         )
+    there = next(one for one in path.resolve().parents if one.exists())
+    if not there.is_dir():
+        raise OutputError(f"cannot write '{path}': '{there}' is a file; give another folder by --baselines")

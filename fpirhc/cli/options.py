@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -47,6 +48,11 @@ def whole(least: int) -> Callable[[str], int]:
     return number
 
 
+def positive(text: str) -> float:
+    """A number above 0."""
+    return _number(text, text, lambda one: 0 < one < math.inf, "a number above 0")
+
+
 def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:
     """--mismatch PERCENT, with the same meaning wherever it stands; see `fpirhc.plant.mismatch`."""
     text = (
@@ -57,17 +63,25 @@ def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:
 
 
 def percent(text: str) -> float:
-    """A percentage, '20%' or '20'; what it is for says which ones are possible."""
+    """A percentage, '20%' or '20'."""
+    digits = text.strip().removesuffix("%")
+    return _number(text, digits, lambda one: 0 <= one < 100, "percent from 0 to below 100, such as 20%")
+
+
+def _number(text: str, digits: str, fits: Callable[[float], bool], expected: str) -> float:
     try:
-        return float(text.strip().removesuffix("%"))
+        value = float(digits)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no percentage; write 20 or 20%") from None
+        value = math.nan
+    if fits(value):
+        return value
+    raise argparse.ArgumentTypeError(f"expected {expected}, got '{text}'")
 
 
 def add_scenarios(parser: Parser, default: int | None, text: str) -> None:
     """--scenarios N, formerly --seeds."""
-    parser.add_argument("--scenarios", type=int, default=default, metavar="N", help=text)
-    parser.add_argument("--seeds", action=Former, type=int, dest="scenarios", new="--scenarios")
+    parser.add_argument("--scenarios", type=whole(1), default=default, metavar="N", help=text)
+    parser.add_argument("--seeds", action=Former, type=whole(1), dest="scenarios", new="--scenarios")
 
 
 def add_cases(parser: Parser, text: str) -> None:

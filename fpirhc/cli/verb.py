@@ -93,7 +93,11 @@ def _unknown(parser: Parser, words: str) -> str:
 
     first = words.split()[0]
     if first.startswith("-"):
+        from fpirhc.task.problem import Problem
+
         options = [name for name in parser._option_string_actions if name.startswith("--")]
+        if first[2:].replace("-", "_") in Problem.__dataclass_fields__:
+            return f"the option '{first}' is unknown; write Problem({first[2:].replace('-', '_')}=...) in the problem file."
         return f"the option '{first}' is unknown.{nearest(first, options)}"
     needed = [str(one.metavar or one.dest) for one in parser._actions if not one.option_strings]
     return f"'{first}' is a word too many; write {' '.join((parser.prog, *needed))} [options]."

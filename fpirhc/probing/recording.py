@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +34,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
     responses = response_names(plant)
     lower = {name: name[:-1] for name in responses}
     needed = ("time", *plant.inputs, *plant.state.elements)
-    for name in needed:
-        if name not in columns:
-            mistakes.add(f"it has no column '{name}'; its columns are {', '.join(columns)}")
+    lacking(columns, needed, mistakes)
     for name in responses:
         if name not in columns and lower[name] not in columns:
             mistakes.add(f"it has no column '{name}', nor '{lower[name]}' to take the difference of")
@@ -55,10 +53,18 @@ def read_recording(path: Path, problem: Problem) -> Record:
     return Record(measured, modelled, usable)
 
 
+def lacking(columns: Mapping[str, np.ndarray], needed: Sequence[str], mistakes: Mistakes, what: str = "") -> None:
+    """Add one mistake that names all columns that are missing, and those that there are."""
+    missing = [name for name in needed if name not in columns]
+    if missing:
+        some = "a column" if len(missing) == 1 else "columns"
+        mistakes.add(f"it lacks {some} for {', '.join(missing)}{what}; its columns are {', '.join(columns)}")
+
+
 def check_times(columns: Mapping[str, np.ndarray], problem: Problem, mistakes: Mistakes) -> None:
     """Add a mistake where the times are missing, or are not a period apart."""
     if "time" not in columns:
-        mistakes.add(f"it has no column 'time'; its columns are {', '.join(columns)}")
+        lacking(columns, ["time"], mistakes)
         return
     steps = np.diff(columns["time"])
     if not len(steps) or not np.all(np.abs(steps - problem.period) <= _EVEN * problem.period):
@@ -73,20 +79,26 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            head, *rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+            lines = csv.reader(file)
+            numbered = [(lines.line_num, row) for row in lines if row and not row[0].startswith("#")]
     except OSError as error:
         raise InvalidValue(f"recording '{path}' cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, ValueError) as error:
+    except (ValueError, csv.Error) as error:
         raise InvalidValue(f"recording {path}: cannot be read as a CSV file with a line of names ({error})") from None
+    if not numbered:
+        raise InvalidValue(f"recording {path}: is empty; expected a line of names, such as time, and rows of numbers")
+    (_, head), *rows = numbered
     values = []
-    for number, row in enumerate(rows, start=2):
+    for number, row in rows:
         if len(row) != len(head):
-            raise InvalidValue(f"recording {path.name}: row {number} has {len(row)} entries, the first one {len(head)}")
+            raise InvalidValue(
+                f"recording {path.name}: line {number} has {len(row)} entries, the line of names {len(head)}"
+            )
         try:
             values.append([float(entry) if entry.strip() else np.nan for entry in row])
         except ValueError:
             raise InvalidValue(
-                f"recording {path.name}: row {number} is not made of numbers: {', '.join(row)}"
+                f"recording {path.name}: line {number} is not made of numbers: {', '.join(row)}"
             ) from None
     table = np.array(values).reshape(-1, len(head))
     return {name.strip(): column for name, column in zip(head, table.T, strict=True)}

@@ -17,7 +17,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import Mistakes, OutputError
 from fpirhc.fields.checked import checked_call
-from fpirhc.probing.recording import check_times, columns_of
+from fpirhc.probing.recording import check_times, columns_of, lacking
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
 from fpirhc.task.problem import Problem
@@ -106,16 +106,12 @@ def _table(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Measurements in the order of the controller, and recorded commands."""
     mistakes, period, inputs = Mistakes(f"recording {name}"), problem.period, tuple(problem.plant.inputs)
-    values: dict[str, np.ndarray] = {}
+    values = dict(columns)
     for one in measures:
-        if one in columns:
-            values[one] = columns[one]
-        elif one.endswith("'") and one[:-1] in columns:
-            values[one] = np.diff(columns[one[:-1]], prepend=columns[one[:-1]][:1]) / period
-        else:
-            mistakes.add(
-                f"it has no column '{one}', which the controller is given; its columns are {', '.join(columns)}"
-            )
+        lower = one.removesuffix("'")
+        if one not in columns and lower in columns:
+            values[one] = np.diff(columns[lower], prepend=columns[lower][:1]) / period
+    lacking(columns, [one for one in measures if one not in values], mistakes, ", which the controller is given")
     present = [one for one in inputs if one in columns]
     if present and len(present) < len(inputs):
         mistakes.add(

@@ -101,7 +101,8 @@ def _check_names(problem: Problem, setpoints: Mapping[str, object]) -> None:
     for name in named_entries("setpoints", setpoints):
         if not known:
             raise InvalidName(
-                f"set-point '{name}': the reference {type(problem.reference).__name__} is given none; use Setpoint(...)"
+                f"set-point '{name}': the reference of the problem, a {type(problem.reference).__name__}, has no set-points; "
+                "use fp.Setpoint(...) in the problem file"
             )
         if name not in known:
             raise InvalidName(f"set-point '{name}' is unknown.{nearest(str(name), known)}")

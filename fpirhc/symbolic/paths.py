@@ -45,6 +45,7 @@ def content_at(owner: object, path: str, what: str = "the controller") -> object
         valid = names_in(value)
         if name not in valid:
             where = f"'{'.'.join(done)}' of {what}" if done else what
+            kind = "" if isinstance(value, Mapping | Sequence) else f" ({type(value).__name__})"
             below = [".".join((*done, one)) for one in paths_to(name, value)]
             hint = f" Did you mean '{below[0]}'?" if below else nearest(name, valid)
             if not valid:
@@ -54,7 +55,6 @@ def content_at(owner: object, path: str, what: str = "the controller") -> object
                     if others
                     else " It has no settings."
                 )
-            kind = "" if isinstance(value, Mapping) else f" ({type(value).__name__})"
             raise InvalidName(f"setting '{path}': {where}{kind} has no '{name}'.{hint}")
         value = entry(value, name)
         done.append(name)

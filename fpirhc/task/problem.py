@@ -12,7 +12,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration, finite_number
 from fpirhc.horizon.cost import Cost
@@ -120,7 +120,7 @@ class Problem(Checked):
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
-            lambda: self.reference_function,
+            lambda: _check_reference(self),
             lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
@@ -461,6 +461,18 @@ def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Boun
 _GAINS: Latest[ca.Function] = Latest(4)
 
 
+def _check_reference(problem: Problem) -> None:
+    """Raise where the reference is wrong, or not finite at the first or the last instant."""
+    function, plant = nominal(problem.reference).function(problem.plant), problem.plant
+    names = [*plant.output.elements, *(f"{c}{chr(39) * order}" for c, order in plant.chains.items())]
+    for t in (0.0, problem.duration):
+        values = np.concatenate([np.asarray(part.full()).ravel() for part in function(t)])
+        wrong = [f"{name} is {value:g}" for name, value in zip(names, values, strict=True) if not np.isfinite(value)]
+        if wrong:
+            where = f"reference: at t = {t:g} {problem.time_unit}"
+            raise InvalidProblem(f"{where} {', '.join(wrong)}; give a motion that has these values")
+
+
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
     plant = problem.plant
@@ -483,7 +495,10 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
         gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
         if not np.all(np.isfinite(free)):
             name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
-            mistakes.add(f"the response of '{name}' ({which} parameters) is not finite at the start ({state})")
+            mistakes.add(
+                f"the response of '{name}' ({which} parameters) is not finite at the start ({state}); "
+                "start elsewhere, or change what is divided by zero there"
+            )
         elif plant.equations.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
             weakest = plant.input.elements[int(np.argmin(np.linalg.norm(gain, axis=0)))]
             mistakes.add(

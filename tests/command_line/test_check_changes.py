@@ -13,7 +13,7 @@ from fpirhc.baselines.judging import BETTER, CHANGED, HOLDS, WORSE, Judgement, R
 from fpirhc.baselines.measuring import FINISHED, Measurement
 from fpirhc.baselines.outline import change, outline
 from fpirhc.baselines.printing import show_check, to_markdown
-from fpirhc.cli.verbs.check import _share
+from fpirhc.cli.options import percent
 
 
 def expected(**values: float) -> Expected:
@@ -130,14 +130,14 @@ def test_a_floor_ignores_small_changes_and_nothing_else():
     assert ignoring(Judgement("case", rows[:1]), 1e-3).holds
 
 
-@pytest.mark.parametrize(("text", "share"), [("0.1%", 1e-3), ("0.1", 1e-3), ("0", 0.0), ("2 %", 0.02)])
-def test_the_floor_is_a_percentage(text, share):
+@pytest.mark.parametrize(("text", "value"), [("0.1%", 0.1), ("0.1", 0.1), ("0", 0.0), ("2 %", 2.0)])
+def test_the_floor_is_a_percentage(text, value):
     """With or without the sign."""
-    assert _share(text) == pytest.approx(share)
+    assert percent(text) == value
 
 
 @pytest.mark.parametrize("text", ["-1%", "a bit", "100%", "nan"])
 def test_a_wrong_floor_is_refused(text):
     """The message shows how to write one."""
-    with pytest.raises(argparse.ArgumentTypeError, match=r"write 0\.1%"):
-        _share(text)
+    with pytest.raises(argparse.ArgumentTypeError, match=r"expected percent .* such as 20%"):
+        percent(text)

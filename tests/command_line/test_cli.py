@@ -196,7 +196,7 @@ def test_optimisers_are_compared_by_name(folder, capsys):
         (["solve", "line.py", "--optimisers", "ipop"], "Did you mean 'ipopt'"),
         (["compare", "line.py", "--optimisers", "fixd-point"], "Did you mean 'fixed-point'"),
         (["compare", "line.py", "--optimisers", "all", "--controllers", "CTC"], "plans with an optimiser"),
-        (["solve", "line.py", "--tolerance", "-1"], "positive tolerance"),
+        (["solve", "line.py", "--tolerance", "-1"], "expected a number above 0"),
     ],
 )
 def test_wrong_optimisers_are_named(folder, capsys, command, message):

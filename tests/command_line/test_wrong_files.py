@@ -7,6 +7,7 @@ expected, and a fix; all mistakes of one file stand in it; the exit code is that
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import dataclass, field
 from inspect import signature
 from pathlib import Path
@@ -24,6 +25,13 @@ REVIEW = ("review", "mine.py")
 ANGLE_COST = """fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2})"""
 ANGLE_MOTION = 'fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)})'
 ANGLE_LIMITS = 'fp.Limits(inputs={"torque": (-15.0, 15.0)})'
+BESIDE = {
+    "notes.txt": "x = 1\n",
+    "two_mess.py": "1 / 0\n",
+    "empty.csv": "",
+    "words.csv": "# of Monday\n\ntime,angle\n0,abc\n",
+    "other.csv": "time,phi\n0,1\n0.02,1\n",
+}
 BOTH = '{"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)}'
 
 
@@ -53,7 +61,7 @@ def one(file: str, old: str, new: str, *said: str) -> Wrong:
 
 def line(words: str, *said: str) -> Wrong:
     """A wrong command line beside a correct file."""
-    return Wrong(PENDULUM, (), said, tuple(words.split()), {"notes.txt": "x = 1\n", "two_mess.py": "1 / 0\n"})
+    return Wrong(PENDULUM, (), said, tuple(shlex.split(words)), BESIDE)
 
 
 PLANTS = {
@@ -331,6 +339,21 @@ PROBLEMS = {
         "expected a function of 1 argument",
         "write lambda t: {'angle': 0.8}",
     ),
+    "reference that is not finite": one(
+        PENDULUM,
+        "0.8 * ca.sin(2 * t)",
+        "ca.sqrt(t)",
+        "mine.py, line 23",
+        "reference: at t = 0 s angle' is inf, angle'' is -inf",
+        "give a motion that has these values",
+    ),
+    "response that divides by zero": one(
+        PENDULUM,
+        "ca.sin(q.angle)",
+        "ca.sin(q.angle) / q.angle",
+        "the response of 'angle' (approximate parameters) is not finite at the start (angle = 0, angle' = 0)",
+        "start elsewhere, or change what is divided by zero there",
+    ),
     "reference that jumps": one(
         PENDULUM,
         "0.8 * ca.sin(2 * t)",
@@ -530,10 +553,10 @@ LINES = {
             "PROBLEM (name of a shipped problem, or path of a problem file) is missing. See fpirhc compare --help.",
         ),
         line("run", "problem file) and CONTROLLER (name of a controller in the problem file) are missing."),
-        line("compare mine.py --seed abc", "--seed 'abc': expected a whole number. See fpirhc compare --help."),
+        line("compare mine.py --seed abc", "--seed: expected a whole number of at least 0, got 'abc'."),
         line("compare mine.py --seed", "--seed needs a value: --seed K. See fpirhc compare --help."),
         line("compare mine.py --s 3", "the option '--s' may be --seed, --scenarios or --seeds; write the whole name."),
-        line("compare mine.py --mismatch x", "fpirhc: --mismatch: 'x' is no percentage; write 20 or 20%."),
+        line("compare mine.py --mismatch x", "--mismatch: expected percent from 0 to below 100, such as 20%, got 'x'."),
         line("completion basch", "SHELL 'basch' is unknown. Did you mean 'bash'? Valid: bash, zsh, fish, tcsh."),
         line("compare mine.py two_mass", "'two_mass' is a word too many; write fpirhc compare PROBLEM [options]"),
         line(
@@ -542,12 +565,118 @@ LINES = {
             "names are separated by spaces, without commas",
         ),
         line("compare mine.py --mismatch 20", "--mismatch needs --scenarios N"),
-        line("review mine.py --mismatch 120%", "mismatch 120.0: expected percent of at least 0 and below 100"),
+        line(
+            "review mine.py --mismatch 120%",
+            "--mismatch: expected percent from 0 to below 100, such as 20%, got '120%'.",
+        ),
         line("run mine.py fpi", "controller 'fpi' is unknown. Did you mean 'RHC+FPI'?"),
         line("run mine.py RHC+FPI --set gain=-2", "Did you mean 'optimiser.map.gain' or 'deformation.map.gain'?"),
         line("run mine.py RHC+FPI --set deformation.gain=-2", "has no 'gain'. Did you mean 'deformation.map.gain'?"),
         line("run mine.py RHC --set mass=2", "Parameters (exact and approximate) and the start are data of every loop"),
         line("check mine.py", "there is no baseline 'mine.json'; write one: fpirhc accept PROBLEM --reason ..."),
+        # new
+        line("new ../my-arm", "'../my-arm' is no name for a problem", "Try 'my_arm'; a folder is given by --dir"),
+        line("new class", "'class' cannot be the name of a problem: it is a word of Python. Try 'my_class'"),
+        line(
+            "new two_mass", "'two_mass' cannot be the name of a problem: a shipped problem has it", "Try 'my_two_mass'"
+        ),
+        line("new numpy", "a module of that name is installed, which the file would hide from everything beside it."),
+        line("new mine", "'mine.py' exists already and is kept; choose another name or --dir"),
+        # review
+        line("review folder.py", "'folder.py' is a folder; a problem file ends in .py"),
+        line(
+            "review mine.py --controllers", "--controllers needs a value: --controllers NAME. See fpirhc review --help."
+        ),
+        line(
+            "review mine.py --controllers RCH abc",
+            "1. controller 'RCH' is unknown. Did you mean 'RHC'?",
+            "2. controller 'abc' is unknown. Valid: RHC, RHC+FPI.",
+        ),
+        line(
+            "review mine.py --mismatch -5", "--mismatch: expected percent from 0 to below 100, such as 20%, got '-5'."
+        ),
+        line(
+            "review mine.py --mismatch nan", "--mismatch: expected percent from 0 to below 100, such as 20%, got 'nan'."
+        ),
+        # compare
+        line("compare mine.py --out notes.txt/a", "cannot write to the folder 'notes.txt/a': it is a file"),
+        line("compare mine.py --headline rms_error", "has a number for every coordinate; give one: 'rms_error.NAME'"),
+        line("compare mine.py --headline rms_error.angel", "is unknown. Did you mean 'rms_error.angle'?"),
+        line(
+            "compare mine.py --headline max_error.phi",
+            "is unknown. Did you mean 'max_error.angle'? Valid: max_error.angle.",
+        ),
+        line("compare mine.py --headline effort.torque", "metric 'effort' has no better direction"),
+        line("compare mine.py --headline ''", "metric '' is unknown. Valid: relative error, cycles, rms_error"),
+        line("compare mine.py --tuned gone.json", "'gone.json': No such file", "'fpirhc tune mine' writes such a file"),
+        line("compare mine.py --scenarios 0", "--scenarios: expected a whole number of at least 1, got '0'."),
+        line("compare mine.py --processes 2", "--processes needs --scenarios N, the number of scenarios"),
+        # run
+        line("run mine.py RHC RHC+FPI", "'RHC+FPI' is a word too many; write fpirhc run PROBLEM CONTROLLER [options]."),
+        line(
+            "run mine.py RHC --duration 0", "'--duration' is unknown; write Problem(duration=...) in the problem file."
+        ),
+        line("run mine.py RHC --dead-time 1", "write Problem(dead_time=...) in the problem file."),
+        line("run mine.py RHC --set =3", "--set =3: expected PATH=NUMBER"),
+        line(
+            "run mine.py RHC+FPI --set deformation.map.gain=abc", "expected PATH=NUMBER, such as deformation.gain=-1.2"
+        ),
+        line("run mine.py RHC+FPI --set deformation.map.gain=nan", "expected a number or (a number, ...), got nan"),
+        line("run mine.py RHC --set limits.inputs.torque=5", "is an interval: expected a pair (lower, upper), got 5.0"),
+        line("run mine.py RHC --set setpoints.angle=2", "a Trajectory, has no set-points; use fp.Setpoint(...)"),
+        line("run mine.py RHC --set optimiser.iterations=0", "FixedPoint.iterations: expected a whole number from 1"),
+        line(
+            "run mine.py RHC --case adult", "problem 'mine' has no cases; add cases = fpirhc.Cases({...}) to its file"
+        ),
+        # solve, tune
+        line(
+            "solve mine.py --tolerance 0", "--tolerance: expected a number above 0, got '0'. See fpirhc solve --help."
+        ),
+        line("solve mine.py --optimisers", "--optimisers needs a value: --optimisers NAME. See fpirhc solve --help."),
+        line(
+            "tune mine.py",
+            "no search space for tuning; add to its file",
+            "tuning = {'RHC+FPI': {'deformation.map.gain':",
+        ),
+        line("tune mine.py --trials 0", "--trials: expected a whole number of at least 1, got '0'."),
+        line("tune two_mass --metric settling.qq", "metric 'settling.qq' is unknown. Did you mean 'settling.q2'?"),
+        # replay
+        line("replay mine.py RHC", "FILE (CSV file: time, what the controller is given, and the inputs"),
+        line("replay mine.py RHC folder.py", "recording 'folder.py' cannot be read: Is a directory"),
+        line("replay mine.py RHC empty.csv", "recording empty.csv: is empty; expected a line of names, such as time"),
+        line("replay mine.py RHC words.csv", "recording words.csv: line 4 is not made of numbers: 0, abc"),
+        line(
+            "replay mine.py RHC other.csv",
+            "1. it lacks columns for angle, angle', angle'', which the controller is given; its columns are time, phi",
+            "2. its times are not 0.01 s apart, the period of the problem",
+        ),
+        line(
+            "replay mine.py RHC notes.txt",
+            "which the controller is given; its columns are x = 1",
+            "lacks a column for time",
+        ),
+        # check, accept
+        line("check nofile", "nofile: cannot be run problem 'nofile' is unknown."),
+        line("check .", ".: cannot be run '.' is a folder; a problem file ends in .py, such as mine.py"),
+        line(
+            "check mine.py --ignore-below -1",
+            "--ignore-below: expected percent from 0 to below 100, such as 20%, got '-1'",
+        ),
+        line("check mine.py --markdown gone/x.md", "cannot write to 'gone/x.md': there is no folder 'gone'"),
+        line("accept mine.py --reason ''", "say why the new numbers are right, --reason 'horizon 20 -> 30'"),
+        line(
+            "accept mine.py --reason x --processes -1", "--processes: expected a whole number of at least 1, got '-1'."
+        ),
+        line(
+            "accept mine.py --reason x --baselines notes.txt",
+            "notes.txt' is a file; give another folder by --baselines",
+        ),
+        # export, probe, limits
+        line("export mine.py RHC", "--out is missing. See fpirhc export --help."),
+        line("export mine.py RHC --out o --live optimiser.iterations", "is a whole number or a switch"),
+        line("probe mine.py --amplitude -1", "expected a number of at least 0, in the unit of the signal"),
+        line("probe mine.py --chatter 0", "expected a number above 0, in the unit of the signal"),
+        line("probe mine.py --recording words.csv", "recording words.csv: line 4 is not made of numbers: 0, abc"),
     )
 }
 WRONG = {**PLANTS, **PROBLEMS, **CONTROLLERS, **FILES, **{" ".join(words): case for words, case in LINES.items()}}
@@ -557,6 +686,7 @@ WRONG = {**PLANTS, **PROBLEMS, **CONTROLLERS, **FILES, **{" ".join(words): case 
 def test_a_wrong_file_or_command_line_is_explained(name, tmp_path, monkeypatch, capsys):
     wrong = WRONG[name]
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.py").mkdir()
     text = wrong.file
     for old, new in wrong.changes:
         assert old in text
@@ -566,7 +696,7 @@ def test_a_wrong_file_or_command_line_is_explained(name, tmp_path, monkeypatch, 
     code = main(list(wrong.words))
     printed = capsys.readouterr()
     said = " ".join((printed.out + printed.err).split())
-    assert code in (ExitCode.BAD_INPUT, ExitCode.ANSWERED_NO, ExitCode.NO_BASELINE)
+    assert code in (ExitCode.BAD_INPUT, ExitCode.ANSWERED_NO, ExitCode.NO_BASELINE, ExitCode.NOT_WRITABLE)
     assert "Traceback" not in said
     assert "an error inside" not in said
     assert "usage:" not in said

@@ -114,10 +114,13 @@ ROWS = {
         2,
         "every scenario would be the same: the problem has no disturbances and no parameter ",
     ),
-    "fpirhc compare two_mass --mismatch a": (2, "--mismatch: 'a' is no percentage; write 20 or 20%."),
+    "fpirhc compare two_mass --mismatch a": (
+        2,
+        "--mismatch: expected percent from 0 to below 100, such as 20%, got 'a'.",
+    ),
     "fpirhc review two_mass --mismatch -1": (
         2,
-        "mismatch -1.0: expected percent of at least 0 and below 100; a parameter keeps its sign",
+        "--mismatch: expected percent from 0 to below 100, such as 20%, got '-1'. See fpirhc review --help.",
     ),
     "fpirhc accept two_mass --reason x --seeds 1": (2, "--seeds: expected a whole number of at least 2, got '1'."),
     "fpirhc export two_mass CTC --out o --cycles -3": (2, "--cycles: expected a whole number of at least 1, got '-3'."),
@@ -154,10 +157,13 @@ ROWS = {
     ),
     "fpirhc export two_mass CTC --out o --live gain": (2, f"setting 'gain': {NEITHER} 'gain'."),
     # files
-    "fpirhc compare two_mass --tuned nosuch.json": (3, "cannot read 'nosuch.json': No such file or directory"),
+    "fpirhc compare two_mass --tuned nosuch.json": (
+        2,
+        "cannot read 'nosuch.json': No such file or directory; 'fpirhc tune two_mass'",
+    ),
     "fpirhc compare two_mass --tuned text.txt": (2, "'text.txt' is not a file that 'fpirhc tune' wrote"),
     "fpirhc replay two_mass CTC nosuch.csv": (2, "recording 'nosuch.csv' cannot be read: No such file or directory"),
-    "fpirhc replay two_mass CTC bad.csv": (2, "recording bad.csv: row 2 has 1 entries, the first one 2"),
+    "fpirhc replay two_mass CTC bad.csv": (2, "recording bad.csv: line 2 has 1 entries, the line of names 2"),
     "fpirhc compare two_mass --out text.txt": (
         3,
         "cannot write to the folder 'text.txt': it is a file; choose another with --out",

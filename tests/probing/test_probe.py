@@ -211,8 +211,8 @@ class Untouched:
     [
         ("time,u,q\n0,0,0\n0.01,0,0\n", "no column 'q''"),
         ("time,u,q,q',q''\n0,0,0,0,0\n0.02,0,0,0,0\n", "not 0.01 s apart"),
-        ("time,u,q,q',q''\n0,0,0,x,0\n", "row 2 is not made of numbers"),
-        ("time,u,q,q',q''\n0,0,0,0\n", "row 2 has 4 entries, the first one 5"),
+        ("time,u,q,q',q''\n0,0,0,x,0\n", "line 2 is not made of numbers"),
+        ("time,u,q,q',q''\n0,0,0,0\n", "line 2 has 4 entries, the line of names 5"),
     ],
 )
 def test_a_wrong_recording_says_what_is_wrong(tmp_path, text, words):

@@ -101,9 +101,9 @@ INPUT = next(iter(TASK.problem.plant.inputs))
 @pytest.mark.parametrize(
     ("columns", "words"),
     [
-        ({"time": TIMES}, "it has no column 'q1', which the controller is given; its columns are time"),
-        ({"time": TIMES, **{n: c for n, c in GOOD.items() if "1" in n}}, "no column 'q2'"),
-        (GOOD, "it has no column 'time'"),
+        ({"time": TIMES}, "it lacks columns for q1, q2, q1', q2'"),
+        ({"time": TIMES, **{n: c for n, c in GOOD.items() if "1" in n}}, "lacks columns for q2, q2'"),
+        (GOOD, "it lacks a column for time"),
         ({"time": 2 * TIMES, **GOOD}, "its times are not"),
         ({"time": TIMES[:1], **{n: c[:1] for n, c in GOOD.items()}}, "its times are not"),
         ({"time": TIMES[::-1], **GOOD}, "its times are not"),
@@ -124,9 +124,9 @@ def test_a_wrong_table_is_named(tmp_path, columns, words):
     ("text", "words"),
     [
         (None, "cannot be read: No such file or directory"),
-        ("", "cannot be read as a CSV file"),
-        ("time,q1\n0,one\n", "row 2 is not made of numbers: 0, one"),
-        ("time,q1\n0\n", "row 2 has 1 entries, the first one 2"),
+        ("", "is empty; expected a line of names"),
+        ("time,q1\n0,one\n", "line 2 is not made of numbers: 0, one"),
+        ("time,q1\n0\n", "line 2 has 1 entries, the line of names 2"),
     ],
 )
 def test_a_file_that_is_no_table_is_named(tmp_path, text, words):

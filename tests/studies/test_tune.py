@@ -173,7 +173,7 @@ def test_a_wrong_metric_is_refused(metric, error, message, task, tmp_path):
 
 def test_a_run_that_fails_costs_more_than_any_metric(task):
     """Between one and two penalties, less if it lasted long; settings that cannot run cost two."""
-    aim = objective("max_error.y", task.metrics)
+    aim = objective("max_error.y", task.metrics, task.problem)
     record = {"outcome": "ended early", "error": None, "lasted": 0.25, "metrics": {"max_error": {"y": None}}}
     finished = {"outcome": "finished", "error": 0.1, "lasted": 1.0, "metrics": {"max_error": {"y": 3e5}}}
     assert aim.cost(finished) == 3e5
@@ -238,7 +238,7 @@ def test_a_file_of_another_problem_is_refused(task):
     Path("t.json").write_text("[1, 2]")
     with pytest.raises(ProblemFileError, match="not a file that 'fpirhc tune' wrote"):
         read_tuned("t.json", task)
-    with pytest.raises(OutputError, match="cannot read"):
+    with pytest.raises(ProblemFileError, match="cannot read"):
         read_tuned("nowhere.json", task)
 
 

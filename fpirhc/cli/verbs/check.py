@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.cli.options import add_baselines, add_no_compile, add_processes
+from fpirhc.cli.options import add_baselines, add_no_compile, add_processes, percent
 from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     text = "show every metric, not only those that changed and the rms errors"
     parser.add_argument("--all", action="store_true", help=text)
     text = "changes smaller than this share of the old value hold, such as 0.1%%; counts and outcomes are never ignored"
-    parser.add_argument("--ignore-below", type=_share, default=0.0, metavar="PERCENT", help=text)
+    parser.add_argument("--ignore-below", type=percent, default=0.0, metavar="PERCENT", help=text)
     add_baselines(parser)
     add_processes(parser)
     add_no_compile(parser)
@@ -38,23 +37,12 @@ def _run(options: argparse.Namespace) -> ExitCode:
         check_replaceable(options.markdown, MARK)
     problems, unchecked = (options.problems, {}) if options.problems else problems_here(Path(), options.baselines)
     measured = _judgements(options, list(dict.fromkeys(map(str, problems))))
-    judgements = [ignoring(judgement, options.ignore_below) for judgement in measured]
+    judgements = [ignoring(judgement, options.ignore_below / 100) for judgement in measured]
     contents = outline(judgements, list(unchecked.items()))
     show_check(contents, options.all)
     if options.markdown:
         write_whole(to_markdown(contents), options.markdown, "report")
     return _code(judgements)
-
-
-def _share(text: str) -> float:
-    """A percentage, '0.1%' or '0.1', as a share."""
-    try:
-        percent = float(text.strip().removesuffix("%"))
-    except ValueError:
-        percent = math.nan
-    if not 0 <= percent < 100:
-        raise argparse.ArgumentTypeError(f"'{text}' is no percentage from 0 to below 100; write 0.1%")
-    return percent / 100
 
 
 def _judgements(options: argparse.Namespace, problems: Sequence[str]) -> list[Judgement]:

@@ -79,6 +79,8 @@ def numbers(settings: Sequence[str]) -> dict[str, float | tuple[float, ...]]:
     for text in settings:
         path, _, value = text.partition("=")
         try:
+            if not path.strip():
+                raise ValueError
             parts = tuple(float(part) for part in value.split(","))
         except ValueError:
             raise InvalidValue(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_optimisers, add_out, add_problem
+from fpirhc.cli.options import add_optimisers, add_out, add_problem, positive
 from fpirhc.cli.output import results_folder
 from fpirhc.cli.verb import ExitCode, Verb
 
@@ -14,7 +14,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(parser)
     add_optimisers(parser)
     text = "largest stationarity of a converged plan, in the unit of the inputs (default: 1e-6)"
-    parser.add_argument("--tolerance", type=float, default=1e-6, metavar="T", help=text)
+    parser.add_argument("--tolerance", type=positive, default=1e-6, metavar="T", help=text)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:

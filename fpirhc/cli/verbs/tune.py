@@ -6,7 +6,16 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.cli.options import add_cases, add_controllers, add_mismatch, add_out, add_problem, add_scenarios, add_seed
+from fpirhc.cli.options import (
+    add_cases,
+    add_controllers,
+    add_mismatch,
+    add_out,
+    add_problem,
+    add_scenarios,
+    add_seed,
+    whole,
+)
 from fpirhc.cli.output import results_folder, resumable
 from fpirhc.cli.verb import ExitCode, Verb
 
@@ -19,7 +28,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "results/PROBLEM/tuning_...")
     add_controllers(parser, "all with a search space in the problem file")
     text = "trials of every controller (default: 50)"
-    parser.add_argument("--trials", type=int, default=50, metavar="N", help=text)
+    parser.add_argument("--trials", type=whole(1), default=50, metavar="N", help=text)
     add_seed(parser, "the proposals and scenarios")
     add_scenarios(parser, 1, "scenarios in every trial (default: 1)")
     add_mismatch(parser)

@@ -94,7 +94,7 @@ def compare(
         InvalidProblem: unknown controllers, or deformations with a gain of the wrong sign.
     """
     begin = time.perf_counter()
-    figure = objective(headline or task.headline_metric, task.metrics, task.problem)
+    figure = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
     selected = select(task, controllers)
     mistakes = Mistakes("changes")
     mistakes.unknown("controller", changes or (), selected)

@@ -79,7 +79,7 @@ def compare_scenarios(
         WorkerDied: processes die again and again.
     """
     begin = time.perf_counter()
-    figure = objective(headline or task.headline_metric, task.metrics, task.problem)
+    figure = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
     numbers = scenario_numbers(task, count, percent, cases)
     if processes < 1:
         raise InvalidValue(f"processes {processes}: expected at least 1")

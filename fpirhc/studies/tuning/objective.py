@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
-from fpirhc.plant.motion import with_space
+from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.simulation.metrics import Metric
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
@@ -123,13 +123,13 @@ class Objective:
         return None if value is None else value * self._sign
 
 
-def objective(name: str | None, metrics: Sequence[Metric], problem: Problem | None = None) -> Objective:
+def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> Objective:
     """Return the objective by the name of a number: None for the relative error, else 'at_limit' or 'overshoot.q1'.
 
     Args:
         name: of the number.
         metrics: those that there are.
-        problem: whose units it has; None: it is shown without one.
+        problem: with the units and names of coordinates and inputs.
 
     Raises:
         InvalidName: an unknown metric.
@@ -147,5 +147,13 @@ def objective(name: str | None, metrics: Sequence[Metric], problem: Problem | No
             raise InvalidValue(
                 f"metric '{metric.name}' has a number for every {metric.by}; give one: '{metric.name}.NAME'"
             )
-        return Objective(metric, element, metric.unit_of(problem, element) if problem else "")
+        elements = _elements(metric, problem)
+        if elements and element not in elements:
+            raise InvalidName(f"metric '{name}' is unknown.{nearest(name, [metric.key(one) for one in elements])}")
+        return Objective(metric, element, metric.unit_of(problem, element))
     raise InvalidName(f"metric '{name}' is unknown.{nearest(name, [RELATIVE_ERROR, *(m.name for m in metrics)])}")
+
+
+def _elements(metric: Metric, problem: Problem) -> list[str]:
+    """Names of the metric's numbers where the problem alone decides them; none where the run does."""
+    return list({"coordinate": followed_units(problem.plant), "input": problem.plant.inputs}.get(metric.by or "", ()))

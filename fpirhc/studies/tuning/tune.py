@@ -161,7 +161,7 @@ def tune(
     # One scenario may be without draws: it is the problem itself.
     numbers = scenario_numbers(task, None if cases is not None and count == 1 else count, percent, cases, same=True)
     conditions = Conditions(seed, TUNING, float(percent), compiled, named=cases is not None)
-    aim = objective(metric or task.headline_metric, task.metrics)
+    aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
     header = {
         **fingerprint(task, conditions),
         "scenarios": list(numbers),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from fpirhc.errors import InvalidName, InvalidValue, Mistakes, OutputError, ProblemFileError
+from fpirhc.errors import InvalidName, InvalidValue, Mistakes, ProblemFileError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values, with_settings
 from fpirhc.studies.comparison.comparison import Comparison
@@ -35,7 +35,7 @@ def read_tuned(path: str | Path, task: Task) -> TunedSettings:
     """Read the file that `fpirhc tune` wrote for this problem.
 
     Raises:
-        OutputError: the file cannot be read.
+        ProblemFileError: the file cannot be read.
         ProblemFileError: the file is of another problem, or was not written by `fpirhc tune`.
     """
     try:
@@ -53,7 +53,9 @@ def read_tuned(path: str | Path, task: Task) -> TunedSettings:
             for name, entry in facts["controllers"].items()
         }
     except OSError as error:
-        raise OutputError(f"cannot read '{path}': {error.strerror}") from None
+        raise ProblemFileError(
+            f"cannot read '{path}': {error.strerror}; 'fpirhc tune {task.name}' writes such a file"
+        ) from None
     except (ValueError, KeyError, TypeError, AttributeError):
         raise ProblemFileError(f"'{path}' is not a file that 'fpirhc tune' wrote") from None
     rest = {name: "not tuned: settings of the problem file" for name in task.controllers if name not in notes}
