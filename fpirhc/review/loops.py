@@ -43,7 +43,8 @@ class Loops:
         places: indices of the loops' points among the reference's points, those at a limit left out: there nothing is fed back.
         loops: loops of the plant with its exact parameters, one for every place.
         ideal: loop of the controller without deformation whose model is the plant, the outer loop by itself; None: not computed.
-        drawn: loops of plants from the box of parameters, and with the shortest and the longest dead time of the box.
+        drawn: of a controller that adapts, loops of plants from the box of parameters, and with the shortest and the longest dead
+            time of the box.
         reason: why there are no loops; else empty.
         learns: whether the controller changes on line what the loops have as it is at their points: a model, or gains.
         draws: points and draws of the parameters of those in `drawn` that differ in nothing else.
@@ -91,12 +92,21 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     places = tuple(k for k, one in every.items() if (_fed_back(one) >= _SMALL * strongest).all())
     if not places or not (strongest.all() or all(points.asked.inside(points.quiet(k)) for k in places)):
         raise NotSupported("the command stands at a limit all along the reference")
-    pairs = _pairs(grid, places, _DRAWN if quick else _DRAWN_OF_PLANS)
+    drawn, late = _drawn(grid, controller, places, strongest) if controller.deformation.adapts else ({}, [])
+    loops, learns = tuple(every[k] for k in places), controller.learns and points.asked.keeps_learned
+    return Loops(places, loops, None, (*drawn.values(), *late), learns=learns, draws=tuple(drawn))
+
+
+def _drawn(
+    grid: ReviewGrid, controller: Controller, places: Sequence[int], strongest: np.ndarray
+) -> tuple[dict[tuple[int, int], LinearLoop], list[LinearLoop]]:
+    """Loops of plants from the box by point and draw, and of dead times at its ends: how a deformation converges all over it."""
+    points = points_of(grid, controller)
+    pairs = _pairs(grid, places, _DRAWN if points.asked.quick else _DRAWN_OF_PLANS)
     drawn = {pair: points.at(*pair) for pair in pairs if np.isfinite(grid.commands[pair[::-1]]).all()}
     drawn = {pair: one for pair, one in drawn.items() if (_fed_back(one) >= _SMALL * strongest).all()}
     late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, places[:: max(1, len(places) // 2)])]
-    loops, learns = tuple(every[k] for k in places), controller.learns and points.asked.keeps_learned
-    return Loops(places, loops, None, (*drawn.values(), *late), learns=learns, draws=tuple(drawn))
+    return drawn, late
 
 
 def _fed_back(loop: LinearLoop) -> np.ndarray:

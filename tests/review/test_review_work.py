@@ -54,3 +54,11 @@ def test_what_differs_in_nothing_is_the_same_problem():
     assert shortened(problem, 100) is shortened(problem, 100)
     assert null_problem(problem, controller) is null_problem(problem, controller)
     assert null_problem(problem, task.controllers["RHC"]) is not null_problem(problem, controller)
+
+
+def test_plants_from_the_box_are_asked_of_controllers_that_adapt_alone(monkeypatch):
+    """Without a deformation no question is about them: three points of the reference, and one with a right model."""
+    task = fp.load_problem("two_mass")
+    linear = counted(monkeypatch, AskedLoop, "_among")
+    fp.review(task.problem, {"RHC": task.controllers["RHC"]}, mismatch=20.0, seed=0)
+    assert len(linear) == 4
