@@ -86,12 +86,6 @@ def test_the_density_at_the_merge_has_order_one() -> None:
     assert 0 not in plant.equations.output_orders.values()
 
 
-@pytest.mark.parametrize(("controller", "expected"), [("CTC", 0.79), ("CTC+FPI", 0.158)])
-def test_adaptation_holds_the_density(controller: str, expected: float) -> None:
-    """The figures of the description."""
-    assert error("freeway_metering", controller) == pytest.approx(expected, rel=0.02)
-
-
 def test_an_exact_map_of_a_minute_has_no_error() -> None:
     """Six steps with the rate held are one map, whose inverse the controller has."""
     assert error("freeway_metering", "CTC exact model") < 1e-12

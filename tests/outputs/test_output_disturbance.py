@@ -183,10 +183,3 @@ def test_a_name_that_is_neither_is_named() -> None:
         sedated(hill(4.0), disturbances={"deep": WAVE})
     with pytest.raises(InvalidProblem, match="not finite"):
         sedated(hill(4.0), disturbances={"depth": fp.Formula(ca.sqrt)})
-
-
-@pytest.mark.parametrize(("name", "described"), [("RHC+FPI", 0.00943), ("RHC offset-free", 0.0109)])
-def test_the_shipped_stimulation_does_what_its_description_says(name: str, described: float) -> None:
-    task = fp.load_problem("anaesthesia_stimulated")
-    run = simulated(task.problem, task.controllers[name])
-    assert fp.measure(task.problem, run).rms_error["bis"] == pytest.approx(described, rel=0.02)

@@ -450,16 +450,6 @@ def test_a_deviation_needs_references_of_all_states() -> None:
         simulated(planned(cost=cost), fp.RecedingHorizon(OPTIMISER))
 
 
-@pytest.mark.parametrize(
-    ("name", "described"),
-    [("CTC", 0.142), ("CTC+FPI", 0.0126), ("RHC", 0.356), ("RHC consistent", 0.0851), ("RHC+FPI", 0.00875)],
-)
-def test_the_shipped_anaesthesia_does_what_its_description_says(name: str, described: float) -> None:
-    task = fp.load_problem("anaesthesia")
-    run = simulated(task.problem, task.controllers[name])
-    assert fp.measure(task.problem, run).rms_error["bis"] == pytest.approx(described, rel=0.02)
-
-
 def test_the_patients_kinetics_conserve_the_drug() -> None:
     """What is infused is in the compartments or has been cleared: V1 C1 + V2 C2 + V3 C3 changes by u - CL C1."""
     age, weight, height = 61.0, 77.0, 175.0

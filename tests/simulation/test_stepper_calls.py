@@ -223,6 +223,7 @@ def test_live_settings_are_named_with_the_interval_that_a_device_may_accept():
     assert one.settings.names == ("setting.deformation.gain",)
     assert one.bounds()["deformation.gain"] == pytest.approx((-2 * 2 / 1.2, 0.0), abs=1e-5)
     assert plain().settings.names == ()
+    assert plain().setpoints == plain().numbers == {}
     with pytest.raises(AttributeError, match="Stepper has no attribute 'mesures'"):
         one.mesures  # type: ignore[attr-defined]  # noqa: B018
 
