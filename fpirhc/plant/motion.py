@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
@@ -197,6 +197,12 @@ def with_exact_parameters(motion: _Motion, exact: np.ndarray) -> _Motion:
     other.__dict__.pop("exact", None)
     object.__setattr__(other, "parameters", parameters)
     return other
+
+
+def known_exactly(motion: _Motion) -> _Motion:
+    """Return the same with the exact parameters as approximate ones."""
+    named = {name: replace(one, approximate=one.exact, spread=None) for name, one in motion.parameters.items()}
+    return replace(motion, parameters=named)
 
 
 def outside_names(motion: Motion) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.describe import identity
 from fpirhc.errors import NotSupported
 from fpirhc.plant.maps import response_age
-from fpirhc.plant.motion import with_exact_parameters
+from fpirhc.plant.motion import known_exactly, with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
@@ -220,12 +220,6 @@ def _judge_block(plant: Plant) -> Block:
         return {"response_error": first - s.desired, "response_force": 0.5 * (first + last) - of_model}
 
     return Block("judge_response", Layout(reads), Layout(writes), step, opaque=plant.equations.inverse_opaque)
-
-
-def known_exactly(plant: Plant) -> Plant:
-    """Return the plant whose approximate parameters are the exact ones."""
-    named = {n: replace(p, approximate=p.exact, spread=None) for n, p in plant.parameters.items()}
-    return replace(plant, parameters=named)
 
 
 def exactly(plant: Plant, values: np.ndarray) -> Plant:

@@ -16,14 +16,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fpirhc.controllers.reference_states import nominal_motion, reference_states
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.maps import step_of
-from fpirhc.plant.motion import controlled_places
+from fpirhc.plant.motion import known_exactly
 from fpirhc.sensing.base import response_names
 from fpirhc.summary import number, table
 from fpirhc.symbolic.live import nominal
@@ -105,7 +106,7 @@ def compare_information(problem: Problem, *, drift: Mapping[str, float] | None =
 
     Raises:
         InvalidProblem: an unknown coordinate, or a drift that is not positive.
-        NotSupported: no `drift` for a plant with outputs, or with a reality of its own: the reference tells no states.
+        NotSupported: no `drift` beside a reality, of which the reference tells no states.
     """
     task = nominal(problem)
     residual: dict[str, float] = {}
@@ -177,18 +178,17 @@ def _noise(problem: Problem, measured: str) -> float:
 def _along_reference(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     """Drift and rms of the residual f - f^ along the reference, by controlled coordinate."""
     plant = problem.plant
-    if plant.outputs or problem.reality is not None:
+    if problem.reality is not None:
         raise NotSupported(
-            "compare_information: the reference tells no states of a plant with outputs, or of a reality; give the drift, "
-            "drift={'"
+            "compare_information: the reference tells no states of a reality; give the drift, drift={'"
             + plant.controlled_names[0]
             + "': ...}, in units of the response per square root of the time's unit"
         )
-    motion, equations = problem.reference.function(plant), plant.equations
-    start = problem.measure_from
-    times = start + problem.period * np.arange(min(_SAMPLES, round((problem.duration - start) / problem.period)))
-    states, highest = motion.map(len(times))(times[None, :])
-    responses = highest[controlled_places(plant), :]
+    equations, first = plant.equations, round(problem.measure_from / problem.period)
+    rows = slice(first, first + min(_SAMPLES, problem.cycles - first))
+    times = problem.period * np.arange(problem.cycles + 1)[rows]
+    states = reference_states(replace(problem, plant=known_exactly(plant)), problem.cycles + 1)[:, rows]
+    _, responses = nominal_motion(problem).map(len(times))(times[None, :])
     commands = equations.inverse.map(len(times))(states, responses, np.tile(plant.exact[:, None], len(times)))
     believed = equations.controlled_response.map(len(times))(
         states, commands, np.tile(plant.approximate[:, None], len(times))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import ControllerWrapper, PlantModel
+from fpirhc.plant.motion import known_exactly
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.latest import Latest
@@ -27,7 +28,7 @@ class ExactModel(ControllerWrapper):
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
         model = self.plant_model(problem)
-        plant = _EXACT.of((model.plant,), (), lambda: _exact(model.plant))
+        plant = _EXACT.of((model.plant,), (), lambda: known_exactly(model.plant))
         return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
 
     def plant_model(self, problem: Problem) -> PlantModel:
@@ -38,10 +39,6 @@ class ExactModel(ControllerWrapper):
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of the wrapped controller."""
         return self.controller.blocks(self.inner_problem(problem))
-
-
-def _exact(plant: Plant) -> Plant:
-    return replace(plant, parameters={name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()})
 
 
 _EXACT: Latest[Plant] = Latest(4)  # so that plans of it are built once
