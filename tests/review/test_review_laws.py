@@ -102,7 +102,7 @@ def test_half_of_the_limit_of_two_cycles_is_proposed_after_a_run(period, harmful
     lost = fp.measure(problem, run).rms_error["y"]
     if harmful:
         assert f"The limit is gain = {-abs(limit):.3g}, but no gain is proposed" in change
-        assert f"{lost:.3g} with it" in change
+        assert f"{lost:.3g} m with it" in change
         assert lost > 1.0
     else:
         assert change == f"Use gain = {-abs(limit) / 2:.3g}, half of the limit."
