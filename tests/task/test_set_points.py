@@ -266,7 +266,7 @@ def test_bad_references():
     with pytest.raises(InvalidProblem, match=r"'q1' is 2\.4, outside its limits of 2 to 2\.3"):
         replace(two_mass(), limits=limited)
     replace(two_mass(), limits=replace(limited, soft={"q1": 1.0}))  # a limit with a price may be passed
-    with pytest.raises(InvalidName, match="Trajectory is given none"):
+    with pytest.raises(InvalidName, match="a Trajectory, has no set-points"):
         fp.simulate(TWO_MASS.problem, TWO_MASS.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": 1.0})
 
 
