@@ -543,6 +543,21 @@ def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
         )
 
 
+def check_chains(problem: Problem, law: str) -> None:
+    """Raise for an output of order 0, which has no derivative below its response.
+
+    Args:
+        problem: the problem.
+        law: what needs such a derivative, as the beginning of a sentence.
+
+    Raises:
+        NotSupported: with the law.
+    """
+    for name, order in problem.plant.response_orders.items():
+        if not order:
+            raise NotSupported(f"{law}, and the command moves '{name}' at once (order 0); use DisturbanceObserver")
+
+
 def check_derivatives(problem: Problem, law: str) -> None:
     """Raise for a map or an output of order 0, where a law has no meaning.
 

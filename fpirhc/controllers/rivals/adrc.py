@@ -29,9 +29,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import command_before, commanding_blocks, input_gain, like, reference_block, rename
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import Undeformed, check_chains
 from fpirhc.controllers.rivals.reference_model import decay_gains
-from fpirhc.errors import NotSupported
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.maps import step_of
@@ -63,12 +62,8 @@ class ADRC(Undeformed):
             NotSupported: no chain of integrators.
             InvalidValue: an error that does not decay in the steps of a map.
         """
-        for name, order in problem.plant.response_orders.items():
-            if not order:
-                raise NotSupported(
-                    f"ADRC observes a chain of integrators, and the command moves '{name}' at once (order 0); "
-                    "use DisturbanceObserver"
-                )
+        check_chains(problem, "ADRC observes a chain of integrators")
+        for order in problem.plant.response_orders.values():
             check_modes(self, problem.plant, decay_gains(self.bandwidth, order))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:

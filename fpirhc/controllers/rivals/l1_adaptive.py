@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
-from fpirhc.controllers.contract import Undeformed
-from fpirhc.errors import NotSupported
+from fpirhc.controllers.contract import Undeformed, check_chains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
@@ -56,12 +55,7 @@ class L1Adaptive(Undeformed):
         Raises:
             NotSupported: no derivative below the response can be predicted.
         """
-        instant = [name for name, order in problem.plant.response_orders.items() if not order]
-        if instant:
-            raise NotSupported(
-                f"L1Adaptive predicts a derivative below the response, and the command moves '{instant[0]}' at once (order 0); "
-                "use DisturbanceObserver"
-            )
+        check_chains(problem, "L1Adaptive predicts a derivative below the response")
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, predictor, invert, limit, judge, running, tracking update, expected."""
