@@ -59,9 +59,9 @@ class ErrorPair:
         """Both errors of the worst coordinate in a sentence."""
         name, rounding = self.worst, beside(0.5 * _ROUNDING, 1.0)
         before, after = (beside(e[name], self.ranges[name]) for e in (self.without, self.adapted))
-        if before == after == rounding:
-            return f"run on its own model, rms error of {name} {before} without adaptation and with it"
         before, after = (one if one == rounding else f"{one}{self.unit(name)}" for one in (before, after))
+        if before == after:
+            return f"run on its own model, rms error of {name} {before} without adaptation and with it"
         share = f"{100 * self.added(name):+.2g} % of its range"
         return f"run on its own model, rms error of {name} {before} without adaptation and {after} with it, {share}"
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import fpirhc as fp
 from fpirhc.plant.plant import Plant
 
 
@@ -54,3 +55,40 @@ def test_infusion_that_holds_half_the_effect():
     """The nominal patient needs 8.32 mg/min for 4.37 mg/l at the effect site (Schnider's kinetics, Hill curve of patient 13)."""
     plant = abroad.load("drug_infusion").problem.plant
     assert rates(plant, [4.37] * 4, [8.32]) == pytest.approx(np.zeros(4), abs=5e-3)
+
+
+def test_half_rule_is_close_to_the_process_that_it_stands_for():
+    """Its step response is within 0.03 of that of E2, with three poles of 0.05 s and zeros at 1 / 0.3 and -1 / 0.08."""
+    problem = abroad.load("half_rule").problem
+    assert problem.reality is not None
+    plant, late, times = problem.reality.plant, problem.dead_time.inputs["u"], np.linspace(0.0, 20.0, 401)
+    reduced = solve_ivp(
+        lambda _, x: rates(plant, list(x), [1.0]), (0, 20), [0.0, 0.0], rtol=1e-9, atol=1e-11, dense_output=True
+    )
+    shown = reduced.sol(np.maximum(times - late, 0.0))[0]
+    poles = np.array([2.0, 1.0, 0.4, 0.2, 0.05, 0.05, 0.05])
+
+    def chain(_: float, x: np.ndarray) -> np.ndarray:
+        return (np.concatenate([[1.0], x[:-1]]) - x) / poles
+
+    full = solve_ivp(chain, (0, 20), np.zeros(7), method="Radau", rtol=1e-9, atol=1e-11, t_eval=times)
+    last, speed = full.y[-1], (full.y[-2] - full.y[-1]) / poles[-1]
+    bend = ((full.y[-3] - full.y[-2]) / poles[-2] - speed) / poles[-1]
+    process = last + (0.08 - 0.3) * speed - 0.3 * 0.08 * bend
+    assert np.abs(process - shown).max() < 0.03
+
+
+def test_half_rule_runs_as_an_independent_integration_does():
+    """Late commands through the valve and the process, cycle after cycle by another integrator."""
+    task = abroad.load("half_rule")
+    problem = task.problem
+    assert problem.reality is not None
+    run = fp.simulate(problem, task.controllers["RHC+FPI"], seed=0, compiled=False)
+    plant, late = problem.reality.plant, 11  # cycles of 0.07 s in 0.77 s
+    commands = np.concatenate([np.zeros(late), run["command"][:, 0]])
+    state, outputs = [0.0, 0.0], [0.0]
+    for command in commands[:1000]:
+        moved = solve_ivp(lambda _, x, u=command: rates(plant, list(x), [u]), (0, 0.07), state, rtol=1e-9, atol=1e-11)
+        state = list(moved.y[:, -1])
+        outputs.append(state[0])
+    np.testing.assert_allclose(run["reality_state.y"][:1000], outputs[:1000], atol=1e-6)

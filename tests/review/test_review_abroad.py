@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -130,3 +131,35 @@ def test_minutes_are_minutes():
     texts = [f"{a.evidence} {a.change}" for a in reviewed("drug_infusion")]
     assert not [t for t in texts if " 1/s" in t or " s " in t or "per second" in t]
     assert any(" 1/min" in t for t in texts)
+
+
+# The half-rule model of Skogestad's process
+
+
+@pytest.mark.parametrize(("gain", "stable"), [(-1.9, True), (-2.4, False)])
+def test_the_limit_of_the_gain_is_that_of_a_run_without_the_valve(gain, stable):
+    """The limit holds for every plant of the box, so also for the right model; the lag of the valve alone doubles it."""
+    limit = about("half_rule", "gain admissible")
+    assert limit.numbers["recommended"] == pytest.approx(-1.08, rel=0.02)
+    task = abroad.load("half_rule")
+    file = importlib.import_module("abroad.half_rule")
+    right = replace(task.problem, reality=None, plant=file.process(1.0), duration=70.0)
+    adaptive = file.plain.with_deformation(replace(file.paired, map=fp.Affine(gain=gain)))
+    run = fp.simulate(right, fp.Predicted(adaptive, inputs=file.LATE), seed=0, compiled=False)
+    swings = np.abs(np.diff(run["command"][-300:, 0])).sum() > 20
+    assert swings != stable
+
+
+def test_the_loop_without_prediction_is_refused_before_a_run():
+    """It plans with a dead time of 11 cycles that it does not know of: a pole outside, and a run in a limit cycle."""
+    margin = about("half_rule", "margin", "RHC, not predicted", "swinging")
+    assert margin.verdict == "no"
+    assert margin.numbers["radius"] == pytest.approx(1.0159, abs=1e-3)
+    assert about("half_rule", "margin", "RHC").verdict == "yes"
+
+
+def test_a_lag_that_is_stated_costs_nothing_with_the_right_model():
+    """What is equal is said to be equal, and not by how many billionths it differs."""
+    null = about("half_rule", "right model alone")
+    assert null.verdict == "yes"
+    assert null.evidence == "run on its own model, rms error of y 0.0627 without adaptation and with it"

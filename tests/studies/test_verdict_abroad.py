@@ -158,3 +158,26 @@ def test_at_the_same_rate_and_with_the_same_information_it_is_parity():
     fast, slow = (adaptive / learner for adaptive, learner in error.values())
     assert fast < 0.5
     assert 0.5 < slow < 2
+
+
+def test_a_process_behind_a_dead_time_and_a_lag_is_better_and_predicting_alone_is_not():
+    """Half the error with a gain that is 40 % wrong; the null test leaves the lag's own error as it is."""
+    process = compared("half_rule")
+    errors = {one.name: one.metrics.rms_error["y"] for one in process.entries}
+    assert errors == pytest.approx(
+        {"RHC": 0.260, "RHC+FPI": 0.144, "RHC, not predicted": 0.235, "RHC+FPI, not predicted": 0.155}, rel=0.01
+    )
+    assert process.findings[0].text.startswith("RHC+FPI lowers the rms error of y from 0.26 to 0.144 (1.8 times less)")
+    assert process.null is not None
+    assert process.null.passed
+    assert process.null.after["y"] == pytest.approx(process.null.before["y"], rel=1e-6)
+
+
+def test_two_loops_that_swing_by_themselves_are_not_told_to_ask_for_less():
+    """Both are unstable behind the dead time, in a limit cycle between limits that the reference needs to 60 %."""
+    pair = compared("half_rule", "RHC, not predicted", "RHC+FPI, not predicted", variant="swinging")
+    [text] = [finding.text for finding in pair.findings if "no clear difference" in finding.text]
+    assert text.endswith(
+        "both swing to and fro where the reference does not. Mend the loop without adaptation first; see its review."
+    )
+    assert "slow the reference down" not in text

@@ -33,8 +33,10 @@ def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, erro
     """An entry with these errors of y [m], z [rad]; `changes` are its other fields and what its run holds."""
     signals = [Signal("error", ("y", "z"), ("m", "rad")), Signal("desired", ("y", "z"), ("m/s2", "rad/s2"))]
     values = [np.zeros((CYCLES, 2)), np.broadcast_to(changes.get("desired", 0.0), (CYCLES, 2))]
-    signals.append(Signal("command", ("u",), ("N",)))
-    values.append(np.asarray(changes.get("command", np.arange(CYCLES) % 2), dtype=float)[:, None])
+    signals += [Signal("command", ("u",), ("N",)), Signal("reference", ("y",), ("m",))]
+    values += [
+        np.asarray(changes.get(n, np.arange(CYCLES) % 2), dtype=float)[:, None] for n in ("command", "reference")
+    ]
     if changes.get("planning"):
         signals, values = [*signals, Signal("solve", SOLVE)], [*values, np.zeros((CYCLES, len(SOLVE)))]
     log = np.hstack(values)[: changes.get("cycles", CYCLES)]
@@ -509,9 +511,9 @@ def test_plans_that_did_not_converge_are_a_cause_from_a_twentieth_of_the_cycles_
 
 
 def test_commands_at_their_limits_are_a_cause_from_a_fifth_of_the_cycles_on():
-    def with_limits(share: float, before: float = 0.0) -> str:
-        plain = entry("RHC", measured={"at_limit": {"": before}})
-        return no_difference(plain=plain, measured={"at_limit": {"": share}})
+    def with_limits(share: float, before: float = 0.0, **both: Any) -> str:
+        plain = entry("RHC", measured={"at_limit": {"": before}}, **both)
+        return no_difference(plain=plain, measured={"at_limit": {"": share}}, **both)
 
     assert with_limits(0.19) == ""
     head = " Its command stands at a limit in 90 % of the cycles (that of RHC in "
@@ -520,4 +522,7 @@ def test_commands_at_their_limits_are_a_cause_from_a_fifth_of_the_cycles_on():
     )
     assert with_limits(0.9, 0.5) == (
         f"{head}50 %), where no adaptation can act: slow the reference down or ask for less, or widen limits that are a choice."
+    )
+    assert with_limits(0.9, 0.5, reference=np.arange(CYCLES) / CYCLES) == (
+        f"{head}50 %): both swing to and fro where the reference does not. Mend the loop without adaptation first; see its review."
     )

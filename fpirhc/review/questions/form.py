@@ -25,7 +25,7 @@ def recommended_form(problem: Problem) -> tuple[str, str]:
         corrected = f"{why}, and the plain form corrects the lateness too"
         return (INCREMENT, f"{why} after a dead time, in which the plain form swings") if waits else (PLAIN, corrected)
     if waits:
-        return REFERENCED, "told of the dead time it leaks, and leaves an exact model alone"
+        return REFERENCED, "with the dead time stated it leaks, and it leaves an exact model alone"
     return REFERENCED, "it leaves an exact model alone whatever the period and the plant's drift"
 
 

@@ -28,6 +28,7 @@ MANY_CYCLES = 3  # of a run from which the slew of its desired response is judge
 _MORE = 2.0  # times the pair's movement of the command, from which it is stated
 _CHATTER = 10.0  # times, from which it is a reason
 _STILL = 1e-9  # of the rms command per unit of time: what moves less stands still
+_SWINGS = 4.0  # times the turns of the reference, from which a command oscillates by itself
 _OFTEN = 0.2  # share of the cycles from which commands at their limits are a reason
 
 
@@ -121,9 +122,26 @@ def limit_cause(plain: Entry, adaptive: Entry) -> str:
     if after < _OFTEN:
         return ""
     fact = f"Its command stands at a limit in {in_percent(after)} of the cycles (that of {plain.name} in {in_percent(before)})"
+    if before >= _OFTEN and _swings(plain) and _swings(adaptive):
+        advice = "Mend the loop without adaptation first; see its review."
+        return f"{fact}: both swing to and fro where the reference does not. {advice}"
     if before >= _OFTEN:
         return f"{fact}, where no adaptation can act: slow the reference down or ask for less, or widen limits that are a choice."
     return f"{fact}, where no adaptation can act: it asks for too much, or oscillates; the command in the report shows which."
+
+
+def _swings(entry: Entry) -> bool:
+    """Whether a command turns far more often than the reference: both by how many times their own span they move."""
+    turns = [
+        float(
+            np.max(
+                np.abs(np.diff(entry.run[signal], axis=0)).sum(0)
+                / np.maximum(np.ptp(entry.run[signal], axis=0), 1e-300)
+            )
+        )
+        for signal in ("command", "reference")
+    ]
+    return turns[0] >= _SWINGS * max(1.0, turns[1])
 
 
 def chatter_cause(plain: Entry, adaptive: Entry) -> str:
