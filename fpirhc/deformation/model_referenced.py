@@ -74,7 +74,7 @@ class ModelReferenced(Wrapper):
             raise InvalidValue(
                 f"ModelReferenced(lag={self.lag!r}): expected a time constant of at least 0 s, or a tuple with one per input"
             )
-        if self.uncertainty is not None:
+        if self.uncertainty is not None and self.cycles is not None:  # else it is checked with the problem's dead times
             check_uncertainty("ModelReferenced", self.uncertainty, self._delays)
         if self.pole is not None:
             check_pole("ModelReferenced", self.pole)

@@ -338,7 +338,8 @@ def _part_that_fits(expected: Expected, value: object) -> str:
     if isinstance(value, Mapping):
         return next((f"give one of its entries, such as [{k!r}]" for k, v in value.items() if expected.fits(v)), "")
     names = [f.name for f in fields(value)] if is_dataclass(value) and not isinstance(value, type) else []
-    return next((f"give its .{name}" for name in names if expected.fits(getattr(value, name))), "")
+    parts = {name: getattr(value, name) for name in names}
+    return next((f"give its .{name}" for name, part in parts.items() if part is not None and expected.fits(part)), "")
 
 
 def _public(contract: type) -> Iterator[tuple[str, type]]:

@@ -98,13 +98,16 @@ class Task(FoundByName):
 
 
 @checked_call
-def load_problem(name_or_path: str) -> Task:
+def load_problem(name_or_path: str | Path) -> Task:
     """Import a problem file and check its definitions.
+
+    Args:
+        name_or_path: name of a shipped problem, or path of a file.
 
     Raises:
         ProblemFileError: the file raises an error on import (the message shows the line), or a definition is missing or wrong.
     """
-    path = find_problem(name_or_path)
+    path = find_problem(str(name_or_path))
     module = _imported(path)
     mistakes = Mistakes(f"problem file '{path.name}'")
     problem, controllers = _problem(module, mistakes), _controllers(module, mistakes)

@@ -110,7 +110,7 @@ def test_a_suggestion_that_a_run_speaks_against_says_so():
     """A hundredth of the budget leaves a gain with which the run of two masses is 40 times worse than without adaptation."""
     assert not fp.suggest(noisy(), planning(), chatter=BUDGET).harm
     small = fp.suggest(noisy(), planning(), chatter={name: value / 100 for name, value in BUDGET.items()}, ringing=0.0)
-    assert small.harm.startswith("with the wrong model the rms error of q1 is 0.0304 without adaptation, 1.")
+    assert small.harm.startswith("with the wrong model the rms error of q1 is 0.0304 m without adaptation, 1.")
     assert small.harm in repr(small)
 
 

@@ -20,7 +20,7 @@ import math
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.review.answer import Answer, Verdict, per_cycle
+from fpirhc.review.answer import Answer, Verdict, duration, per_cycle
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops, is_planned
 from fpirhc.review.question import ControllerQuestion
@@ -28,6 +28,7 @@ from fpirhc.review.questions.zero_dynamics import of_zero_dynamics, zero_dynamic
 from fpirhc.review.spectra import eigenvalues_near, largest_product
 from fpirhc.review.stages import stiff_advice
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.symbolic.live import nominal
 
 CONVERGES = "Does the deformation converge?"
 BOX = "Does it converge all over the box of parameters?"
@@ -70,7 +71,8 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     if growth.max() > -_SURE:
         ends = [f"{end:.6g}" for end in (radii.min(), worst)]
         text += f" (between {' and '.join(ends)} along the reference)" if ends[0] != ends[1] else ""
-        return Answer(CONVERGES, Verdict.UNKNOWN, text, _mend(grid, controller, loops), numbers)
+        change = _slow(grid, controller, loops, worst) or _mend(grid, controller, loops)
+        return Answer(CONVERGES, Verdict.UNKNOWN, text, change, numbers)
     against = [*([] if controller.deforms == "target" else _steep(grid, controller)), *doubts]
     if against:
         return Answer(
@@ -92,6 +94,18 @@ def box_converges(grid: ReviewGrid, loops: Loops) -> Answer:
         return Answer(BOX, Verdict.YES, text, "", numbers)
     change = _OF_THE_PLANT if of_zero_dynamics(grid, worst) else "Lower the gain, or narrow the box of the parameters."
     return Answer(BOX, Verdict.UNKNOWN, text, change, numbers)
+
+
+def _slow(grid: ReviewGrid, controller: Controller, loops: Loops, worst: float) -> str:
+    """What is quicker, where it converges at every point and is slow beside the loop with the right model; else nothing."""
+    ideal = loops.ideal.radius if loops.ideal is not None else 1.0
+    if not ideal < worst < 1:
+        return ""
+    time = duration(_SURE / -math.log(worst) * grid.problem.period, grid.problem)
+    leaks = ", or a leak with a smaller pole," if nominal(controller.deformation.iteration.leak) else ""
+    return (
+        f"It converges, and takes {time} for a factor of 100, more than the run has: a larger gain{leaks} is quicker."
+    )
 
 
 def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:

@@ -1,0 +1,117 @@
+"""A heated tank behind a pipe, with a slow valve that its model does not have, beside an integration of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import abroad
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import fpirhc as fp
+from fpirhc.errors import InvalidField, InvalidValue
+from fpirhc.review.answer import Verdict
+from fpirhc.review.questions.convergence import CONVERGES
+from fpirhc.review.questions.right_model import NULL_TEST
+from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.summary import written_out
+
+K, TAU, LAG, LATE, PERIOD, RATE, GAIN, POLE = 2.0, 10.0, 0.5, 10, 0.1, 0.2, 0.1, 0.95  # GAIN: half of the map's own
+K_MODEL, TAU_MODEL = 1.4, 14.0
+LAG_LEFT = "Does the tracking law leave room for the lag of the reality?"
+SLOW = (
+    "It converges, and takes 135 min for a factor of 100, more than the run has: a larger gain, or a leak with a smaller pole, "
+    "is quicker."
+)
+
+
+@pytest.fixture(scope="module")
+def tank():
+    return fp.load_problem(Path(abroad.__file__).parent / "heated_tank.py")
+
+
+def by_hand(*, adapts: bool) -> float:
+    """The rms error from 40 min on: the exact step of tank and valve under a held command, the law and the iteration as formulas.
+
+    d_k = T^N' + 2 rate e_k + rate^2 (sum of e_j h, j < k, less 2 e_0 / rate),  e = T^N - T,  r_k = d_k + delta_k,  u_k = (tau^ r_k + T) / K^,
+    delta_k = p delta_{k-1} + (1 - p) (delta_{k-1-D} - a (f_k - f^_k + delta_{k-1-D})).
+    """
+    rates = np.array([[-1 / TAU, K / TAU, 0.0], [0.0, -1 / LAG, 1 / LAG], [0.0, 0.0, 0.0]])
+    move = expm(rates * PERIOD)
+    temperature, valve = 20.0, 10.0
+    commands, deltas, errors = [10.0] * (LATE + 1), [0.0] * (LATE + 1), []
+    integral = -2 * 10.0 / RATE  # the law begins with the reference's own response
+    for k in range(1200):
+        t = k * PERIOD
+        wanted, slope = 30 + 10 * np.sin(0.1 * t), np.cos(0.1 * t)
+        errors.append(wanted - temperature)
+        acted = commands[-1 - LATE]
+        late = deltas[-1 - LATE]
+        apart = (K * valve - temperature) / TAU - (K_MODEL * acted - temperature) / TAU_MODEL
+        new = POLE * deltas[-1] + (1 - POLE) * (late - GAIN * (apart + late))
+        deltas.append(new if adapts and k else 0.0)
+        request = slope + 2 * RATE * errors[-1] + RATE**2 * integral + deltas[-1]
+        integral += PERIOD * errors[-1]
+        commands.append(float(np.clip((TAU_MODEL * request + temperature) / K_MODEL, 0, 100)))
+        temperature, valve, _ = move @ [temperature, valve, commands[-1 - LATE]]
+    return float(np.sqrt(np.mean(np.square(errors[400:]))))
+
+
+@pytest.mark.parametrize("adapts", [False, True])
+def test_dead_time_and_lag_are_those_of_an_independent_integration(tank, adapts):
+    run = fp.simulate(tank.problem, tank.controllers["CTC+FPI" if adapts else "CTC"], seed=0, compiled=False)
+    assert fp.measure(tank.problem, run).rms_error["T"] == pytest.approx(by_hand(adapts=adapts), rel=1e-3)
+
+
+def test_verdict_and_review_say_what_the_runs_say(tank):
+    """The sentence has the integration's digits; the review knows the dead time and finds the valve that the model does not have."""
+    comparison = fp.compare(tank, seed=0, controllers=["CTC", "CTC+FPI"], compiled=False)
+    plain, adapted = (written_out(by_hand(adapts=adapts)) for adapts in (False, True))
+    assert comparison.outcome is Outcome.BETTER
+    assert f"CTC+FPI lowers the rms error of T from {plain} to {adapted} K" in comparison.verdict[0]
+    answers = answered(tank, tank.controllers["CTC+FPI"])
+    assert {question: a.change for question, a in answers.items() if a.verdict != Verdict.YES} == {CONVERGES: SLOW}
+    assert "2 x 0.2 1/min x lag = 0.2, which must stay below 1" in answers[LAG_LEFT].evidence
+    assert answers[NULL_TEST].evidence == "run on its own model, rms error of T 0.201 K without adaptation and with it"
+
+
+def test_the_advice_of_a_slow_iteration_helps(tank):
+    """The recommended gain converges within the run, and lowers the error."""
+    adapted = tank.controllers["CTC+FPI"]
+    quicker = adapted.with_deformation(replace(adapted.deformation, map=fp.Affine(gain=-1.0)))
+    assert answered(tank, quicker)[CONVERGES].verdict == Verdict.YES
+    slow, quick = (
+        fp.measure(tank.problem, fp.simulate(tank.problem, one, seed=0, compiled=False)).rms_error["T"]
+        for one in (adapted, quicker)
+    )
+    assert quick < slow / 1.5
+
+
+def answered(tank, controller):
+    answers = fp.review(tank.problem, {"x": controller}, seed=0, mismatch=0.0).controllers["x"]
+    return {a.question: a for a in answers}
+
+
+def test_an_uncertainty_is_checked_with_the_dead_time_that_the_problem_fills_in(tank):
+    """Left open, the dead time is that of the problem: ten cycles bear an error of ten, and none of eleven."""
+    law, affine = tank.controllers["CTC"].tracking, fp.Affine(gain=-0.2)
+    for uncertainty in (0, 10):
+        fp.simulate(
+            tank.problem,
+            fp.ComputedTorque(law, fp.ModelReferenced(affine, uncertainty=uncertainty)),
+            seed=0,
+            compiled=False,
+        )
+    with pytest.raises(
+        InvalidValue, match=r"uncertainty=11\): expected whole cycles from 0 to 10, the dead time of 10"
+    ):
+        fp.simulate(
+            tank.problem, fp.ComputedTorque(law, fp.ModelReferenced(affine, uncertainty=11)), seed=0, compiled=False
+        )
+
+
+def test_a_plant_in_place_of_a_reality_is_told_how_to_write_one(tank):
+    with pytest.raises(InvalidField, match=r"Problem.reality: expected a Reality .*; write fp.Reality\(plant=...\)$"):
+        replace(tank.problem, reality=tank.problem.reality.plant)
