@@ -7,7 +7,8 @@ which is the second-order model of (-0.3 s + 1)(0.08 s + 1) / ((2 s + 1)(s + 1)(
 S. Skogestad, Simple analytic rules for model reduction and PID controller tuning, J. Process Control 13, 2003, example E2: k = 1,
 theta = 0.77, tau_1 = 2, tau_2 = 1.2. The output follows the valve, v' = (u - v) / tau_2 and y' = (k v - y) / tau_1; the model
 of the controllers has y and the command alone. Chosen here: the unit of time (s), a gain of the model that is
-40 % too large, a slow sine, a cycle of 0.07 s. `swinging` weighs the command a hundred times less, which a loop without prediction does not bear.
+40 % too large, a slow sine, a cycle of 0.07 s. `swinging` weighs the command a hundred times less, which a loop
+without prediction does not bear.
 """
 
 from dataclasses import replace
