@@ -15,6 +15,10 @@ from sampled import lag, poles
 import fpirhc as fp
 from fpirhc.contraction.large_errors import least_product
 from fpirhc.deformation import Deformation
+from fpirhc.review.question import ControllerQuestion, known_questions
+from fpirhc.review.questions.convergence import BOX, CONVERGES
+from fpirhc.review.questions.gain import GAIN, ONE_SIGN, TWO_CYCLES
+from fpirhc.review.questions.right_model import NULL_TEST
 from fpirhc.simulation.model_as_plant import shortened
 
 RATE, PERIOD = 20.0, 1e-3  # 1/s, s
@@ -89,6 +93,33 @@ def test_two_cycle_that_is_said_to_exist_is_there():
             assert sizes.max() < 1e-6
         else:
             assert sizes.max() == pytest.approx(one_answer.numbers["amplitude"], rel=1e-6)
+            assert one_answer.evidence.endswith(f"alternates with the size {sizes.max():.3g}")
+
+
+def test_the_basin_grows_with_the_step_of_the_map_and_four_times_the_error_is_wanted():
+    """Only of the plain form with a bounded step; the proposed scale is just enough."""
+
+    def asked(scale: float) -> Any:
+        return answer(moving(), fp.Sigmoid(gain=-0.5, scale=scale), "come back")
+
+    first = asked(1.0)
+    error, basin = first.numbers["error"], first.numbers["basin"]
+    for ratio, verdict in ((4.01, "yes"), (3.99, "unknown"), (2.49, "no")):
+        one = asked(ratio * error / basin)
+        assert one.verdict == verdict
+        assert one.numbers["basin"] == pytest.approx(ratio * error, rel=1e-6)
+        told = f"Raise the map's scale at least {4 / ratio:.2g} times, or leave it out to have it chosen."
+        assert one.change == ("" if verdict == "yes" else told)
+        assert ("times are wanted" in one.evidence) == (verdict != "yes")
+    assert answer(moving(), fp.Affine(gain=-0.5), "come back") is None
+    assert answer(moving(), fp.Increment(fp.Sigmoid(gain=-0.5, scale=1.0), cycles=0), "come back") is None
+
+
+def test_questions_that_are_asked_of_a_map_on_targets_ask_its_loop():
+    """Whatever is about a response Jacobian is not asked; its loop, its gain and its dead time are."""
+    of_targets = {q.text for q in known_questions(ControllerQuestion) if q.of_targets}
+    assert {CONVERGES, BOX, GAIN, NULL_TEST} < of_targets
+    assert not {ONE_SIGN, TWO_CYCLES} & of_targets
 
 
 @pytest.mark.parametrize(("period", "harmful"), [(PERIOD, False), (0.02, True)])
