@@ -16,7 +16,6 @@ from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import null_space
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
@@ -243,6 +242,8 @@ def _reduced(a: np.ndarray, outer: np.ndarray) -> np.ndarray:
     """
     if not len(outer):
         return np.zeros((0, 0))
+    from scipy.linalg import null_space  # it takes longer to import than a problem to load
+
     count, change = len(outer), np.vstack([outer, null_space(outer).T])
     straight = change @ a @ np.linalg.inv(change)
     settle = np.linalg.pinv(straight[count:, count:])

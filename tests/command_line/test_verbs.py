@@ -185,6 +185,8 @@ HEAVY = ("casadi", "numpy", "scipy", "rich", "jinja2", "matplotlib", "control", 
         ("import fpirhc as fp; fp.Problem", HEAVY[2:]),
         ("import fpirhc as fp; fp.load_problem('two_mass')", ("matplotlib", "rich", "jinja2")),
         ("import fpirhc.report.html", ("matplotlib",)),
+        ("import fpirhc.studies.comparison.compare", ("scipy",)),
+        ("from fpirhc.review import question as q; q.known_questions(q.ControllerQuestion)", ("scipy",)),
     ],
 )
 def test_what_comes_first_is_light(first, absent):

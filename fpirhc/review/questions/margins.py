@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import scipy.linalg
 
 from fpirhc.review.answer import Answer, Verdict, duration
 from fpirhc.review.loops import Loops, is_planned
@@ -182,9 +181,11 @@ def _between(
 
 def _response(loop: LinearLoop, place: int) -> Callable[[np.ndarray], np.ndarray]:
     """Function frequencies -> L_i; from the matrices, because polynomials of so many states lose all digits."""
+    from scipy.linalg import schur  # it takes longer to import than a problem to load
+
     [one] = loop.cycles
     g, c = one.entry[:, place], one.arriving[place]
-    form, turn = scipy.linalg.schur(loop.dynamics - np.outer(g, c), output="complex")
+    form, turn = schur(loop.dynamics - np.outer(g, c), output="complex")
     left, right = c @ turn, turn.conj().T @ g
 
     def opened(frequencies: np.ndarray) -> np.ndarray:

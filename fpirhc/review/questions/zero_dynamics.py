@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import null_space
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
@@ -60,6 +59,8 @@ def zero_dynamics_modes(grid: ReviewGrid, places: Sequence[int]) -> list[np.ndar
 
 def _modes(slopes: StateSlopes) -> np.ndarray:
     """Eigenvalues of A - B D^-1 C on the states that leave all derivatives below the responses at zero, Y x = 0."""
+    from scipy.linalg import null_space  # it takes longer to import than a problem to load
+
     inside = null_space(slopes.y)
     motion = slopes.a - slopes.b @ np.linalg.solve(slopes.d, slopes.c)
     return np.asarray(np.linalg.eigvals(inside.T @ motion @ inside))

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import numpy as np
-import scipy.linalg
 
 NEUTRAL = 1e-6  # distance of |pole| from 1, where a mode neither decays nor grows
 _SHOWN = 1e-6  # share of a judged error in an eigenvector, in scales
@@ -139,10 +138,12 @@ class LinearLoop:
 
         It solves P = F P F' + Q over a period, where Q is what the noise of its cycles adds up to.
         """
+        from scipy.linalg import solve_discrete_lyapunov  # it takes longer to import than a problem to load
+
         added = np.zeros_like(self.dynamics, shape=2 * self.cycles[0].dynamics.shape[1:])
         for one in self.cycles:
             added = one.dynamics @ added @ one.dynamics.T + one.entry @ covariance @ one.entry.T
-        return np.asarray(scipy.linalg.solve_discrete_lyapunov(self.dynamics, added))
+        return np.asarray(solve_discrete_lyapunov(self.dynamics, added))
 
     @property
     def _shown(self) -> np.ndarray:
