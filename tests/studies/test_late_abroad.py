@@ -32,10 +32,15 @@ def tank():
     return fp.load_problem(Path(abroad.__file__).parent / "heated_tank.py")
 
 
+def rms(tank, controller):
+    return fp.measure(tank.problem, fp.simulate(tank.problem, controller, seed=0, compiled=False)).rms_error["T"]
+
+
 def by_hand(*, adapts: bool) -> float:
     """The rms error from 40 min on: the exact step of tank and valve under a held command, the law and the iteration as formulas.
 
-    d_k = T^N' + 2 rate e_k + rate^2 (sum of e_j h, j < k, less 2 e_0 / rate),  e = T^N - T,  r_k = d_k + delta_k,  u_k = (tau^ r_k + T) / K^,
+    d_k = T^N' + 2 rate e_k + rate^2 (sum of e_j h, j < k, less 2 e_0 / rate),  e = T^N - T,
+    r_k = d_k + delta_k,  u_k = (tau^ r_k + T) / K^,
     delta_k = p delta_{k-1} + (1 - p) (delta_{k-1-D} - a (f_k - f^_k + delta_{k-1-D})).
     """
     rates = np.array([[-1 / TAU, K / TAU, 0.0], [0.0, -1 / LAG, 1 / LAG], [0.0, 0.0, 0.0]])
@@ -61,12 +66,12 @@ def by_hand(*, adapts: bool) -> float:
 
 @pytest.mark.parametrize("adapts", [False, True])
 def test_dead_time_and_lag_are_those_of_an_independent_integration(tank, adapts):
-    run = fp.simulate(tank.problem, tank.controllers["CTC+FPI" if adapts else "CTC"], seed=0, compiled=False)
-    assert fp.measure(tank.problem, run).rms_error["T"] == pytest.approx(by_hand(adapts=adapts), rel=1e-3)
+    controller = tank.controllers["CTC+FPI" if adapts else "CTC"]
+    assert rms(tank, controller) == pytest.approx(by_hand(adapts=adapts), rel=1e-3)
 
 
 def test_verdict_and_review_say_what_the_runs_say(tank):
-    """The sentence has the integration's digits; the review knows the dead time and finds the valve that the model does not have."""
+    """The sentence has the integration's digits; the review knows the dead time and the valve that the model lacks."""
     comparison = fp.compare(tank, seed=0, controllers=["CTC", "CTC+FPI"], compiled=False)
     plain, adapted = (written_out(by_hand(adapts=adapts)) for adapts in (False, True))
     assert comparison.outcome is Outcome.BETTER
@@ -82,11 +87,7 @@ def test_the_advice_of_a_slow_iteration_helps(tank):
     adapted = tank.controllers["CTC+FPI"]
     quicker = adapted.with_deformation(replace(adapted.deformation, map=fp.Affine(gain=-1.0)))
     assert answered(tank, quicker)[CONVERGES].verdict == Verdict.YES
-    slow, quick = (
-        fp.measure(tank.problem, fp.simulate(tank.problem, one, seed=0, compiled=False)).rms_error["T"]
-        for one in (adapted, quicker)
-    )
-    assert quick < slow / 1.5
+    assert rms(tank, quicker) < rms(tank, adapted) / 1.5
 
 
 def answered(tank, controller):
@@ -98,18 +99,12 @@ def test_an_uncertainty_is_checked_with_the_dead_time_that_the_problem_fills_in(
     """Left open, the dead time is that of the problem: ten cycles bear an error of ten, and none of eleven."""
     law, affine = tank.controllers["CTC"].tracking, fp.Affine(gain=-0.2)
     for uncertainty in (0, 10):
-        fp.simulate(
-            tank.problem,
-            fp.ComputedTorque(law, fp.ModelReferenced(affine, uncertainty=uncertainty)),
-            seed=0,
-            compiled=False,
-        )
+        referenced = fp.ModelReferenced(affine, uncertainty=uncertainty)
+        assert rms(tank, fp.ComputedTorque(law, referenced)) < by_hand(adapts=False)
     with pytest.raises(
         InvalidValue, match=r"uncertainty=11\): expected whole cycles from 0 to 10, the dead time of 10"
     ):
-        fp.simulate(
-            tank.problem, fp.ComputedTorque(law, fp.ModelReferenced(affine, uncertainty=11)), seed=0, compiled=False
-        )
+        rms(tank, fp.ComputedTorque(law, fp.ModelReferenced(affine, uncertainty=11)))
 
 
 def test_a_plant_in_place_of_a_reality_is_told_how_to_write_one(tank):
