@@ -60,7 +60,7 @@ def test_infusion_that_holds_half_the_effect():
 def test_half_rule_is_close_to_the_process_that_it_stands_for():
     """Its step response is within 0.03 of that of E2, with three poles of 0.05 s and zeros at 1 / 0.3 and -1 / 0.08."""
     problem = abroad.load("half_rule").problem
-    assert problem.reality is not None
+    assert isinstance(problem.reality, fp.Reality)
     plant, late, times = problem.reality.plant, problem.dead_time.inputs["u"], np.linspace(0.0, 20.0, 401)
     reduced = solve_ivp(
         lambda _, x: rates(plant, list(x), [1.0]), (0, 20), [0.0, 0.0], rtol=1e-9, atol=1e-11, dense_output=True
@@ -82,7 +82,7 @@ def test_half_rule_runs_as_an_independent_integration_does():
     """Late commands through the valve and the process, cycle after cycle by another integrator."""
     task = abroad.load("half_rule")
     problem = task.problem
-    assert problem.reality is not None
+    assert isinstance(problem.reality, fp.Reality)
     run = fp.simulate(problem, task.controllers["RHC+FPI"], seed=0, compiled=False)
     plant, late = problem.reality.plant, 11  # cycles of 0.07 s in 0.77 s
     commands = np.concatenate([np.zeros(late), run["command"][:, 0]])
