@@ -12,6 +12,7 @@ import numpy as np
 
 from fpirhc.conformance.laws import hold, keep, within
 from fpirhc.errors import Mistakes
+from fpirhc.plant.motion import input_columns
 from fpirhc.plant.plant import Plant
 
 _POINTS = 20
@@ -25,15 +26,15 @@ def check_plant(plant: Plant, *, seed: int, box: Mapping[str, tuple[float, float
     Args:
         plant: the plant.
         seed: of the points.
-        box: intervals of states (q1, q1', ...) and inputs by name, from which the points are drawn; (-1, 1) for every
-            other name.
+        box: intervals of states (q1, q1', ...) and inputs by name ("input NAME" beside a coordinate NAME), from which the points
+            are drawn; (-1, 1) for every other name.
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
         InvalidProblem: a name in `box` that the plant does not have.
     """
     mistakes = Mistakes("box")
-    mistakes.unknown("state or input", box or {}, [*plant.state.elements, *plant.inputs])
+    mistakes.unknown("state or input", box or {}, [*plant.state.elements, *input_columns(plant)])
     mistakes.raise_if_any()
     keep(plant, _Trial(plant, dict(box or {})), LAWS, seed)
 
@@ -58,13 +59,13 @@ class _Trial:
     def points(self, generator: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
         """States and inputs."""
         return [
-            (self._drawn(self.plant.state.elements, generator), self._drawn(self.plant.input.elements, generator))
+            (self._drawn(self.plant.state.elements, generator), self._drawn(input_columns(self.plant), generator))
             for _ in range(_POINTS)
         ]
 
     def where(self, x: np.ndarray, u: np.ndarray) -> str:
         """A point in words."""
-        names = [*self.plant.state.elements, *self.plant.input.elements]
+        names = [*self.plant.state.elements, *input_columns(self.plant)]
         return "at " + ", ".join(f"{n} = {v:.4g}" for n, v in zip(names, [*x, *u], strict=True))
 
     def _drawn(self, names: tuple[str, ...], generator: np.random.Generator) -> np.ndarray:

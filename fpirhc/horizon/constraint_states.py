@@ -138,8 +138,8 @@ def soft_names(limits: Limits, plant: Plant) -> frozenset[str]:
 
 
 def _entry(name: str, plant: Plant) -> str:
-    """Name of the entry; a rate is softened by the name of its input."""
-    return f"{name} rate" if name in plant.inputs else name
+    """Name of the entry; a rate is softened by the name of its input where no state has it, else by its own name."""
+    return f"{name} rate" if name in plant.inputs and name not in plant.state.elements else name
 
 
 def _as_measured(name: str) -> str:

@@ -169,6 +169,11 @@ def followed_units(motion: Motion) -> dict[str, str]:
     return {name: one.unit for name, one in motion.outputs.items()} or dict(motion.coordinates)
 
 
+def input_columns(motion: Motion) -> tuple[str, ...]:
+    """Names of the inputs in tables that hold states too: "input NAME" where a coordinate has the name of an input."""
+    return tuple(f"input {name}" if name in motion.coordinates else name for name in motion.inputs)
+
+
 def time_signal(motion: Motion) -> Signal:
     """Return the time's signal."""
     return scalar("time", motion.time_unit)

@@ -40,9 +40,6 @@ def check_names(plant: Motion, mistakes: Mistakes) -> None:
         mistakes.add(
             f"time_unit is {plant.time_unit!r}; write the unit of time of the equations, such as 's', 'ms' or 'day'"
         )
-    every = [*plant.coordinates, *plant.inputs]
-    for name in sorted({n for n in every if every.count(n) > 1}):
-        mistakes.add(f"'{name}' names both a {quantities.removesuffix('s')} and an input; rename one")
     for name in sorted(plant.outputs.keys() & plant.inputs.keys()):
         mistakes.add(f"'{name}' names both an output and an input; rename one")
     _check_order_numbers(plant, mistakes)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.plant.motion import input_columns
 from fpirhc.probing.excitation import Record
 from fpirhc.sensing.base import response_names
 from fpirhc.task.problem import Problem
@@ -19,7 +20,8 @@ _EVEN = 0.01  # share of the period by which a time may be off
 def read_recording(path: Path, problem: Problem) -> Record:
     """Return the record in a CSV file.
 
-    Its columns are "time", every input by name (the command that is sent at this time), the elements of the model's state, and the
+    Its columns are "time", every input by name (the command that is sent at this time;
+    "input NAME" where a coordinate has the same name), the elements of the model's state, and the
     responses ("q1''"); a response without a column is the difference of its lower derivative over a cycle.
 
     Args:
@@ -33,7 +35,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
     responses = response_names(plant)
     lower = {name: name[:-1] for name in responses}
-    needed = ("time", *plant.inputs, *plant.state.elements)
+    needed = ("time", *input_columns(plant), *plant.state.elements)
     lacking(columns, needed, mistakes)
     for name in responses:
         if name not in columns and lower[name] not in columns:
@@ -42,7 +44,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
     check_times(columns, problem, mistakes)
     mistakes.raise_if_any()
     states = np.column_stack([columns[e] for e in plant.state.elements])
-    commands = np.column_stack([columns[n] for n in plant.inputs])
+    commands = np.column_stack([columns[n] for n in input_columns(plant)])
     measured = np.column_stack(
         [columns[n] if n in columns else np.diff(columns[lower[n]], prepend=np.nan) / period for n in responses]
     )[1:]

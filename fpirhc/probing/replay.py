@@ -17,6 +17,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import Mistakes, OutputError
 from fpirhc.fields.checked import checked_call
+from fpirhc.plant.motion import input_columns
 from fpirhc.probing.recording import check_times, columns_of, lacking
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
@@ -105,7 +106,7 @@ def _table(
     columns: Mapping[str, np.ndarray], problem: Problem, measures: tuple[str, ...], name: str
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Measurements in the order of the controller, and recorded commands."""
-    mistakes, period, inputs = Mistakes(f"recording {name}"), problem.period, tuple(problem.plant.inputs)
+    mistakes, period, inputs = Mistakes(f"recording {name}"), problem.period, input_columns(problem.plant)
     values = dict(columns)
     for one in measures:
         lower = one.removesuffix("'")

@@ -28,6 +28,7 @@ from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.dead_time import MEASUREMENT, delay_block
+from fpirhc.task.disturbance import disturbed_place
 from fpirhc.task.exogenous import model_values, real_values
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.problem import Problem
@@ -212,9 +213,9 @@ class Equations(Mover):
         def step(s: Signals) -> dict[str, Expression]:
             u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
             if disturbed:
-                adds = dict(zip(disturbed[0].elements, ca.vertsplit(s.disturbance), strict=True))
-                u = u + ca.vertcat(*(adds.get(name, 0) for name in plant.inputs))
-                w = ca.vertcat(*(adds.get(name, 0) for name in plant.names))
+                adds = _by_place(problem, s.disturbance)
+                u = u + ca.vertcat(*(adds.get((True, name), 0) for name in plant.inputs))
+                w = ca.vertcat(*(adds.get((False, name), 0) for name in plant.names))
             return {"_state_after": advance(s._state_before, u, getattr(s, exact.name), w), "_acting": u, "_forcing": w}
 
         return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)
@@ -274,8 +275,8 @@ class Body(Mover):
         def step(s: Signals) -> dict[str, Expression]:
             u = getattr(s, arriving.name)
             if disturbed:
-                added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
-                u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
+                adds = _by_place(problem, s.disturbance)
+                u = u + ca.vertcat(*(adds.get((True, name), 0) for name in plant.inputs))
             return {SENT: u}
 
         return Block("send", Layout((arriving, *disturbed)), Layout((like(plant.input, SENT),)), step)
@@ -492,6 +493,12 @@ def logged_signal(problem: Problem) -> Signal:
     """Return the signal of what disturbances add to y, y', ... below the responses."""
     output = problem.plant.output
     return Signal(LOGGED, output.elements, output.units)
+
+
+def _by_place(problem: Problem, disturbance: Expression) -> dict[tuple[bool, str], Expression]:
+    """Return what disturbances add by (whether to an input, name)."""
+    values, inputs = ca.vertsplit(disturbance), problem.plant.inputs
+    return {disturbed_place(key, inputs): value for key, value in zip(problem.disturbances, values, strict=False)}
 
 
 def added(problem: Problem, disturbance: Expression) -> tuple[Expression, Expression]:

@@ -188,7 +188,8 @@ class Limits(Checked):
         paths: named limits on expressions of state and input in stages 0 ... N-1: `PathConstraint`, `Ellipsoid`, or a
             `Limit` of your own.
         soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or
-            path, or by name of an input for its rate. The cost then has the term 'soft NAME'.
+            path, or by name of an input for its rate ("NAME rate" where a state has that name). The cost then has the term
+            'soft NAME'.
         prices: prices, in cost per second and unit, of limits that are kept wherever that is worth its price (exact penalties, L1);
             by the same names. Such a limit is kept exactly while its multiplier is below the price. The price is not part of the
             cost's terms; `Plan.slacks` gives what was paid.
@@ -214,14 +215,15 @@ class Limits(Checked):
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("state", self.states, plant.state.elements)
         mistakes.unknown("rates: input", self.rates, plant.inputs)
-        mistakes.unknown("soft: limit of", self.soft, [*self.states, *self.paths, *self.rates])
+        rates = [f"{name} rate" if name in plant.state.elements else name for name in self.rates]
+        mistakes.unknown("soft: limit of", self.soft, [*self.states, *self.paths, *rates])
         for name, interval in [*self.inputs.items(), *self.states.items(), *self.rates.items()]:
             _check_interval(name, interval, mistakes)
         for name, path in self.paths.items():
             if name in plant.state.elements or name in plant.inputs:
                 mistakes.add(f"paths: '{name}' is already the name of a state or input; choose another")
             _check_interval(name, (path.lower, path.upper), mistakes)
-        mistakes.unknown("prices: limit of", self.prices, [*self.states, *self.paths, *self.rates])
+        mistakes.unknown("prices: limit of", self.prices, [*self.states, *self.paths, *rates])
         for name in sorted(self.prices.keys() & self.soft.keys()):
             mistakes.add(f"'{name}' is both soft and priced; choose one")
         for name, price in self.prices.items():

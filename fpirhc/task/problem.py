@@ -29,7 +29,7 @@ from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.checks import check_maps, check_stage, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
-from fpirhc.task.disturbance import Disturbance
+from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
 from fpirhc.task.exogenous import Exogenous, check_signals, not_held, real_values, rows_of, signals_of
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
@@ -55,7 +55,8 @@ class Problem(Checked):
         duration: length of a run.
         limits: of inputs, states, rates and paths.
         disturbances: by name of the input, coordinate or output to which they add; a name of both a coordinate of the moving plant
-            and an output is the coordinate's, and adds to its response.
+            and an output is the coordinate's, and adds to its response. Where an input and a coordinate share a name, they are
+            "input NAME" and "coordinate NAME".
         dead_time: of inputs and measurement. A controller may assume another one.
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
@@ -111,7 +112,13 @@ class Problem(Checked):
         plant = self.plant
         _check_input_before(self, mistakes)
         mistakes.unknown(f"judged: {followed(plant)}", self.judged or (), followed_units(plant))
-        disturbed = [*plant.inputs, *self.moves.disturbable(plant)]
+        others = self.moves.disturbable(plant)
+        shared = [n for n in self.disturbances if n in plant.inputs and n in others]
+        for name in shared:
+            mistakes.add(
+                f"disturbances: '{name}' names both an input and a coordinate; write 'input {name}' or 'coordinate {name}'"
+            )
+        disturbed = [*self.disturbable, *shared]
         what = "input, coordinate or output" if plant.outputs else "input or coordinate"
         mistakes.unknown(f"disturbances: {what}", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
@@ -248,8 +255,11 @@ class Problem(Checked):
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
         if self.reality is None:
             return self
-        known = {*self.plant.inputs, *self.plant.coordinates, *followed_units(self.plant)}
-        disturbances = {name: one for name, one in self.disturbances.items() if name in known}
+        inputs, others = self.plant.inputs, dict.fromkeys([*self.plant.coordinates, *followed_units(self.plant)])
+        known = [*((True, name) for name in inputs), *((False, name) for name in others)]
+        keys = dict(zip(known, disturbance_keys(inputs, others), strict=True))
+        there = {disturbed_place(name, inputs): one for name, one in self.disturbances.items()}
+        disturbances = {keys[place]: one for place, one in there.items() if place in keys}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)
 
@@ -282,6 +292,11 @@ class Problem(Checked):
                     "disturbances that nobody knows yet; disturb a state or an input, or an output of order 1"
                 )
             self.disturbances[name].derivative(instants, 1)
+
+    @property
+    def disturbable(self) -> tuple[str, ...]:
+        """Names that disturbances may have: of the inputs in the plant's order, then of what else moves."""
+        return disturbance_keys(self.plant.inputs, self.moves.disturbable(self.plant))
 
     @property
     def _needed(self) -> tuple[frozenset[str], tuple[str, ...]]:

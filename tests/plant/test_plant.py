@@ -182,7 +182,6 @@ BAD: dict[str, dict[str, Any]] = {
     "order is 1000000000, and the highest possible is 20": {"order": 10**9},
     "must be one scalar": {"response": lambda q, v, u, p: {"y": ca.vertcat(u.u, u.u)}},
     "no input reaches coordinate": {"response": lambda q, v, u, p: {"y": -q.y}},
-    "names both a coordinate and an input": {"inputs": {"y": "N"}},
 }
 
 

@@ -174,7 +174,8 @@ def reference_keeps_limits(grid: ReviewGrid) -> Answer | None:
     if not outside and not touched:
         return Answer(LIMITS, Verdict.YES, text, "", numbers)
     change = f"Move the reference inside the limits of {', '.join([*outside, *touched])}, or widen them."
-    softened = {*limits.soft, *limits.prices} | {f"{i} rate" for i in {*limits.soft, *limits.prices}}
+    soft = {*limits.soft, *limits.prices}
+    softened = soft | {f"{i} rate" for i in soft - {*problem.plant.state.elements}}
     hard = [name for name in outside if name not in softened]
     return Answer(LIMITS, Verdict.NO if hard else Verdict.UNKNOWN, text, change, numbers)
 

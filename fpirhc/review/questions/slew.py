@@ -25,6 +25,7 @@ from fpirhc.review.questions.speed import law_of
 from fpirhc.review.spectra import spectrum_near
 from fpirhc.review.state_slopes import below_responses, state_slopes
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.task.disturbance import disturbed_place
 
 SLEW = "Is the map fast enough for reference and disturbances?"
 RANGE = "Is the map's range large enough for the requests?"
@@ -107,9 +108,10 @@ def effect(grid: ReviewGrid, name: str) -> float:
     response by its own derivative, which is zero for a jump.
     """
     plant = grid.problem.plant
-    if plant.outputs and name in plant.coordinates:
+    of_input, name = disturbed_place(name, plant.inputs)
+    if not of_input and plant.outputs and name in plant.coordinates:
         return _effect_of_state(grid, name)
-    if name not in plant.inputs:
+    if not of_input:
         return 0.0 if name in plant.outputs else 1.0
     unit = np.array([1.0 if i == name else 0.0 for i in plant.inputs])
     command = np.nan_to_num(grid.commands[0, 0])

@@ -344,5 +344,6 @@ def _started(problem: Problem, state: Mapping[str, float] | None, before: Mappin
 def _calm(problem: Problem) -> Problem:
     """The problem without disturbances and noise, and with an entry for signals at its inputs."""
     sensors = {n: replace(s, noise=None, quantum=None, dropout=0.0) for n, s in problem.sensing.sensors.items()}
-    still = {name: Jump(at=0.0, size=0.0) for name in problem.plant.inputs}
+    keys = problem.disturbable[: len(problem.plant.inputs)]
+    still = {key: Jump(at=0.0, size=0.0) for key in keys}
     return replace(problem, disturbances=still, sensing=replace(problem.sensing, sensors=sensors))

@@ -1,0 +1,152 @@
+"""A coordinate and an input may have one name, as a joint and its motor do: nothing but the name differs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.conformance import check_plant
+from fpirhc.errors import InvalidProblem
+from fpirhc.probing.recording import read_recording
+from fpirhc.review.grid import review_grid
+from fpirhc.review.questions.slew import effect
+from fpirhc.task.external_plant import Body
+
+JOINTS = ("shoulder", "elbow")
+CONTROLLER = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), fp.ModelReferenced(fp.Affine(gain=-0.5)))
+
+
+def joints(motors: tuple[str, str], keys: tuple[str, str, str], **changes) -> fp.Problem:
+    """Two joints with these motors; disturbances of the first motor and of the first joint, and the soft rate of that motor."""
+
+    def response(q, v, u, p):
+        first, second = (getattr(u, name) for name in motors)
+        return {"shoulder": (first - 0.3 * second) / p.m - ca.sin(q.shoulder), "elbow": second / p.m - 0.1 * v.elbow}
+
+    plant = fp.Plant(
+        coordinates=dict.fromkeys(JOINTS, "rad"),
+        inputs=dict.fromkeys(motors, "N m"),
+        parameters={"m": fp.Parameter(1.0, 1.3, "kg m^2")},
+        response=response,
+    )
+    of_motor, of_joint, rate = keys
+    settings = {
+        "disturbances": {of_motor: fp.Step(at=0.05, size=0.7), of_joint: fp.Sine(amplitude=0.4, frequency=3.0)},
+        "limits": fp.Limits(
+            inputs=dict.fromkeys(motors, (-5.0, 5.0)),
+            states={"shoulder": (-2.0, 2.0)},
+            rates={motors[0]: (-60.0, 60.0)},
+            soft={"shoulder": 10.0, rate: 1e-3},
+        ),
+        **changes,
+    }
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"shoulder": ca.sin(2 * t), "elbow": ca.cos(2 * t)}),
+        start={"shoulder": 0.0, "elbow": 1.0},
+        period=0.01,
+        duration=0.3,
+        horizon=fp.Horizon(stages=5, step=0.01),
+        cost=fp.Quadratic(states=dict.fromkeys(JOINTS, 10.0), deviation=dict.fromkeys(motors, 1e-3)),
+        **settings,
+    )
+
+
+SHARED = joints(JOINTS, ("input shoulder", "coordinate shoulder", "shoulder rate"))
+OTHER = joints(("M1", "M2"), ("M1", "shoulder", "M1"))
+
+
+def test_a_run_is_that_of_other_names():
+    """Every signal of the run is bit for bit that of motors with names of their own."""
+    shared, other = (fp.simulate(one, CONTROLLER, seed=0, compiled=False) for one in (SHARED, OTHER))
+    assert shared.layout.names == other.layout.names
+    for name in other.layout.names:
+        if not name.endswith("_time"):  # wall time
+            assert np.array_equal(shared[name], other[name], equal_nan=True), name
+
+
+def test_disturbances_act_where_they_are_said_to():
+    """With the disturbance of one kind alone the run differs from that with the other one."""
+    runs = [
+        fp.simulate(replace(SHARED, disturbances={key: fp.Step(at=0.05, size=0.7)}), CONTROLLER, seed=0, compiled=False)
+        for key in ("input shoulder", "coordinate shoulder")
+    ]
+    assert not np.allclose(runs[0]["state"], runs[1]["state"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"disturbances": {"elbow": fp.Step(at=0.1, size=1.0)}},
+            "'elbow' names both an input and a coordinate; write 'input elbow' or 'coordinate elbow'",
+        ),
+        ({"disturbances": {"input elbo": fp.Step(at=0.1, size=1.0)}}, "Did you mean 'input elbow'"),
+        (
+            {"limits": fp.Limits(rates={"elbow": (-1.0, 1.0)}, soft={"elbow": 1.0})},
+            "soft: limit of 'elbow' is unknown. Did you mean 'elbow rate'",
+        ),
+    ],
+)
+def test_a_bare_name_is_refused_where_it_is_ambiguous(changes, message):
+    """The message says both names, or the nearest one."""
+    with pytest.raises(InvalidProblem, match=message):
+        replace(SHARED, **changes)
+
+
+def unused(parameters: Mapping[str, float], seed: int) -> Body:
+    """Nothing runs."""
+    raise AssertionError
+
+
+def test_the_model_of_an_external_plant_takes_what_the_body_has():
+    """Nothing but inputs of a body can be disturbed: the bare name is the input's, and its model is still a problem."""
+    measures = {**dict.fromkeys(JOINTS, "rad"), **{f"{name}'": "rad/s" for name in JOINTS}}
+    measures |= {f"{name}''": "rad/s^2" for name in JOINTS}
+    body = fp.ExternalPlant(make=unused, measures=measures)
+    step = fp.Step(at=0.1, size=1.0)
+    problem = replace(SHARED, reality=body, disturbances={"elbow": step})
+    assert problem.of_model.disturbances == {"input elbow": step}
+
+
+def test_a_recording_names_the_commands(tmp_path: Path):
+    """Columns of commands are 'input NAME' beside the coordinate's own; without them they are asked for by that name."""
+    run = fp.simulate(SHARED, CONTROLLER, seed=0, compiled=False)
+    columns = {"time": run.time, **{e: run["state"][:, k] for k, e in enumerate(SHARED.plant.state.elements)}}
+    commands = {f"input {name}": run["command"][:, k] for k, name in enumerate(JOINTS)}
+
+    def written(values: dict[str, np.ndarray]) -> Path:
+        path = tmp_path / "run.csv"
+        np.savetxt(path, np.column_stack(list(values.values())), delimiter=",", header=",".join(values), comments="")
+        return path
+
+    record = read_recording(written({**columns, **commands}), SHARED)
+    assert record.usable.any()
+    with pytest.raises(fp.FpirhcError, match="lacks columns for input shoulder, input elbow"):
+        read_recording(written(columns), SHARED)
+
+
+def test_a_box_of_a_plant_has_both():
+    """Points are drawn from the interval of the joint and of its motor."""
+    check_plant(SHARED.plant, seed=0, box={"elbow": (-0.5, 0.5), "input elbow": (2.0, 3.0)})
+
+
+def test_a_review_weighs_both_disturbances():
+    """A unit of torque changes the responses by 1 / m, one of the response by 1."""
+    grid = review_grid(SHARED, mismatch=10.0, seed=0)
+    assert effect(grid, "coordinate shoulder") == 1.0
+    assert effect(grid, "input shoulder") == pytest.approx(1 / 1.3)
+
+
+def test_a_review_is_that_of_other_names():
+    """Every verdict and every number."""
+    shared, other = (fp.review(one, {"FPI": CONTROLLER}, mismatch=10.0, seed=0) for one in (SHARED, OTHER))
+    for ours, theirs in ((shared.problem, other.problem), (shared.controllers["FPI"], other.controllers["FPI"])):
+        assert [one.verdict for one in ours] == [one.verdict for one in theirs]
+        assert [list(one.numbers.values()) for one in ours] == [list(one.numbers.values()) for one in theirs]
