@@ -33,6 +33,8 @@ import draws  # noqa: E402  # stands beside the problem file
 import vehicle  # noqa: E402
 
 LOST = 1.0  # m
+AHEAD = 0.03  # s, of a controller that predicts its state
+PREDICTIONS = {"by model": fp.ByModel(), "with residual": fp.ByModel(residual_time=0.1), "by desired": fp.ByDesired()}
 MOMENTS = 0.1  # gain of the second iteration, on the moments
 TURN = 2 * np.pi * 0.2  # rad/s, of the circle
 BUTTER = ((0.39133577, 0.78267155, 0.39133577), (0.36952738, 0.19581571))  # numerator; denominator without its one
@@ -191,14 +193,18 @@ def circle(task: Task) -> None:
     late += [(f"motors {t} ms", {"late_motors": t / 1e3}) for t in (10, 20, 30)]
     law = fp.Exponential(rate=3.0, integral=False)
     slow = fp.ComputedTorque(law, fp.ModelReferenced(fp.Affine(gain=-0.05)))
-    controllers = {**task.controllers, "CTC+FPI, gain -.05": slow}
-    print(f"{'':22s}" + "".join(f"{title or 'no latency':>14s}" for title, _ in late))
+    predicted = {
+        f"CTC+FPI, 30 ms ahead {name}": fp.Predicted(task.controllers["CTC+FPI"], inputs=AHEAD, by=by)
+        for name, by in PREDICTIONS.items()
+    }
+    controllers = {**task.controllers, "CTC+FPI, gain -.05": slow, **predicted}
+    print(f"{'':34s}" + "".join(f"{title or 'no latency':>14s}" for title, _ in late))
     rows = {
         name: [_circled(task, name, controllers.get(name), told) for _, told in late]
         for name in (*RIVALS, *controllers)
     }
     for name, cells in rows.items():
-        print(f"{name:22s}" + "".join(f"{cell:14.4f}" for cell in cells), flush=True)
+        print(f"{name:34s}" + "".join(f"{cell:14.4f}" for cell in cells), flush=True)
 
 
 def _circled(task: Task, name: str, controller: fp.Controller | None, told: Mapping[str, float]) -> float:
@@ -219,7 +225,7 @@ def _circled(task: Task, name: str, controller: fp.Controller | None, told: Mapp
     if controller is None:
         return float(RIVALS[name](numbers, first, speed).distances(motion(problem), problem.cycles, 0)[300:].mean())
     run = fp.simulate(problem, controller, seed=0, compiled=False)
-    away = np.linalg.norm([run[f"error.{n}"].ravel() for n in "xyz"], axis=0)[300:]
+    away = np.linalg.norm([run[f"true_error.{n}"].ravel() for n in "xyz"], axis=0)[300:]
     return float(away.mean()) if run.stop is None else np.inf
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -57,6 +59,31 @@ def test_what_the_model_lacks_is_lacking_in_the_prediction(late, form, by, remov
     run = fp.simulate(problem, law(late, form, by), seed=0, compiled=False)
     expected = [FORCE / KP * (1 + KD * late + KP * late**2 / 2), FORCE / KP * (KD * late + KP * late**2 / 2), 0.0]
     assert run["true_error.q"][-1] == pytest.approx(expected[int(removed)], rel=0.01, abs=1e-6)
+
+
+def test_errors_of_a_body_outside_are_those_of_now():
+    """A body that shows no response: what the controller follows is the reference ahead, and errors count from that of now."""
+
+    class Body:
+        def reset(self, _seed):
+            self.state = np.array([0.0, 1.0])
+            return self.state
+
+        def step(self, _time, command):
+            q, v = self.state
+            self.state = np.array([q + PERIOD * v + PERIOD**2 / 2 * command[0], v + PERIOD * command[0]])
+            return self.state
+
+    problem = replace(
+        mass(0.0).with_exact(np.zeros(1)),
+        reality=fp.ExternalPlant(Body(), measures={"q": "m", "q'": "m/s"}),
+        sensing=fp.Sensing(estimator=fp.VelocityDifference()),
+        reference=fp.Trajectory(lambda t: {"q": ca.sin(t)}),
+        start={"q": 0.0, "q'": 1.0},
+    )
+    run = fp.simulate(problem, law(0.08, by=fp.ByDesired()), seed=0, compiled=False)
+    np.testing.assert_allclose(run["true_error.q"], np.sin(run.time) - run["state.q"], atol=1e-12)
+    assert np.abs(run["reference.q"] - np.sin(run.time + 0.08)).max() < 1e-12
 
 
 def test_review_names_a_prediction_that_knows_it():
