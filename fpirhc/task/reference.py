@@ -47,12 +47,35 @@ class Reference(Checked, ABC):
         return False
 
     @abstractmethod
+    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
+        """Return {coordinate: expression of t}."""
+
     def function(self, plant: Plant) -> ca.Function:
         """Function t -> (nominal state (nx), nominal response (n)); of a plant with outputs these are those of its outputs.
 
         Raises:
             InvalidProblem: a coordinate is missing, unknown, or not a scalar.
         """
+        return _FUNCTIONS.of((self, plant.equations), (), lambda: self._function(plant))
+
+    def _function(self, plant: Plant) -> ca.Function:
+        matrix, what = kind(self.opaque), followed(plant)
+        t = matrix.sym("t")
+        motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
+        _check(plant, motion, what)
+        by = time_derivatives(plant)
+        derivatives = {c: by(motion[c], t, r) for c, r in plant.chains.items()}
+        state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.output.elements]
+        response = [derivatives[c][r] for c, r in plant.chains.items()]
+        results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
+        return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
+
+    def derivatives(self, coordinate: str, order: int) -> ca.Function:
+        """Function t -> the coordinate's nominal value and its derivatives up to `order`, shape (order + 1,)."""
+        matrix = kind(self.opaque)
+        t = matrix.sym("t")
+        values = differentiated(matrix(self.coordinates(t)[coordinate]), t, order)
+        return ca.Function("fpirhc_reference_derivatives", [t], [ca.densify(ca.vertcat(*values))])
 
     @property
     def set_points(self) -> Mapping[str, Steps]:
@@ -89,9 +112,10 @@ class Reference(Checked, ABC):
         t = kind(self.opaque).sym("t")
         return ca.Function("fpirhc_reference_ahead", [t], list(function(t + ahead)), ["t"], ["state", "response"])
 
-    @abstractmethod
     def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
         """Function (t, own signals) -> the coordinate's value and its derivatives up to `order`, shape (order + 1,)."""
+        del plant, stages
+        return self.derivatives(coordinate, order)
 
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
         """Function (own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from now on; None without own signals."""
@@ -109,40 +133,8 @@ class Reference(Checked, ABC):
         return 0.0
 
 
-class KnownMotion(Reference, ABC):
-    """Contract: a nominal motion whose coordinates are expressions of the time."""
-
-    @abstractmethod
-    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
-        """Return {coordinate: expression of t}."""
-
-    def function(self, plant: Plant) -> ca.Function:
-        """Function t -> (nominal state (nx), nominal response (n)), built once for a plant."""
-        return _FUNCTIONS.of((self, plant.equations), (), lambda: self._function(plant))
-
-    def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
-        """Function t -> the coordinate's nominal value and its derivatives up to `order`, shape (order + 1,)."""
-        del plant, stages
-        matrix = kind(self.opaque)
-        t = matrix.sym("t")
-        values = differentiated(matrix(self.coordinates(t)[coordinate]), t, order)
-        return ca.Function("fpirhc_reference_derivatives", [t], [ca.densify(ca.vertcat(*values))])
-
-    def _function(self, plant: Plant) -> ca.Function:
-        matrix, what = kind(self.opaque), followed(plant)
-        t = matrix.sym("t")
-        motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
-        _check(plant, motion, what)
-        by = time_derivatives(plant)
-        derivatives = {c: by(motion[c], t, r) for c, r in plant.chains.items()}
-        state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.output.elements]
-        response = [derivatives[c][r] for c, r in plant.chains.items()]
-        results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
-        return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
-
-
 @dataclass(frozen=True, eq=False)
-class Trajectory(KnownMotion):
+class Trajectory(Reference):
     """A nominal motion given as expressions of time: Trajectory(lambda t: {"q1": ca.sin(2 * t)}).
 
     Args:
@@ -160,7 +152,7 @@ class Trajectory(KnownMotion):
 
 
 @dataclass(frozen=True, eq=False)
-class Table(KnownMotion):
+class Table(Reference):
     """A nominal motion given by samples and joined by splines; outside the table it is constant.
 
     Args:

@@ -14,12 +14,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import cast
+from typing import NoReturn, cast
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.given import described
 from fpirhc.fields.kinds import Count, Positive, real_number
 from fpirhc.plant.chain import response_units
@@ -260,6 +260,17 @@ class Setpoint(Reference):
         mistakes = Mistakes("Setpoint")
         mistakes.unknown("start: coordinate", self.start, self.values)
         mistakes.raise_if_any()
+
+    def coordinates(self, t: Expression) -> NoReturn:
+        """Refuse: the motion depends on the orders of a plant; use `function`.
+
+        Raises:
+            NotSupported: always.
+        """
+        del t
+        raise NotSupported(
+            "the motion towards set-points depends on the orders of a plant; use Setpoint.function(plant)"
+        )
 
     @property
     def set_points(self) -> Mapping[str, Steps]:

@@ -268,10 +268,7 @@ def test_an_output_that_is_only_judged_is_measured_and_not_controlled() -> None:
     first = sedated(hill(5.5))
 
     def motion(t: Any) -> dict[str, Any]:
-        return {
-            **first.reference.coordinates(t),  # type: ignore[attr-defined]  # a trajectory
-            "level": 4.0 + 0 * t,
-        }
+        return {**first.reference.coordinates(t), "level": 4.0 + 0 * t}
 
     judged = replace(first, plant=plant, reference=fp.Trajectory(motion), judged=("depth", "level"))
     run = simulated(judged, fp.ComputedTorque(fp.Exponential(rate=1.0)))

@@ -72,9 +72,17 @@ class Shifted(Reference):
         """Those of the reference."""
         return self.reference.set_points
 
+    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
+        """Return the motion without shift."""
+        return self.reference.coordinates(t)
+
     def function(self, plant: Plant) -> ca.Function:
         """Function t -> (nominal state (nx), nominal response (n)) without shift."""
         return self.reference.function(plant)
+
+    def derivatives(self, coordinate: str, order: int) -> ca.Function:
+        """Function t -> the coordinate's nominal value and its derivatives without shift."""
+        return self.reference.derivatives(coordinate, order)
 
     def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
         """Return the own signals of the reference, and the shift."""
