@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import os
 import sys
 from collections.abc import Mapping, Sequence
 
@@ -16,6 +17,8 @@ from fpirhc.summary import printable
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; `--help` ends with SystemExit(0), as argparse does."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    # Matrices of loops are small: threads of the linear algebra wait for one another. NumPy reads this when it is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = int(_run([word for word in words if word != DEBUG]))
         sys.stdout.flush()  # a reader that has gone shows here, and not at the end of the program

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -210,3 +212,14 @@ def test_solve_without_a_horizon_says_what_is_missing(folder, capsys):
     """A problem for tracking laws has nothing to solve."""
     assert main(["solve", "line.py"]) == 2
     assert "no horizon or no cost" in capsys.readouterr().err
+
+
+def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise():
+    """NumPy is imported after the number is set, so a command of its own process is asked."""
+    for given, expected in ((None, "1"), ("2", "2")):
+        environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+        environment |= {} if given is None else {"OPENBLAS_NUM_THREADS": given}
+        code = "import os, sys\nfrom fpirhc.cli.main import main\nassert 'numpy' not in sys.modules\nmain(['list', '--x'])\n"
+        asked = [sys.executable, "-c", f"{code}print(os.environ['OPENBLAS_NUM_THREADS'])"]
+        done = subprocess.run(asked, env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == expected
