@@ -21,9 +21,9 @@ from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
 from fpirhc.review.questions.commands import commands_inside, inverse_exists
 from fpirhc.review.questions.convergence import _NEAR, _without, box_converges, converges
-from fpirhc.review.questions.gain import _sign, gain_admissible, gain_of_target
+from fpirhc.review.questions.gain import _gain, _sign, gain_admissible, gain_of_target
 from fpirhc.review.questions.margins import LEAST_PHASE, MARGINS, margins_enough
-from fpirhc.review.questions.slew import effect, range_enough, slew_enough
+from fpirhc.review.questions.slew import _start_deviation, effect, range_enough, slew_enough
 from fpirhc.review.recommended_gain import FAR, recommended_gain
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
@@ -151,6 +151,18 @@ OWN = "See the question about the gain; under dead time pair the deformation."
 def test_the_fault_of_an_outer_loop_is_not_the_gains(grid, ideal, change):
     """A loop that does not converge with the right model needs another rate, and no other gain."""
     assert convergence(grid, loops(2.0, ideal=ideal)).change == change
+
+
+@pytest.mark.parametrize(
+    ("share", "ideal", "seconds"),
+    [(0.5, 0.5, "20 s"), (0.25, 0.5, "40 s"), (0.5, 0.999, ""), (-0.5, 0.5, ""), (0.0, 0.5, ""), (0.5, None, "")],
+)
+def test_a_slow_loop_is_told_its_time_where_the_right_model_is_quicker(grid, share, ideal, seconds):
+    """A share of the hundredfold change in a run of 10 s takes its inverse of it; what grows or is as slow anyway is not told."""
+    one = convergence(grid, loops(math.exp(-share * EDGE), ideal=ideal))
+    assert one.verdict == "unknown"
+    told = f"It converges, and takes {seconds} for a factor of 100, more than the run has: a larger gain is quicker."
+    assert (told if seconds else OWN) == one.change
 
 
 def test_a_loop_that_changes_on_line_is_unknown(grid):
@@ -292,6 +304,12 @@ def test_of_a_map_without_a_gain_of_its_own_the_effective_one_is_told(monkeypatc
     assert one.change == "Use effective gain = 0.1, half of it."
 
 
+def test_of_a_map_on_targets_the_loop_decides_and_without_eigenvalues_nobody(monkeypatch):
+    monkeypatch.setattr("fpirhc.review.questions.gain.gain_of_target", lambda case: "its loop")
+    asked: Any = [SimpleNamespace(controller=SimpleNamespace(deforms=d), spectra=None) for d in ("target", "response")]
+    assert [_gain(case) for case in asked] == ["its loop", None]
+
+
 def test_the_sign_of_eigenvalues_is_that_of_the_box():
     """J = 1 at the plant; one of the other sign in the box leaves it open, one at the plant is a no; none is no answer."""
     plant, box, both = (Spectrum(np.array(e, complex)[:, None]) for e in ([1.0], [1.0, -0.5], [2.0, -1.0]))
@@ -407,6 +425,23 @@ def test_a_disturbance_of_a_state_acts_on_the_response_of_the_output():
     )
     own = review_grid(problem, 0.0, 0)
     assert [effect(own, name) for name in ("b", "y", "u")] == pytest.approx([4.5, 0.0, 4.5])
+
+
+def test_a_start_off_the_reference_of_outputs_is_the_state_that_explains_them():
+    """With y = a, a' = 3 b (1 + a) the start (0.6, 0.3) has y' = 1.44, the reference 0.5 and 1; coordinates have theirs."""
+    plant = fp.Plant.of_states(
+        states={"a": "m", "b": "m"},
+        inputs={"u": "m/s"},
+        outputs={"y": fp.Output("m", lambda x, p: x.a)},
+        rates=lambda x, u, p: {"a": p.k * x.b * (1 + x.a), "b": u.u},
+        parameters={"k": fp.Parameter(3.0, 3.0, "1/s")},
+    )
+    reference = fp.Trajectory(lambda t: {"y": 0.5 + ca.sin(t)})
+    problem = fp.Problem(plant, reference, start={"a": 0.6, "b": 0.3}, period=PERIOD, duration=PERIOD * CYCLES)
+    shown = np.array([[1.0, 0.0], [2 / 3, 4.5]])  # of y and y' by a and b, at a = 0.5 and b = 2 / 9
+    assert _start_deviation(review_grid(problem, 0.0, 0), shown) == pytest.approx([0.1, (0.44 - 0.2 / 3) / 4.5])
+    off = review_grid(mass(start={"q": 0.2, "q'": 1.0}), 0.0, 0)
+    assert _start_deviation(off, np.full((2, 2), np.nan)) == pytest.approx([0.2, -0.5])
 
 
 @pytest.mark.parametrize(("ratio", "verdict"), [(10.1, "yes"), (9.9, "unknown"), (1.01, "unknown"), (0.99, "no")])

@@ -15,7 +15,7 @@ from sampled import lag, poles
 import fpirhc as fp
 from fpirhc.contraction.large_errors import least_product
 from fpirhc.deformation import Deformation
-from fpirhc.review.question import ControllerQuestion, known_questions
+from fpirhc.review.question import ControllerQuestion, ProblemQuestion, known_questions
 from fpirhc.review.questions.convergence import BOX, CONVERGES
 from fpirhc.review.questions.gain import GAIN, ONE_SIGN, TWO_CYCLES
 from fpirhc.review.questions.right_model import NULL_TEST
@@ -120,6 +120,22 @@ def test_questions_that_are_asked_of_a_map_on_targets_ask_its_loop():
     of_targets = {q.text for q in known_questions(ControllerQuestion) if q.of_targets}
     assert {CONVERGES, BOX, GAIN, NULL_TEST} < of_targets
     assert not {ONE_SIGN, TWO_CYCLES} & of_targets
+
+
+def test_a_no_about_the_way_speaks_against_the_verdict():
+    """A singular inverse, commands and requests out of range, and two-cycles: whatever the poles of the loop say."""
+    every = *known_questions(ControllerQuestion), *known_questions(ProblemQuestion)
+    doubts = {q.text for q in every if q.doubts}
+    assert doubts == {
+        "Is the problem well posed?",
+        "Does the inverse exist along the reference?",
+        "Are the commands that the reference needs inside the limits?",
+        "Is the map fast enough for reference and disturbances?",
+        "Is the map's range large enough for the requests?",
+        "Is it free of bounded two-cycles?",
+        "Does it come back from the largest response error?",
+        "Does the loop with the reality converge?",
+    }
 
 
 @pytest.mark.parametrize(("period", "harmful"), [(PERIOD, False), (0.02, True)])
