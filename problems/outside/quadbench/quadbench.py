@@ -17,13 +17,13 @@ import numpy as np
 import vehicle
 
 import fpirhc as fp
-from fpirhc.task.reference import KnownMotion
+from fpirhc.task.reference import Reference
 
 AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
-class ToGoal(KnownMotion):
+class ToGoal(Reference):
     """From rest at the origin to a position, velocity and acceleration at the time T, with the least integral of squared jerk.
 
     r = c3 t^3 + c4 t^4 + c5 t^5 by axis; [c3, c4, c5] solve r(T), r'(T), r''(T) of the goal. Numbers of the goal may be live.
