@@ -351,7 +351,7 @@ def test_journey_with_text(capsys):
     [
         (["no_such_problem"], "unknown"),
         (["two_mass", "--controllers", "RCH"], "Did you mean"),
-        (["two_mass", "--mismatch", "250"], "mismatch 250"),
+        (["two_mass", "--mismatch", "250"], "--mismatch: expected percent from 0 to below 100, such as 20%, got '250'"),
     ],
 )
 def test_bad_input_ends_with_2(words, message, capsys):

@@ -26,8 +26,8 @@ PROBLEM = fp.Problem(
 )
 GENTLE = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.05))
 TEXT = (
-    r"ComputedTorque: adaptation does harm, by runs of 300 cycles: on the plant the rms error of y is (\S+) without adaptation, "
-    r"(\S+) with it; on its own model, with nothing to adapt the rms error of y is (\S+) without adaptation, (\S+) with it\. "
+    r"ComputedTorque: adaptation does harm, by runs of 300 cycles: on the plant the rms error of y is (\S+) m without adaptation, "
+    r"(\S+) m with it; on its own model, with nothing to adapt the rms error of y is (\S+) m without adaptation, (\S+) m with it\. "
 )
 
 

@@ -136,6 +136,7 @@ class AskedLoop:
         changed[self._gains] = gain
         return changed
 
+    @np.errstate(over="ignore")  # a scalar product that is infinite is not below its bound
     def run(
         self, memory: np.ndarray, cycles: int, led: np.ndarray | None = None, request: np.ndarray | None = None
     ) -> Passage:
