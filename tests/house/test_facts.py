@@ -426,9 +426,9 @@ BUILDS = {
     "review/questions/form.py": {"Increment", "ModelReferenced"},  # the forms that are compared
     "review/prediction.py": {"Identity"},  # no adaptation
     "review/suggest.py": {"Filtered"},  # the suggested deformation
-    "simulation/held_input.py": {"Identity"},  # no controller: nothing is adapted
     "studies/comparison/caveats.py": {"HeldInput"},  # the plant with nobody at it
     "simulation/linearise/asked_loop.py": {"Jump"},  # the entry of signals at the inputs
+    "studies/operating_limits.py": {"Noise"},  # the noise of the sensors at which a controller fails is sought
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
     "task/checks.py": {"MapSteps", "StepDifference"},  # what a map has in place of an integrator and of its response
 }

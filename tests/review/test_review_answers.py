@@ -307,7 +307,8 @@ def test_of_a_map_without_a_gain_of_its_own_the_effective_one_is_told(monkeypatc
 def test_of_a_map_on_targets_the_loop_decides_and_without_eigenvalues_nobody(monkeypatch):
     monkeypatch.setattr("fpirhc.review.questions.gain.gain_of_target", lambda case: "its loop")
     asked: Any = [SimpleNamespace(controller=SimpleNamespace(deforms=d), spectra=None) for d in ("target", "response")]
-    assert [_gain(case) for case in asked] == ["its loop", None]
+    answers: list[Any] = [_gain(case) for case in asked]
+    assert answers == ["its loop", None]
 
 
 def test_the_sign_of_eigenvalues_is_that_of_the_box():

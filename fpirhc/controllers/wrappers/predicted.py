@@ -29,7 +29,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import cast
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -64,6 +64,11 @@ class Predictor(Checked, ABC):
     def residual_time(self) -> float | None:
         """Time constant of the low-passed model residual that `advance` is given, s; None: the residual is zero."""
         return None
+
+    def others(self, late: float) -> tuple[Predictor, ...]:
+        """Return the predictors that may know more over a dead time of `late` s, for questions about this one."""
+        del late
+        return ()
 
     @abstractmethod
     def check(self, plant: Plant) -> None:
@@ -105,6 +110,10 @@ class ByModel(Predictor):
             raise InvalidValue(
                 f"ByModel(residual_time={self.residual_time!r}): expected a positive number of seconds or None"
             )
+
+    def others(self, late: float) -> tuple[Predictor, ...]:
+        """A residual as slow as the dead time, and the desired responses; none where there is a residual, or no dead time."""
+        return (ByModel(residual_time=late), ByDesired()) if late and self.residual_time is None else ()
 
     def check(self, plant: Plant) -> None:
         """Accept every plant."""
@@ -357,16 +366,10 @@ def output_ahead(plant: Plant) -> ca.Function:
 
 
 def other_predictions(controller: Controller) -> dict[str, Controller]:
-    """Return the controller with a residual in its prediction, and with the desired responses, by the text of the prediction.
-
-    None where it does not predict by its model alone.
-    """
-    if isinstance(controller, Predicted):
-        late = controller.inputs + controller.measurement
-        if controller.by != ByModel() or not late:
-            return {}
-        residual = replace(controller, by=ByModel(residual_time=late))
-        return {f"ByModel(residual_time={late:.3g})": residual, "ByDesired()": replace(controller, by=ByDesired())}
+    """Return the controller with the other predictors that its own one names, by their texts; none where nothing predicts."""
+    around: Any = controller
+    if isinstance(getattr(around, "by", None), Predictor):
+        return {str(other): replace(around, by=other) for other in around.by.others(around.inputs + around.measurement)}
     if controller.inner is None:
         return {}
     return {name: with_inner(controller, other) for name, other in other_predictions(controller.inner).items()}
