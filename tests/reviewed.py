@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -12,7 +10,6 @@ import numpy as np
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.review.grid import review_grid
-from fpirhc.review.loops import loops_along
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
 from fpirhc.review.questions.convergence import CONVERGES
@@ -54,22 +51,11 @@ def about(result: dict[str, fp.Answer], words: str) -> fp.Answer:
     return result[question]
 
 
-class _Later:
-    """A value that is built when its first attribute is read."""
-
-    def __init__(self, build: Callable[[], Any]) -> None:
-        self._build = cache(build)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._build(), name)
-
-
 def case(problem: fp.Problem, controller: Any, mismatch: float = 0.0) -> Case:
     """What one question of a review is asked with; the linear loops are built if it reads them."""
     grid = review_grid(problem, mismatch, 0)
     ready = resolved(grid.problem, controller)
-    loops: Any = _Later(lambda: loops_along(grid, ready))
-    return Case(grid, ready, loops, NominalRuns(grid.problem))
+    return Case(grid, ready, NominalRuns(grid.problem))
 
 
 def answer(problem: fp.Problem, controller: Any, words: str, mismatch: float = 0.0) -> Any:

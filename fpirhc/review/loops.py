@@ -43,20 +43,15 @@ class Loops:
         places: indices of the loops' points among the reference's points, those at a limit left out: there nothing is fed back.
         loops: loops of the plant with its exact parameters, one for every place.
         ideal: loop of the controller without deformation whose model is the plant, the outer loop by itself; None: not computed.
-        drawn: of a controller that adapts, loops of plants from the box of parameters, and with the shortest and the longest dead
-            time of the box.
         reason: why there are no loops; else empty.
         learns: whether the controller changes on line what the loops have as it is at their points: a model, or gains.
-        draws: points and draws of the parameters of those in `drawn` that differ in nothing else.
     """
 
     places: tuple[int, ...]
     loops: tuple[LinearLoop, ...]
     ideal: LinearLoop | None
-    drawn: tuple[LinearLoop, ...] = ()
     reason: str = ""
     learns: bool = False
-    draws: tuple[tuple[int, int], ...] = ()
 
     @property
     def radii(self) -> np.ndarray:
@@ -92,21 +87,20 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     places = tuple(k for k, one in every.items() if (_fed_back(one) >= _SMALL * strongest).all())
     if not places or not (strongest.all() or all(points.asked.inside(points.quiet(k)) for k in places)):
         raise NotSupported("the command stands at a limit all along the reference")
-    drawn, late = _drawn(grid, controller, places, strongest) if controller.deformation.adapts else ({}, [])
-    loops, learns = tuple(every[k] for k in places), controller.learns and points.asked.keeps_learned
-    return Loops(places, loops, None, (*drawn.values(), *late), learns=learns, draws=tuple(drawn))
+    learns = controller.learns and points.asked.keeps_learned
+    return Loops(places, tuple(every[k] for k in places), None, learns=learns)
 
 
-def _drawn(
-    grid: ReviewGrid, controller: Controller, places: Sequence[int], strongest: np.ndarray
-) -> tuple[dict[tuple[int, int], LinearLoop], list[LinearLoop]]:
-    """Loops of plants from the box by point and draw, and of dead times at its ends: how a deformation converges all over it."""
-    points = points_of(grid, controller)
-    pairs = _pairs(grid, places, _DRAWN if points.asked.quick else _DRAWN_OF_PLANS)
-    drawn = {pair: points.at(*pair) for pair in pairs if np.isfinite(grid.commands[pair[::-1]]).all()}
-    drawn = {pair: one for pair, one in drawn.items() if (_fed_back(one) >= _SMALL * strongest).all()}
-    late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, places[:: max(1, len(places) // 2)])]
-    return drawn, late
+def loops_over_box(grid: ReviewGrid, controller: Controller, own: Loops) -> tuple[LinearLoop, ...]:
+    """Return loops of plants from the box of parameters, and with its shortest and its longest dead time.
+
+    Raises:
+        NotSupported: no linear loop.
+        FpirhcError: every error that the controller raises about the problem.
+    """
+    drawn, every = points_of(grid, controller).drawn(own), max(1, len(own.places) // 2)
+    late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, own.places[::every])]
+    return (*drawn.values(), *late)
 
 
 def _fed_back(loop: LinearLoop) -> np.ndarray:
@@ -129,6 +123,13 @@ class Points:
         if (place, draw) not in self._loops:
             self._loops[place, draw] = self.asked.at(self.quiet(place, draw))
         return self._loops[place, draw]
+
+    def drawn(self, own: Loops) -> dict[tuple[int, int], LinearLoop]:
+        """Return the loops of plants from the box by point and draw, those at a limit left out."""
+        strongest = np.max([_fed_back(one) for one in own.loops], axis=0)
+        pairs = _pairs(self.grid, own.places, _DRAWN if self.asked.quick else _DRAWN_OF_PLANS)
+        drawn = {pair: self.at(*pair) for pair in pairs if np.isfinite(self.grid.commands[pair[::-1]]).all()}
+        return {pair: one for pair, one in drawn.items() if (_fed_back(one) >= _SMALL * strongest).all()}
 
     def between(self, place: int, draw: int, gains: tuple[float, float], *, held: bool) -> tuple[LinearLoop, ...]:
         """Return the linear loops of two gains of the map at a point, in the same coordinates; held: plans are held for ever."""
@@ -320,7 +321,7 @@ class LoopsByGain:
 
     def over_box(self, most: int) -> list[Pair]:
         """Return (lower, own) for no more than so many draws of the parameters."""
-        return [self._pair(*one, False) for one in thinned(self._own.draws, most)]
+        return [self._pair(*one, False) for one in thinned(tuple(self._points.drawn(self._own)), most)]
 
     def at(self, gain: float, pair: Pair) -> LinearLoop:
         """Return the loop at another effective gain."""

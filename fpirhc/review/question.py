@@ -22,7 +22,7 @@ from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.members import within
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.loops import Loops, LoopsByGain, loops_by_gain
+from fpirhc.review.loops import Loops, LoopsByGain, loops_along, loops_by_gain
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.prediction import NominalRun
 from fpirhc.review.spectra import spectrum_near
@@ -42,14 +42,12 @@ class Case:
     Args:
         grid: points of the reference and draws of the parameters.
         controller: the controller, with its automatic settings chosen.
-        loops: its linear loops.
         runs: the models' own runs of this review.
         general: answers about the problem.
     """
 
     grid: ReviewGrid
     controller: Controller
-    loops: Loops
     runs: NominalRuns
     general: tuple[Answer, ...] = ()
 
@@ -74,6 +72,11 @@ class Case:
         except InvalidValue:
             return None
         return own, boxed
+
+    @cached_property
+    def loops(self) -> Loops:
+        """Its linear loops along the reference."""
+        return loops_along(self.grid, self.controller)
 
     @cached_property
     def by_gain(self) -> LoopsByGain | None:

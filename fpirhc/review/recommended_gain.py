@@ -30,7 +30,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import review_grid
-from fpirhc.review.loops import LoopsByGain, loops_along, own_loops
+from fpirhc.review.loops import LoopsByGain
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.question import Case
 from fpirhc.review.questions.margins import keeps_margins
@@ -213,7 +213,7 @@ def recommended_for(problem: Problem, controller: Controller) -> Recommended | N
         boxed = spectrum_near(
             grid, ready.plant_model(grid.problem).parameters(grid.problem.plant), grid.draws, near=False
         )
-        case = Case(grid, ready, loops_along(grid, ready), NominalRuns(grid.problem))
+        case = Case(grid, ready, NominalRuns(grid.problem))
         return gain_advice(case, boxed, leaves_right_model_alone(case))
     except FpirhcError:
         return None
@@ -223,7 +223,7 @@ def _case_with(case: Case, gain: float) -> Case:
     """The case of the controller with another effective gain."""
     deformation = case.controller.deformation.with_effective_gain(gain)
     controller = resolved(case.problem, case.controller.with_deformation(deformation))
-    return Case(case.grid, controller, loops_along(case.grid, controller), case.runs)
+    return Case(case.grid, controller, case.runs)
 
 
 def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> str:
@@ -247,5 +247,5 @@ def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> s
 
 def _speed(problem: Problem, controller: Controller) -> Answer | None:
     grid = review_grid(problem, 0.0, 0)
-    case = Case(grid, controller, own_loops(grid, controller), NominalRuns(grid.problem))
+    case = Case(grid, controller, NominalRuns(grid.problem))
     return fast_enough(case) or plan_keeps_up(case)

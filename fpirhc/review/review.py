@@ -13,7 +13,6 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.review.answer import Answer, Review, Verdict, decided
 from fpirhc.review.grid import ReviewGrid, review_grid
-from fpirhc.review.loops import loops_along
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, asked, known_questions
 from fpirhc.review.questions.convergence import CONVERGES
@@ -59,7 +58,7 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     grid = replace(grid, draws=grid.draws[:1])  # the box does not matter
     ready = resolved(grid.problem, controller)
     general = _present(asked(question, grid) for question in known_questions(ProblemQuestion) if question.doubts)
-    case = Case(grid, ready, loops_along(grid, ready), NominalRuns(grid.problem), general)
+    case = Case(grid, ready, NominalRuns(grid.problem), general)
     [verdict] = (question for question in known_questions(ControllerQuestion) if question.text == CONVERGES)
     answer = verdict.ask(case)
     assert answer is not None
@@ -77,11 +76,9 @@ def _of(grid: ReviewGrid, controller: Controller, general: tuple[Answer, ...], r
     schedule = schedule_stable(grid.problem, ready)
     if schedule is not None:
         return (schedule,)
-    broken: list[str] = []
-    loops = attempted("the linear loop", loops_along, grid, ready, broken=broken)
-    if loops is None:
+    case, broken = Case(grid, ready, runs, general), list[str]()
+    if attempted("the linear loop", lambda: case.loops, broken=broken) is None:
         return (Answer("Is there a linear loop along the reference?", Verdict.UNKNOWN, broken[0]),)
-    case = Case(grid, ready, loops, runs, general)
     return _present(case.answer(question) for question in known_questions(ControllerQuestion))
 
 

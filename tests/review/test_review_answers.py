@@ -198,13 +198,16 @@ def test_doubts_and_steep_maps_speak_against_convergence(grid):
         ((), "yes", "in 100 % of 1 draws; the worst mode is multiplied by 0.25 per cycle"),
     ],
 )
-def test_share_of_the_box_that_converges(grid, drawn, verdict, text):
+def test_share_of_the_box_that_converges(grid, drawn, verdict, text, monkeypatch):
     """Of the draws; without draws of the loops along the reference."""
-    one = box_converges(grid, loops(0.25, drawn=tuple(map(loop, drawn))))
+    case: Any = SimpleNamespace(grid=grid, controller=None, loops=loops(0.25))
+    monkeypatch.setattr("fpirhc.review.questions.convergence.loops_over_box", lambda *_: tuple(map(loop, drawn)))
+    one = box_converges(case)
     radii = drawn or (0.25,)
     assert (one.verdict, one.evidence, bool(one.change)) == (verdict, text, verdict == "unknown")
     assert one.numbers == {"share": pytest.approx(np.mean(np.array(radii) < 1)), "radius": max(radii)}
-    assert box_converges(grid, Loops((), (), None, reason="none")).evidence == "no linear loop: none"
+    without: Any = SimpleNamespace(grid=grid, loops=Loops((), (), None, reason="none"))
+    assert box_converges(without).evidence == "no linear loop: none"
 
 
 # The gain

@@ -123,8 +123,8 @@ def test_the_box_contains_the_dead_time():
     for uncertainty, verdict in ((0, "unknown"), (5, "yes")):
         controller = told(fp.Increment(MAP, cycles=20, uncertainty=uncertainty))
         narrow, wide = (case(mass(20), controller, mismatch) for mismatch in (0.0, 10.0))
-        assert box_converges(narrow.grid, narrow.loops).verdict == "yes"
-        boxed = box_converges(wide.grid, wide.loops)
+        assert box_converges(narrow).verdict == "yes"
+        boxed = box_converges(wide)
         assert boxed.verdict == verdict
         assert (boxed.numbers["radius"] < 1) == (verdict == "yes")
 

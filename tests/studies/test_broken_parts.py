@@ -118,7 +118,7 @@ def test_a_question_that_breaks_is_unknown_by_name(monkeypatch):
 
 def test_a_linear_loop_that_is_not_finite_is_unknown(monkeypatch):
     """The controllers have that answer, and the problem has its own ones."""
-    monkeypatch.setattr(reviewing, "loops_along", breaks)
+    monkeypatch.setattr("fpirhc.review.question.loops_along", breaks)
     whole, of_broken = answers(monkeypatch)
     assert [(q, a.verdict) for q, a in of_broken.items()] == [
         ("Is there a linear loop along the reference?", Verdict.UNKNOWN)

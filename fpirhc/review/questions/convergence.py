@@ -22,8 +22,8 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict, duration, per_cycle
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.loops import Loops, is_planned
-from fpirhc.review.question import ControllerQuestion
+from fpirhc.review.loops import Loops, is_planned, loops_over_box
+from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.zero_dynamics import of_zero_dynamics, zero_dynamics_modes
 from fpirhc.review.spectra import eigenvalues_near, largest_product
 from fpirhc.review.stages import stiff_advice
@@ -81,12 +81,13 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     return Answer(CONVERGES, Verdict.YES, text, "", numbers)
 
 
-def box_converges(grid: ReviewGrid, loops: Loops) -> Answer:
+def box_converges(case: Case) -> Answer:
     """Return in how many draws of the parameters the linear loop converges; unknown where it is not all of them."""
-    if not loops.loops:
-        return Answer(BOX, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
+    grid, own = case.grid, case.loops
+    if not own.loops:
+        return Answer(BOX, Verdict.UNKNOWN, f"no linear loop: {own.reason}")
     # Without draws the box is a point: approximate and exact parameters are the same.
-    radii = np.array([one.radius for one in loops.drawn or loops.loops])
+    radii = np.array([one.radius for one in loops_over_box(grid, case.controller, own) or own.loops])
     share, worst = float((radii < 1).mean()), float(radii.max())
     text = f"in {100 * share:.3g} % of {len(radii)} draws; the worst mode is multiplied by {worst:.6g} per cycle"
     numbers = {"share": share, "radius": worst}
@@ -164,5 +165,5 @@ QUESTIONS = (
     ControllerQuestion(
         lambda case: converges(case.grid, case.controller, case.loops, case.doubts), CONVERGES, order=1, of_targets=True
     ),
-    ControllerQuestion(lambda case: box_converges(case.grid, case.loops), BOX, order=2, of_targets=True),
+    ControllerQuestion(box_converges, BOX, order=2, of_targets=True),
 )
