@@ -147,7 +147,7 @@ def test_growth_that_no_gain_changes_is_not_blamed_on_the_gain(plant):
     one = plant()
     adaptive = one.controllers["CTC+FPI"]
     boxed = case(one.problem, adaptive, mismatch=10.0)
-    for said in (predict(one.problem, adaptive), box_converges(boxed.grid, boxed.loops)):
+    for said in (predict(one.problem, adaptive), box_converges(boxed)):
         assert said.verdict is Verdict.UNKNOWN
         assert said.change.startswith("The slowest mode is that of the zero dynamics, which no gain changes")
 
