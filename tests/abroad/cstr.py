@@ -5,9 +5,11 @@
     T_K' = (Q + K_w A_R (T_R - T_K)) / (m_k c_pk),     k1 = beta k0 exp(-E/(T_R + 273.15)), k3 with alpha E_ad.
 
 Model and figures: do-mpc, examples/CSTR (LGPL-3; Klatt and Engell 1998). Concentrations in mol/l, temperatures in C, time in
-hours; F is the inflow per volume, 1/h, Q the heat flow, kJ/h. The set-point 0.6 mol/l, the weights of the inputs' changes,
-the limits, the period of 0.005 h and the 20 stages are those of the example. `problem` has the exact model; `wrong` has
-alpha = 0.95, beta = 1.1 as its model; the spreads are do-mpc's scenarios alpha in {0.95, 1, 1.05}, beta in {0.9, 1, 1.1}.
+hours; F is the inflow per volume, 1/h, Q the heat flow, kJ/h. The set-point 0.6 mol/l,
+the limits, the period of 0.005 h and the 20 stages are those of the example; its weights of the inputs'
+changes act there on F / 100 and Q / 2000, and here on F and Q, which makes the plans gentler. `problem` has the exact model;
+`wrong` has alpha = 0.95, beta = 1.1 as its model; the spreads are do-mpc's scenarios alpha in {0.95, 1, 1.05},
+beta in {0.9, 1, 1.1}.
 The jacket has a pole at K_w A_R / (m_k c_pk) = 86.7 1/h: 0.43 of it passes in a cycle.
 """
 

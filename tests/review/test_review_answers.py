@@ -23,6 +23,7 @@ from fpirhc.review.questions.commands import commands_inside, inverse_exists
 from fpirhc.review.questions.convergence import _NEAR, _without, box_converges, converges
 from fpirhc.review.questions.gain import _gain, _sign, gain_admissible, gain_of_target
 from fpirhc.review.questions.margins import LEAST_PHASE, MARGINS, margins_enough
+from fpirhc.review.questions.right_model import _no_gain
 from fpirhc.review.questions.slew import _start_deviation, effect, range_enough, slew_enough
 from fpirhc.review.recommended_gain import FAR, recommended_gain
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
@@ -559,3 +560,17 @@ def test_a_plain_form_without_margins_is_told_of_a_form_that_has_them():
         "Use a form that passes the desired response at once (ModelReferenced, Increment), or "
     )
     assert (good.verdict, good.change) == (Verdict.YES, "")
+
+
+@pytest.mark.parametrize(
+    ("null", "said"),
+    [
+        (0.4, "it leaves a right model alone, so another form does not help"),
+        (0.6, "or use a form that leaves a right model alone: this one changes more than is wrong"),
+    ],
+)
+def test_a_form_that_leaves_a_right_model_alone_is_not_told_to_use_one(null, said):
+    """Errors: 1 without adaptation, more with it; what it makes of a right model says whether the form is to blame."""
+    answer = _no_gain("", {"without": 1.0, "with": 1.2, "null": null}, elsewhere=False)
+    assert answer.verdict == "no"
+    assert said in answer.change

@@ -77,7 +77,10 @@ def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer
     if elsewhere:
         text += ", for the exact values of the model's own parameters, which move nothing beside a reality"
         return Answer(PAYS, Verdict.UNKNOWN, text, "Run it and compare.", numbers)
-    change = "Leave the deformation out, or use a form that leaves a right model alone: the model is right enough."
+    if numbers["null"] <= _HARM * numbers["without"]:
+        change = "Leave the deformation out: it leaves a right model alone, so another form does not help."
+    else:
+        change = "Leave the deformation out, or use a form that leaves a right model alone: this one changes more than is wrong."
     return Answer(PAYS, Verdict.NO, text, change, numbers)
 
 
