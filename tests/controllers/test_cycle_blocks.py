@@ -24,6 +24,7 @@ from fpirhc.controllers.base import (
     fed,
     invert_block,
     reference_block,
+    with_held_deformation,
 )
 from fpirhc.controllers.contract import (
     FORMER,
@@ -168,6 +169,37 @@ def test_the_request_is_deformed_once_the_pair_is_valid(counted, blind, valid):
     result = cycle(block, **pair, warm_up=float(counted))
     assert result["_deformed_unclipped"].tolist() == ([11.0, 20.5] if valid else [4.0, 4.0])
     assert result["_deformation"].tolist() == ([7.0, 16.5] if valid else [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("error", "learns"), [([9_999.0, 0.0], True), ([10_001.0, 0.0], False), ([-1e9, 0.0], False), ([0.0, 1e9], True)]
+)
+def test_a_map_with_a_memory_remembers_nothing_of_an_absurd_error(error, learns):
+    """Beyond 10 000 times the response that limits allow, 1 of the first and any of the second coordinate; the request stays."""
+    block = deform_block(masses().plant, fp.Filtered(fp.Affine(-1.0), pole=0.5), largest=(1.0, np.inf))
+    pair = {"_deformed_last": [10.0, 20.0], "realised": error, "desired": [0.0, 0.0], "warm_up": 1.0}
+    result = cycle(block, **pair)
+    assert (result["_deformed_unclipped"].tolist() != [10.0, 20.0]) == learns
+    after = np.concatenate([result[f"{name}_next"] for name in block.memory.names])
+    assert (after != block.memory.start()).any() == learns
+
+
+@pytest.mark.parametrize(
+    ("deformation", "answered", "repeats"),
+    [
+        (fp.Affine(-1.0), 1.0, True),
+        (fp.Affine(-1.0), np.inf, False),
+        (fp.Identity(), 1.0, False),
+        (fp.Filtered(fp.Affine(-1.0), pole=0.5), 1.0, False),
+        (fp.ModelReferenced(fp.Affine(-1.0)), 1.0, False),
+    ],
+)
+def test_the_steps_of_missing_cycles_are_those_of_a_plain_map_without_memory(deformation, answered, repeats):
+    plant = masses().plant
+    block = with_held_deformation(
+        plant, deformation, deform_block(plant, deformation), settles=False, answered=answered
+    )
+    assert (block.bridged is not None) == repeats
 
 
 def test_one_blind_cycle_where_nothing_else_is_said():

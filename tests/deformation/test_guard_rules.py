@@ -155,6 +155,20 @@ def test_every_event_has_a_description():
     assert len(set(EVENTS.values())) == 6
 
 
+@pytest.mark.parametrize(("form", "watched"), [(SATURATING, True), (fp.ModelReferenced(SATURATING), False)])
+def test_oscillation_at_the_limit_is_watched_where_the_last_request_is_given(form, watched):
+    """A model-referenced form is given the model's response: its distance from the next request is no step."""
+    guard = fp.Guarded(form, largest_deformation=LARGEST)
+    layout = guard.memory(("q",))
+    f, m = ca.SX.sym("f"), ca.SX.sym("m", layout.size)
+    _, after = guard.step(ca.SX(0.0), f, ca.SX(0.3), layout.split(m))
+    step = ca.Function("guard", [f, m], [ca.densify(layout.join(after))])
+    memory = layout.start()
+    for k in range(30):
+        memory = step(0.3 + 5.0 * (-1) ** k, memory).full()[:, 0]
+    assert (memory[layout.slice("guard_oscillating")] > 0) == watched
+
+
 @pytest.mark.parametrize("wrapper", [lambda m: fp.Guarded(m, largest_deformation=LARGEST), fp.BeyondLimit])
 def test_a_wrapper_that_changes_no_pair_may_stand_around_a_model_referenced_form(wrapper):
     """A form compares the response with its own; a filter around it would change one of the two alone."""

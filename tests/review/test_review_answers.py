@@ -140,7 +140,8 @@ def test_margins_of_an_integrator_by_hand(grid):
 
 
 def test_the_range_along_the_reference_is_told(grid):
-    """What is unknown has its smallest and its largest factor."""
+    """What is unknown has its smallest and its largest factor, or the one that is everywhere the same."""
+    assert "between" not in convergence(grid, loops(1.0, 1.0)).evidence
     assert convergence(grid, loops(0.5, 1.25)).evidence.endswith("per cycle (between 0.5 and 1.25 along the reference)")
 
 
@@ -261,8 +262,17 @@ def test_both_signs_have_no_gain():
     box = admissible(-0.5, [1.0], [-1.0, 1.0])
     assert (box.verdict, box.change) == ("unknown", "Use another form, or leave the deformation out.")
     assert box.evidence == "gain = -0.5; no gain is recommended, because no gain converges all over the box"
+    assert box.numbers["linear_limit"] == pytest.approx(-4.0)  # the plant's own
     own = admissible(-0.5, [-1.0, 1.0], [-1.0, 1.0])
     assert (own.verdict, own.change) == ("no", "See the question about the eigenvalues' sign.")
+
+
+@pytest.mark.parametrize(("limit", "verdict"), [(-0.51, "yes"), (-0.49, "unknown")])
+def test_a_limit_that_is_not_the_maps_counts_too(limit, verdict):
+    """J = 1 bears |A_c| < 4; what else limits the loop, such as its poles, is in the advice."""
+    spectrum = Spectrum(np.array([[1.0 + 0j]]))
+    advice = replace(recommended_gain(fp.Affine(-0.5), assess_gain(fp.Affine(-0.5), spectrum), 1.0, None), limit=limit)
+    assert gain_admissible(fp.Affine(-0.5), spectrum, spectrum, 2.0, advice).verdict == verdict
 
 
 def test_both_signs_of_an_inverse_are_inside():

@@ -115,6 +115,17 @@ def test_the_basin_grows_with_the_step_of_the_map_and_four_times_the_error_is_wa
     assert answer(moving(), fp.Increment(fp.Sigmoid(gain=-0.5, scale=1.0), cycles=0), "come back") is None
 
 
+def test_the_basin_is_asked_of_laws_with_two_poles_and_compared_with_jumps():
+    """One pole has no basin to leave; 40 N on a mass of 1 / 1.5 kg are a larger error than any of the run."""
+    sigmoid = fp.Sigmoid(gain=-0.5, scale=1.0)
+    law = fp.ComputedTorque(fp.Exponential(rate=RATE, integral=False), sigmoid)
+    assert reviewed.answer(moving(), law, "come back") is not None
+    assert reviewed.answer(replace(chain(1, 1.5), duration=0.5), law, "come back") is None
+    pushed = moving(disturbances={"u": fp.Step(at=1.0, size=40.0)})
+    gain = float(pushed.plant.equations.response(np.zeros(2), 1.0, pushed.plant.exact))
+    assert answer(pushed, sigmoid, "come back").numbers["error"] == pytest.approx(40.0 * gain)
+
+
 def test_questions_that_are_asked_of_a_map_on_targets_ask_its_loop():
     """Whatever is about a response Jacobian is not asked; its loop, its gain and its dead time are."""
     of_targets = {q.text for q in known_questions(ControllerQuestion) if q.of_targets}
