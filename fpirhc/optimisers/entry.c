@@ -1,22 +1,22 @@
 /* One library runs on every machine of its architecture: wider registers are used where there are some. Without fused
    multiply-add both round alike. A library for one machine, which is known to have them (ALWAYS_WIDE), has the wider code alone. */
 #ifdef PORTABLE
-static int run_plain(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
+static int run_plain(const casadi_real** arg, casadi_real** res, casadi_real* w) { return run(arg, res, w); }
 #define run_wide run_plain
 #else /* PORTABLE */
 #if defined(__GNUC__) && defined(__x86_64__)
-__attribute__((target("avx2"))) static int run_wide(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
+__attribute__((target("avx2"))) static int run_wide(const casadi_real** arg, casadi_real** res, casadi_real* w) { return run(arg, res, w); }
 #else
-static int run_wide(const casadi_real** arg, casadi_real** res) { return 1; }
+static int run_wide(const casadi_real** arg, casadi_real** res, casadi_real* w) { return 1; }
 #endif
 #ifdef ALWAYS_WIDE
 #define run_plain run_wide
 #else
-static int run_plain(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
+static int run_plain(const casadi_real** arg, casadi_real** res, casadi_real* w) { return run(arg, res, w); }
 #endif
 #endif /* PORTABLE */
 
 int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
-  (void)iw, (void)w, (void)mem;
-  return WIDE ? run_wide(arg, res) : run_plain(arg, res);
+  (void)iw, (void)mem;
+  return WIDE ? run_wide(arg, res, w) : run_plain(arg, res, w);
 }

@@ -2,9 +2,8 @@
 
    The same mathematics as the composed graph in fixed_point.py and search.py, which is the reference it is tested against:
    names follow those files. What is generated stands before this text: the stage functions evaluate, pull, linearise, hessian, end
-   and deformed, the sizes NS, NU, NT (entries of the data of a stage), NM (partial derivatives of a stage), N, WORK and INTEGERS
-   (of the stage functions), the constants of the search, and ENTRY, the name of the function. Matrices are column-major, stages follow each other. Nothing is allocated:
-   everything lies on the stack. */
+   and deformed, the sizes NS, NU, NT (entries of the data of a stage), NM (partial derivatives of a stage), N, the constants of the search, and ENTRY, the name of the function. Matrices are column-major, stages follow each other. Nothing is allocated: what is as long as a
+   plan lies in the caller's work, ROOM numbers. */
 
 typedef struct {
   casadi_real u[N * NU], x[(N + 1) * NS], g[N * NU], value;
@@ -18,9 +17,9 @@ typedef struct {
 #ifdef SCALE_AT
   casadi_real metric[NU], first_gamma; /* settings are live: the scale and the first gamma are data of the call */
 #endif
-  casadi_real w[WORK + 1];
-  casadi_int iw[INTEGERS + 1];
 } Search;
+
+typedef char search_fits[sizeof(Search) == ROOM * sizeof(casadi_real) ? 1 : -1];
 
 #ifdef SCALE_AT
 #define scale (s->metric)
@@ -54,18 +53,18 @@ INLINE int try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In 
     }
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
     res[0] = x + NS, res[1] = &cost, res[2] = s->partials + i * NM;
-    if (evaluate(arg, res, s->iw, s->w, 0)) return 0;
+    if (evaluate(arg, res, 0, 0, 0)) return 0;
     plan->value += cost;
   }
   arg[0] = plan->x + N * NS, arg[1] = data + N * NT;
   res[0] = &cost, res[1] = slope, res[2] = s->final;
-  if (end(arg, res, s->iw, s->w, 0)) return 0;
+  if (end(arg, res, 0, 0, 0)) return 0;
   plan->value += cost;
   for (j = 0; j < NS; ++j) s->lambda[N * NS + j] = slope[j];
   for (i = N - 1; i >= 0; --i) {
     arg[0] = s->partials + i * NM, arg[1] = s->lambda + (i + 1) * NS;
     res[0] = s->lambda + i * NS, res[1] = plan->g + i * NU;
-    if (pull(arg, res, s->iw, s->w, 0)) return 0;
+    if (pull(arg, res, 0, 0, 0)) return 0;
   }
   return all_finite(&plan->value, 1) && all_finite(plan->g, N * NU) && all_finite(plan->x, (N + 1) * NS);
 }
@@ -203,10 +202,10 @@ INLINE int direct(Search* s, const Plan* plan, In data, In lower, In upper) {
     int free[NU];
     arg[0] = s->partials + i * NM;
     res[0] = a, res[1] = b, res[2] = ls, res[3] = lu;
-    if (linearise(arg, res, s->iw, s->w, 0)) return 1;
+    if (linearise(arg, res, 0, 0, 0)) return 1;
     arg[0] = plan->x + i * NS, arg[1] = plan->u + i * NU, arg[2] = data + i * NT, arg[3] = s->lambda + (i + 1) * NS;
     res[0] = q, res[1] = cross, res[2] = r;
-    if (hessian(arg, res, s->iw, s->w, 0)) return 1;
+    if (hessian(arg, res, 0, 0, 0)) return 1;
     condense(q, cross, r, p, a, b, turned);
     for (l = 0; l < NU; ++l) {
       r[l * NU + l] += DAMPING / scale[l];
@@ -238,7 +237,7 @@ INLINE int direct(Search* s, const Plan* plan, In data, In lower, In upper) {
       for (m = 0; m < NS; ++m) p[j * NS + m] = 0.5 * (q[j * NS + m] + q[m * NS + j]);
   }
   arg[0] = wanted, arg[1] = data, res[0] = s->v;
-  return deformed(arg, res, s->iw, s->w, 0);
+  return deformed(arg, res, 0, 0, 0);
 }
 
 /* max |U - clip(U - D g)| */
@@ -282,30 +281,30 @@ INLINE void remember(const Search* s, const Plan* best, Out memory) {
   memory[MEMORY - 1] = s->tau;
 }
 
-INLINE int run(const casadi_real** arg, casadi_real** res) {
+INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
   static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
   In s0 = arg[0] ? arg[0] : nothing, data = arg[1] ? arg[1] : nothing, memory = arg[4] ? arg[4] : nothing;
   In lower = arg[2] ? arg[2] : nothing, upper = arg[3] ? arg[3] : nothing;
-  Search s;
-  Plan *best = s.plans, *plan = s.plans + 1, *other;
+  Search* restrict s = (Search*)w;
+  Plan *best = s->plans, *plan = s->plans + 1, *other;
   int i, posed = sane(s0, data, lower, upper), count = 0, plain = 0, empty = 0, evaluated, status;
   casadi_real left = 0;
 #ifdef SCALE_AT
-  for (i = 0; i < NU; ++i) s.metric[i] = data[SCALE_AT + i];
-  s.first_gamma = SHARE / data[STEEPEST_AT];
+  for (i = 0; i < NU; ++i) s->metric[i] = data[SCALE_AT + i];
+  s->first_gamma = SHARE / data[STEEPEST_AT];
 #endif
-  begin(&s, best, memory, lower, upper);
+  begin(s, best, memory, lower, upper);
   for (;; ++count) {
-    int bold = s.tau >= SHORTEST;
-    int ok = try_next(&s, best, plan, s0, data, lower, upper), accepted = judged(&s, best, plan, ok, lower, upper);
+    int bold = s->tau >= SHORTEST;
+    int ok = try_next(s, best, plan, s0, data, lower, upper), accepted = judged(s, best, plan, ok, lower, upper);
     plain += !bold;
     if (accepted) other = best, best = plan, plan = other;
     if (count == ITERATIONS || (STOP_EARLY && plain == PLAIN)) break;
-    if (STOP_EARLY && best->value < UNTRIED && residual(&s, best, lower, upper) <= TOLERANCE) break;
-    if (accepted && direct(&s, best, data, lower, upper)) return 1;
+    if (STOP_EARLY && best->value < UNTRIED && residual(s, best, lower, upper) <= TOLERANCE) break;
+    if (accepted && direct(s, best, data, lower, upper)) return 1;
   }
   evaluated = best->value < UNTRIED;
-  left = residual(&s, best, lower, upper);
+  left = residual(s, best, lower, upper);
   for (i = 0; i < NU; ++i) empty |= lower[i] > upper[i];
   status = empty ? INFEASIBLE : !(posed && evaluated) ? NON_FINITE : left <= TOLERANCE ? CONVERGED : NOT_CONVERGED;
   if (res[0]) for (i = 0; i < N * NU; ++i) res[0][i] = best->u[i];
@@ -317,7 +316,7 @@ INLINE int run(const casadi_real** arg, casadi_real** res) {
     res[1][4] = status;
   }
   if (res[2]) {
-    if (posed && evaluated) remember(&s, best, res[2]);
+    if (posed && evaluated) remember(s, best, res[2]);
     else for (i = 0; i < MEMORY; ++i) res[2][i] = !posed ? memory[i] : i < N * NU ? middle(lower[i % NU], upper[i % NU]) : 0;
   }
   return 0;

@@ -8,18 +8,25 @@ enum { PURE, INTERIOR };
 enum { BEGINS, ENDS };                   /* where a pure phase stands: before an interior one, or after it */
 enum { KEPT, COLD, WARM };               /* how an interior phase gets its slacks */
 
+/* What is as long as a plan; it lies in the caller's work, ROOM numbers. */
 typedef struct {
   Point points[2];
-  Duals y, by;
+  Duals y, by, trial;
   Direction move;
-  Limits limits;
   casadi_real next_z[2][COUNT], best_u[N * NU], best_x[(N + 1) * NS], best_z[2][COUNT];
-  casadi_real weight[COUNT], lean[COUNT], costates[(N + 1) * NS], g[N * NU], filter[FILTER][2];
-  casadi_real inside[2][NU], gaps[N * NS], price, mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
+  casadi_real weight[COUNT], lean[COUNT], costates[(N + 1) * NS], g[N * NU], gaps[N * NS];
+  Scratch scratch;
+} Room;
+
+typedef char room_fits[sizeof(Room) == ROOM * sizeof(casadi_real) ? 1 : -1];
+
+typedef struct {
+  Room* room;
+  Limits limits;
+  casadi_real filter[FILTER][2], inside[2][NU], price, mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
   Certificate last;
   int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, use_exact, stuck, rolled, rewarms;
   int descends; /* whether interior plans are rollouts with gaps that lower phi, because the filter gave up */
-  Scratch scratch;
 } Machine;
 
 static casadi_real sum_of_gaps(const Point* p) {
@@ -44,7 +51,7 @@ static void log_terms(const Machine* m, const Point* p, const Duals* y, casadi_r
 static casadi_real gap_price(const Machine* m) {
   int k;
   casadi_real largest = 0;
-  for (k = 0; k < N * NS; ++k) largest = larger(largest, fabs(m->move.costates[k + NS]) * spread[k % NS]);
+  for (k = 0; k < N * NS; ++k) largest = larger(largest, fabs(m->room->move.costates[k + NS]) * spread[k % NS]);
   return m->price >= NEARLY * largest ? m->price : ABOVE * largest;
 }
 
@@ -52,12 +59,12 @@ static casadi_real gap_price(const Machine* m) {
 static casadi_real log_slope(const Machine* m, const Point* p) {
   int side, i, r, k, j;
   casadi_real sum = 0;
-  for (k = 0; k < N * NU; ++k) sum += p->lu[k] * m->move.du[k];
-  for (k = 0; k < N * NS; ++k) sum += p->ls[k] * m->move.dx[k];
-  for (j = 0; j < NS; ++j) sum += p->tail[j] * m->move.dx[N * NS + j];
+  for (k = 0; k < N * NU; ++k) sum += p->lu[k] * m->room->move.du[k];
+  for (k = 0; k < N * NS; ++k) sum += p->ls[k] * m->room->move.dx[k];
+  for (j = 0; j < NS; ++j) sum += p->tail[j] * m->room->move.dx[N * NS + j];
   EACH_LIMIT(&m->limits) {
-    sum -= m->mu * m->by.t[side][k] / m->y.t[side][k];
-    if (r >= NU) sum += (capacity(r) - m->mu / m->y.e[side][k]) * m->by.e[side][k];
+    sum -= m->mu * m->room->by.t[side][k] / m->room->y.t[side][k];
+    if (r >= NU) sum += (capacity(r) - m->mu / m->room->y.e[side][k]) * m->room->by.e[side][k];
   }
   return sum;
 }
@@ -66,7 +73,7 @@ static casadi_real log_slope(const Machine* m, const Point* p) {
 static casadi_real squared_move(const Machine* m) {
   int k;
   casadi_real sum = 0;
-  for (k = 0; k < N * NU; ++k) sum += curvature[k % NU] * m->move.du[k] * m->move.du[k];
+  for (k = 0; k < N * NU; ++k) sum += curvature[k % NU] * m->room->move.du[k] * m->room->move.du[k];
   return sum;
 }
 
@@ -77,7 +84,7 @@ static casadi_real barrier_error(const Machine* m, const Point* p, casadi_real* 
   *least = 10 * FINITE, *most = 0;
   for (k = 0; k < COUNT; ++k) push[k] = 0;
   EACH_LIMIT(&m->limits) {
-    casadi_real t = m->y.t[side][k], z = m->y.z[side][k], e = m->y.e[side][k];
+    casadi_real t = m->room->y.t[side][k], z = m->room->y.z[side][k], e = m->room->y.e[side][k];
     push[k] -= SIGN(side) * z;
     worst = larger(worst, fabs(distance(&m->limits, p, side, i, r) - t + e) / unit[r]);
     *least = smaller(*least, t * z), *most = larger(*most, t * z);
@@ -85,7 +92,7 @@ static casadi_real barrier_error(const Machine* m, const Point* p, casadi_real* 
     *least = smaller(*least, e * (capacity(r) - z)), *most = larger(*most, e * (capacity(r) - z));
   }
   for (i = 0; i < N; ++i) {
-    In after = m->costates + (i + 1) * NS;
+    In after = m->room->costates + (i + 1) * NS;
     casadi_real rest[NS];
     for (l = 0; l < NU; ++l) {
       casadi_real sum = p->lu[i * NU + l] + push[i * ROWS + l];
@@ -112,7 +119,7 @@ static int is_done(const Certificate* c) {
 static casadi_real returned_left(Machine* m, const Point* p) {
   int k;
   casadi_real push[COUNT], g[N * NU], left = 0;
-  pushes(push, &m->limits, p, m->y.z, NEAR_LIMIT);
+  pushes(push, &m->limits, p, m->room->y.z, NEAR_LIMIT);
   adjoint(p, push, g);
   for (k = 0; k < N * NU; ++k) {
     casadi_real u = p->u[k];
@@ -129,15 +136,15 @@ static void begin_cold(Machine* m, Point* p, In s0, In data, In lower, In upper,
     In arg[8];
     Out res[8];
     arg[0] = data + i * NT, res[0] = x, res[1] = u;
-    guess(arg, res, m->scratch.iw, m->scratch.w, 0);
+    guess(arg, res, 0, 0, 0);
     for (j = 0; j < NS; ++j) p->x[i * NS + j] = m->start == REFERENCE || m->start == DESCENT ? x[j] : s0[j];
     for (l = 0; l < NU && i < N; ++l) {
       casadi_real hair = smaller(0.01 * unit[l], 0.25 * (upper[l] - lower[l]));
       p->u[i * NU + l] = between(inputs && m->start == 0 ? inputs[i * NU + l] : u[l], lower[l] + hair, upper[l] - hair);
     }
   }
-  for (j = 0; j < N * NU * NS; ++j) m->move.k[j] = 0;
-  for (j = 0; j < (N + 1) * NS; ++j) m->costates[j] = 0;
+  for (j = 0; j < N * NU * NS; ++j) m->room->move.k[j] = 0;
+  for (j = 0; j < (N + 1) * NS; ++j) m->room->costates[j] = 0;
   m->phase = INTERIOR, m->slacks = COLD, m->fresh = 1, m->use_exact = 0;
   m->descends = m->start >= DESCENT, m->price = COST;
   m->mu = COST, m->floor = MU_END * COST, m->delta = m->descends ? LEAST_DAMPING : 0;
@@ -160,9 +167,9 @@ static In box(Machine* m, int side, In limit, In other) {
 
 static void keep(Machine* m, const Point* p) {
   int k;
-  for (k = 0; k < N * NU; ++k) m->best_u[k] = p->u[k];
-  for (k = 0; k < (N + 1) * NS; ++k) m->best_x[k] = p->x[k];
-  for (k = 0; k < COUNT; ++k) m->best_z[0][k] = m->y.z[0][k], m->best_z[1][k] = m->y.z[1][k];
+  for (k = 0; k < N * NU; ++k) m->room->best_u[k] = p->u[k];
+  for (k = 0; k < (N + 1) * NS; ++k) m->room->best_x[k] = p->x[k];
+  for (k = 0; k < COUNT; ++k) m->room->best_z[0][k] = m->room->y.z[0][k], m->room->best_z[1][k] = m->room->y.z[1][k];
 }
 
 /* Leave the pure phase: for an interior phase near its best plan, or back to the interior plan it came from. */
@@ -174,9 +181,9 @@ static void enter_interior(Machine* m, Point* p) {
     m->mu = MU_WARM * COST, m->floor = MU_END * COST;
     if (m->misses == 0) return;
   }
-  for (k = 0; k < N * NU; ++k) p->u[k] = m->best_u[k];
-  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = m->best_x[k];
-  for (k = 0; k < COUNT; ++k) m->y.z[0][k] = m->best_z[0][k], m->y.z[1][k] = m->best_z[1][k];
+  for (k = 0; k < N * NU; ++k) p->u[k] = m->room->best_u[k];
+  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = m->room->best_x[k];
+  for (k = 0; k < COUNT; ++k) m->room->y.z[0][k] = m->room->best_z[0][k], m->room->y.z[1][k] = m->room->best_z[1][k];
   m->fresh = 1;
   if (m->place_of == BEGINS) return;
   m->floor *= 0.01, m->slacks = KEPT;
@@ -186,7 +193,7 @@ static void enter_interior(Machine* m, Point* p) {
 static void enter_pure(Machine* m, const Point* p, int place_of) {
   m->phase = PURE, m->place_of = place_of, m->misses = m->steps = 0;
   keep(m, p);
-  m->last = certified(&m->limits, p, m->y.z, m->g);
+  m->last = certified(&m->limits, p, m->room->y.z, m->room->g);
   m->error = m->last.error;
 }
 
@@ -233,10 +240,10 @@ static void trial_duals(const Machine* m, const Point* p, Duals* y) {
   if (m->descends) put_on_path(&m->limits, p, y, m->mu, 0);
   EACH_LIMIT(&m->limits) {
     if (!m->descends) {
-      y->t[side][k] = m->y.t[side][k] + m->alpha * m->by.t[side][k];
-      y->e[side][k] = m->y.e[side][k] + m->alpha * m->by.e[side][k];
+      y->t[side][k] = m->room->y.t[side][k] + m->alpha * m->room->by.t[side][k];
+      y->e[side][k] = m->room->y.e[side][k] + m->alpha * m->room->by.e[side][k];
     }
-    y->z[side][k] = m->y.z[side][k] + m->alpha_dual * m->by.z[side][k];
+    y->z[side][k] = m->room->y.z[side][k] + m->alpha_dual * m->room->by.z[side][k];
     y->z[side][k] = between(y->z[side][k], m->mu / (1e8 * y->t[side][k]), 1e8 * m->mu / y->t[side][k]);
     (void)i, (void)r;
   }
@@ -244,12 +251,12 @@ static void trial_duals(const Machine* m, const Point* p, Duals* y) {
 
 static void adopt_costates(Machine* m, casadi_real share) {
   int k;
-  for (k = NS; k < (N + 1) * NS; ++k) m->costates[k] += share * (m->move.costates[k] - m->costates[k]);
+  for (k = NS; k < (N + 1) * NS; ++k) m->room->costates[k] += share * (m->room->move.costates[k] - m->room->costates[k]);
 }
 
 /* Judge the plan that was expanded; returns whether it is the new one. */
 static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, In data, In lower, In upper) {
-  Duals y;
+  Duals* y = &m->room->trial;
   casadi_real theta, phi;
   int k;
   if (m->fresh) {
@@ -263,7 +270,7 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
     casadi_real g[N * NU];
     Certificate c;
     int halved, waits;
-    ok = ok && (c = certified(&m->limits, p, m->next_z, g), c.error < FINITE);
+    ok = ok && (c = certified(&m->limits, p, m->room->next_z, g), c.error < FINITE);
     halved = ok && c.error <= 0.5 * m->error;
     waits = m->misses < PATIENCE && c.error < HOPELESS;
     ok = ok && (halved || waits) && ++m->steps <= PURE_STEPS;
@@ -271,8 +278,8 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
     /* Gauss-Newton goes on only where the contraction that was seen ends the call with one more step. */
     m->use_exact |= c.error * c.error > AHEAD * SCALED_TOLERANCE * m->error;
     m->misses = halved ? 0 : m->misses + 1;
-    for (k = 0; k < COUNT; ++k) m->y.z[0][k] = m->next_z[0][k], m->y.z[1][k] = m->next_z[1][k];
-    for (k = 0; k < N * NU; ++k) m->g[k] = g[k];
+    for (k = 0; k < COUNT; ++k) m->room->y.z[0][k] = m->room->next_z[0][k], m->room->y.z[1][k] = m->room->next_z[1][k];
+    for (k = 0; k < N * NU; ++k) m->room->g[k] = g[k];
     m->last = c;
     adopt_costates(m, 1);
     if (halved) {
@@ -281,16 +288,16 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
     }
     return 1;
   }
-  y = m->y;
+  *y = m->room->y;
   if (ok) {
-    trial_duals(m, p, &y);
-    log_terms(m, p, &y, &theta, &phi);
+    trial_duals(m, p, y);
+    log_terms(m, p, y, &theta, &phi);
     phi += m->descends ? m->price * sum_of_gaps(p) : 0;
     ok = fabs(phi) <= FINITE && fabs(theta) <= FINITE && (m->descends ? falls_enough(m, phi) : passes(m, theta, phi));
   }
   if (ok) {
     adopt_costates(m, m->alpha);
-    m->y = y;
+    m->room->y = *y;
     m->delta = m->halvings >= 3 ? larger(4 * m->delta, 1e-4) : m->halvings ? m->delta : m->delta > 5e-7 ? m->delta / 5 : 0;
     if (m->descends) m->delta = larger(m->delta, LEAST_DAMPING);
     m->halvings = m->raises = 0;
@@ -311,25 +318,25 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
 static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
   int ok;
   if (m->phase == PURE) {
-    pure_terms(&m->limits, p, &m->y, m->g, m->weight, m->lean);
+    pure_terms(&m->limits, p, &m->room->y, m->room->g, m->room->weight, m->room->lean);
   } else {
-    if (m->slacks != KEPT) put_inside(&m->limits, p, &m->y, m->mu, m->slacks == WARM);
-    if (m->descends) put_on_path(&m->limits, p, &m->y, m->mu, m->slacks == COLD);
-    interior_terms(&m->limits, p, &m->y, m->mu, m->weight, m->lean);
+    if (m->slacks != KEPT) put_inside(&m->limits, p, &m->room->y, m->mu, m->slacks == WARM);
+    if (m->descends) put_on_path(&m->limits, p, &m->room->y, m->mu, m->slacks == COLD);
+    interior_terms(&m->limits, p, &m->room->y, m->mu, m->room->weight, m->room->lean);
     m->slacks = KEPT;
   }
-  ok = m->use_exact && swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 1, data, &m->scratch);
-  ok = ok || swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 0, data, &m->scratch);
+  ok = m->use_exact && swept(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 1, data, &m->room->scratch);
+  ok = ok || swept(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 0, data, &m->room->scratch);
   m->use_exact |= m->phase == INTERIOR || !ok;
   if (!ok) {
     m->delta = larger(10 * m->delta, 1e-6);
     m->fresh = 2; /* try again from the same plan */
     if (m->delta > 1e8) restart(m, p, s0, data, lower, upper);
   } else if (m->phase == PURE) {
-    pure_multipliers(&m->limits, p, &m->y, &m->move, m->next_z);
+    pure_multipliers(&m->limits, p, &m->room->y, &m->room->move, m->room->next_z);
   } else {
-    interior_moves(&m->limits, p, &m->y, &m->by, &m->move, m->mu, &m->alpha, &m->alpha_dual);
-    log_terms(m, p, &m->y, &m->theta, &m->phi);
+    interior_moves(&m->limits, p, &m->room->y, &m->room->by, &m->room->move, m->mu, &m->alpha, &m->alpha_dual);
+    log_terms(m, p, &m->room->y, &m->theta, &m->phi);
     m->dphi = log_slope(m, p);
     if (m->descends) {
       casadi_real apart = sum_of_gaps(p);
@@ -346,9 +353,9 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
   m->stuck = m->again = m->rolled = m->descends = m->filtered = m->raises = m->halvings = m->misses = m->steps = m->rewarms = 0;
   m->price = m->alpha = m->alpha_dual = m->dphi = m->theta = m->phi = m->error = 0;
   m->last.error = m->last.left = m->last.violation = m->last.broken = 10 * FINITE;
-  for (k = 0; k < COUNT; ++k) m->y.z[0][k] = known ? z[k] : 0, m->y.z[1][k] = known ? z[COUNT + k] : 0;
-  for (k = 0; k < COUNT; ++k) m->y.t[0][k] = m->y.t[1][k] = 1, m->y.e[0][k] = m->y.e[1][k] = 0;
-  for (k = 0; k < COUNT; ++k) m->next_z[0][k] = m->next_z[1][k] = 0; /* limits that are not there stay so */
+  for (k = 0; k < COUNT; ++k) m->room->y.z[0][k] = known ? z[k] : 0, m->room->y.z[1][k] = known ? z[COUNT + k] : 0;
+  for (k = 0; k < COUNT; ++k) m->room->y.t[0][k] = m->room->y.t[1][k] = 1, m->room->y.e[0][k] = m->room->y.e[1][k] = 0;
+  for (k = 0; k < COUNT; ++k) m->room->next_z[0][k] = m->room->next_z[1][k] = 0; /* limits that are not there stay so */
   m->start = known ? -1 : 0;
   if (!known) {
     for (k = 0; k < N * NU; ++k) has_guess |= memory[k] != 0;
@@ -357,8 +364,8 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
   }
   for (k = 0; k < N * NU; ++k) p->u[k] = between(memory[k], lower[k % NU], upper[k % NU]);
   for (k = 0; k < NS; ++k) p->x[k] = s0[k];
-  for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k], m->costates[NS + k] = memory[N * NU + N * NS + k];
-  for (k = 0; k < N * NU * NS; ++k) m->move.k[k] = memory[N * NU + 2 * N * NS + k];
+  for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k], m->room->costates[NS + k] = memory[N * NU + N * NS + k];
+  for (k = 0; k < N * NU * NS; ++k) m->room->move.k[k] = memory[N * NU + 2 * N * NS + k];
   m->mu = memory[MEMORY - 2] * COST, m->delta = memory[MEMORY - 1], m->floor = MU_END * COST;
   m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->use_exact = !PLAIN_FIRST;
 }
@@ -367,9 +374,9 @@ static void remember(const Machine* m, const Point* p, Out memory) {
   int k;
   Out z = memory + N * NU + 2 * N * NS + N * NU * NS;
   for (k = 0; k < N * NU; ++k) memory[k] = p->u[k];
-  for (k = 0; k < N * NS; ++k) memory[N * NU + k] = p->x[NS + k], memory[N * NU + N * NS + k] = m->costates[NS + k];
-  for (k = 0; k < N * NU * NS; ++k) memory[N * NU + 2 * N * NS + k] = m->move.k[k];
-  for (k = 0; k < COUNT; ++k) z[k] = m->y.z[0][k], z[COUNT + k] = m->y.z[1][k];
+  for (k = 0; k < N * NS; ++k) memory[N * NU + k] = p->x[NS + k], memory[N * NU + N * NS + k] = m->room->costates[NS + k];
+  for (k = 0; k < N * NU * NS; ++k) memory[N * NU + 2 * N * NS + k] = m->room->move.k[k];
+  for (k = 0; k < COUNT; ++k) z[k] = m->room->y.z[0][k], z[COUNT + k] = m->room->y.z[1][k];
   memory[MEMORY - 2] = MU_WARM;
   memory[MEMORY - 1] = m->delta;
 }
@@ -378,18 +385,18 @@ static void remember(const Machine* m, const Point* p, Out memory) {
 static int next_plan(Machine* m, const Point* best, Point* p) {
   int k, pure = !m->fresh && m->phase == PURE, descends = m->phase == INTERIOR && m->descends;
   casadi_real share = m->fresh || pure ? 0 : m->alpha;
-  In du = descends ? m->move.v : m->move.du;
+  In du = descends ? m->room->move.v : m->room->move.du;
   for (k = 0; k < N * NU; ++k) p->u[k] = best->u[k] + (share > 0 ? share * du[k] : 0);
-  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = best->x[k] + (share > 0 && !descends ? share * m->move.dx[k] : 0);
+  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = best->x[k] + (share > 0 && !descends ? share * m->room->move.dx[k] : 0);
   if (pure) {
     casadi_real made[N * NU];
     In arg[8];
     Out res[8];
-    arg[0] = m->move.v, res[0] = made;
-    deformed(arg, res, m->scratch.iw, m->scratch.w, 0);
+    arg[0] = m->room->move.v, res[0] = made;
+    deformed(arg, res, 0, 0, 0);
     for (k = 0; k < N * NU; ++k) p->u[k] += made[k];
   }
-  for (k = 0; k < N * NS; ++k) m->gaps[k] = (1 - share) * (best->f[k] - best->x[k + NS]);
+  for (k = 0; k < N * NS; ++k) m->room->gaps[k] = (1 - share) * (best->f[k] - best->x[k + NS]);
   if (descends && !m->fresh) return 1;
   return m->fresh ? m->fresh == 1 && m->slacks == COLD && m->start == ROLLED : pure;
 }
@@ -410,23 +417,25 @@ static int plan_in_force(Machine* m, Point* p, In memory, In s0, In data, In low
   for (k = 0; k < N * NU; ++k) p->u[k] = memory[k];
   for (k = 0; k < NS; ++k) p->x[k] = s0[k];
   for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k];
-  return expand(p, memory + N * NU + 2 * N * NS, 1, 0, s0, data, lower, upper, &m->scratch);
+  return expand(p, memory + N * NU + 2 * N * NS, 1, 0, s0, data, lower, upper, &m->room->scratch);
 }
 
 int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
   static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
   In s0 = arg[0] ? arg[0] : nothing, data = arg[1] ? arg[1] : nothing, memory = arg[4] ? arg[4] : nothing;
   In lower = arg[2] ? arg[2] : nothing, upper = arg[3] ? arg[3] : nothing;
+  Room* room = (Room*)w;
   Machine m;
-  Point *best = m.points, *p = m.points + 1, *other;
+  Point *best = room->points, *p = room->points + 1, *other;
   Certificate c = {0, 0, 0, 0};
   int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, status, ok = 0, ended = 0;
-  (void)iw, (void)w, (void)mem;
+  (void)iw, (void)mem;
+  m.room = room;
   for (i = 0; i < NU; ++i) empty |= lower[i] > upper[i];
   begin(&m, best, memory, s0, data, lower, upper);
   for (; posed; ++count) {
     int final = count == ITERATIONS, rolled = next_plan(&m, best, p), accepted;
-    ok = expand(p, m.move.k, rolled, m.descends && m.phase == INTERIOR ? m.gaps : 0, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), &m.scratch);
+    ok = expand(p, m.room->move.k, rolled, m.descends && m.phase == INTERIOR ? m.room->gaps : 0, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), &m.room->scratch);
     accepted = judged(&m, best, p, ok, rolled, s0, data, lower, upper);
     if (accepted) other = best, best = p, p = other, m.rolled = rolled && !m.descends;
     ended = !m.fresh && m.phase == PURE && is_done(&m.last) && returned_left(&m, best) <= TOLERANCE;
@@ -436,16 +445,16 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
   ok = posed;
   if (posed && (!m.rolled || m.fresh)) {
     *p = *best;
-    ok = expand(p, m.move.k, 1, 0, s0, data, lower, upper, &m.scratch);
+    ok = expand(p, m.room->move.k, 1, 0, s0, data, lower, upper, &m.room->scratch);
     if (ok) best = p;
   }
   if (posed && !ended) {
-    p = best == m.points ? m.points + 1 : m.points;
+    p = best == m.room->points ? m.room->points + 1 : m.room->points;
     if (plan_in_force(&m, p, memory, s0, data, lower, upper) && (!ok || priced_cost(&m.limits, p) < priced_cost(&m.limits, best))) best = p, ok = 1;
   }
   if (ok) {
     casadi_real g[N * NU];
-    c = certified(&m.limits, best, m.y.z, g);
+    c = certified(&m.limits, best, m.room->y.z, g);
     c.left = returned_left(&m, best);
     ok = c.error < FINITE;
   }

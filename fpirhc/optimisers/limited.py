@@ -77,7 +77,17 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     texts.insert(1, linearise)
     sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
-    return Driver("\n".join(texts), leaves, {**sizes, **_constants(settings, measures)})
+    return Driver("\n".join(texts), leaves, {**sizes, **_constants(settings, measures)}, _room(ocp, measures))
+
+
+def _room(ocp: OptimalControl, measures: Scales) -> int:
+    """Numbers of the struct Room of limited.c."""
+    nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+    inputs, states, limits = n * nu, (n + 1) * ns, n * (nu + len(measures.bounded))
+    point = 2 * inputs + states + n * ns * (2 + ns + nu) + ns + ns * ns + 1
+    direction = 2 * inputs + inputs * ns + 2 * states
+    kept = 2 * inputs + 2 * states + 6 * limits + n * ns
+    return 2 * point + 3 * 6 * limits + direction + kept + states * (ns + 1)
 
 
 def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:

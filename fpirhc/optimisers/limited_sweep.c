@@ -1,7 +1,7 @@
 /* One expansion along a plan, and one Riccati sweep around it, with the weights and gradients of its limits.
 
    Generated before this text: the stage functions evaluate, linearise, bend, curve, plain, end and deformed, and the sizes NS, NU,
-   NT, NM and NH (partial derivatives of a stage and of its gradient), N, NB (bounded states), WORK and INTEGERS. Entry r of stage i
+   NT, NM and NH (partial derivatives of a stage and of its gradient), N and NB (bounded states). Entry r of stage i
    is input r, or the state place[r - NU] one stage later. */
 
 #define ROWS (NU + NB)
@@ -17,9 +17,9 @@ typedef struct {
   casadi_real v[N * NU], k[N * NU * NS], dx[(N + 1) * NS], du[N * NU], costates[(N + 1) * NS];
 } Direction;
 
+/* A sweep's cost to go. */
 typedef struct {
-  casadi_real w[WORK + 1];
-  casadi_int iw[INTEGERS + 1];
+  casadi_real values[(N + 1) * NS * NS], slopes[(N + 1) * NS];
 } Scratch;
 
 static const int place[NB + 1] = PLACES;
@@ -44,17 +44,17 @@ static int expand(Point* p, In k, int rolled, In gaps, In s0, In data, In lower,
     for (j = 0; j < NS && (rolled || i == 0); ++j) x[j] = at[j];
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
     res[0] = p->f + i * NS, res[1] = &cost, res[2] = partials;
-    if (evaluate(arg, res, s->iw, s->w, 0)) return 0;
+    if (evaluate(arg, res, 0, 0, 0)) return 0;
     arg[0] = partials;
     res[0] = p->a + i * NS * NS, res[1] = p->b + i * NS * NU, res[2] = p->ls + i * NS, res[3] = p->lu + i * NU;
-    if (linearise(arg, res, s->iw, s->w, 0)) return 0;
+    if (linearise(arg, res, 0, 0, 0)) return 0;
     p->value += cost;
     for (j = 0; j < NS; ++j) at[j] = p->f[i * NS + j] - (gaps ? gaps[i * NS + j] : 0);
   }
   for (j = 0; j < NS && rolled; ++j) p->x[N * NS + j] = at[j];
   arg[0] = p->x + N * NS, arg[1] = data + N * NT;
   res[0] = &cost, res[1] = p->tail, res[2] = p->final;
-  if (end(arg, res, s->iw, s->w, 0)) return 0;
+  if (end(arg, res, 0, 0, 0)) return 0;
   p->value += cost;
   ok = all_finite(&p->value, 1) && all_finite(p->f, N * NS) && all_finite(p->ls, N * NS) && all_finite(p->lu, N * NU);
   return ok && all_finite(p->tail, NS) && all_finite(p->a, N * NS * NS) && all_finite(p->b, N * NS * NU);
@@ -91,7 +91,7 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
   int i, j, l, m;
   In arg[8];
   Out res[8];
-  casadi_real values[(N + 1) * NS * NS], slopes[(N + 1) * NS], factor[NU * NU];
+  casadi_real *values = s->values, *slopes = s->slopes, factor[NU * NU];
   for (j = 0; j < NS * NS; ++j) values[N * NS * NS + j] = p->final[j];
   for (j = 0; j < NS; ++j) slopes[N * NS + j] = p->tail[j];
   for (j = 0; j < NU * NU; ++j) factor[j] = 0; /* no compiler shall take it for unwritten */
@@ -108,11 +108,11 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
     arg[0] = p->x + i * NS, arg[1] = p->u + i * NU, arg[2] = data + i * NT, arg[3] = costates + (i + 1) * NS;
     if (use_exact) {
       res[0] = bends;
-      if (bend(arg, res, s->iw, s->w, 0)) return 0;
+      if (bend(arg, res, 0, 0, 0)) return 0;
       arg[0] = bends;
     }
     res[0] = q, res[1] = cross, res[2] = r;
-    if (use_exact ? curve(arg, res, s->iw, s->w, 0) : plain(arg, res, s->iw, s->w, 0)) return 0;
+    if (use_exact ? curve(arg, res, 0, 0, 0) : plain(arg, res, 0, 0, 0)) return 0;
     for (j = 0; j < NS; ++j) {
       pushed[j] = slope[j];
       for (m = 0; m < NS; ++m) pushed[j] += value[m * NS + j] * (p->f[i * NS + m] - p->x[(i + 1) * NS + m]);

@@ -116,7 +116,15 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings) -> Driver:
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     texts.insert(1, linearise)
-    return Driver("\n".join(texts), leaves, {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings)})
+    return Driver("\n".join(texts), leaves, {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings)}, _room(ocp))
+
+
+def _room(ocp: OptimalControl) -> int:
+    """Numbers of the struct Search of fixed_point.c."""
+    nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+    plan = 2 * n * nu + (n + 1) * ns + 1
+    course = n * (2 * nu + nu * ns + ns + partial_count(ocp)) + (n + 1) * ns + ns * ns
+    return 2 * plan + course + 5 + (nu + 1 if ocp.settings else 0)
 
 
 def _sizes(ocp: OptimalControl) -> dict[str, object]:

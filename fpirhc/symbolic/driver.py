@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from fpirhc.errors import NotSupported
 from fpirhc.symbolic.expression import FINITE, TINY
 from fpirhc.symbolic.latest import Latest
 
@@ -35,6 +36,7 @@ OF_TYPE = """#include <float.h>
 """
 _LARGE_OR_SMALL = re.compile(r"(?<![\w.])\d\.\d{16}e[+-](?:[3-9]\d|\d{3})\b")
 _drivers: dict[str, str] = {}
+_rooms: dict[str, int] = {}
 _LATEST: Latest[ca.Function] = Latest(16)
 _BODY = re.compile(
     r"(?:^/\* (\w+):\([^\n]*\*/\n)?^static int (casadi_f\d+)\([^\n]*\) \{\n(.*?)^\}$", re.MULTILINE | re.DOTALL
@@ -52,14 +54,16 @@ class Driver:
 
     Args:
         text: C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys.
-            WORK and INTEGERS are defined there as the sizes of the leaves' scratch space.
+            ROOM is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw.
         leaves: generated Functions by key.
         constants: preprocessor definitions by name.
+        room: numbers that the driver needs in w.
     """
 
     text: str
     leaves: Mapping[str, ca.Function]
     constants: Mapping[str, object]
+    room: int = 0
 
     def source(self) -> str:
         """Return the whole C file, in which the entry is called ENTRY."""
@@ -69,10 +73,7 @@ class Driver:
             generator.add(leaf)
         lines = [f"#define {name} {value}" for name, value in self.constants.items()]
         lines += [f"#define {name} fpirhc_leaf_{name}" for name in self.leaves]
-        lines += [
-            f"#define WORK {max((f.sz_w() for f in renamed), default=0)}",
-            f"#define INTEGERS {max((f.sz_iw() for f in renamed), default=0)}",
-        ]
+        lines.append(f"#define ROOM {self.room}")
         # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
         generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
         return "\n".join([of_type(generated), *lines, _FAST, self.text])
@@ -88,7 +89,7 @@ def registered(name: str, driver: Driver) -> str:
     """Return the unique name of a driver: a Function of this name has it as its body in C."""
     source = driver.source()
     unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
-    _drivers[unique] = source
+    _drivers[unique], _rooms[f"{unique}_driver"] = source, driver.room
     return unique
 
 
@@ -181,14 +182,18 @@ def with_less_work(source: str, sizes: Mapping[str, int], functions: Mapping[str
     """Return a program with the same results and a shorter work vector.
 
     CasADi gives every Function of a program one work vector w: its callees get w from its begin, and its own values stand behind
-    what the largest callee needs. A driver keeps its numbers on the stack and leaves w alone. So its callers' own values can move
-    down, and the program needs less. It also keeps room for values that its C only points to: a Function ends behind the last
-    value that its text has. A Function is changed only where its text shows that nothing but calls uses the begin of w.
+    what the largest callee needs. A driver needs another number of them than the graph that it replaces. So its callers' own
+    values move, mostly down, and the program needs less. CasADi also keeps room for values that its C only points to: a Function
+    ends behind the last value that its text has. A Function is changed only where its text shows that nothing but calls uses the
+    begin of w.
 
     Args:
         source: generated C, in which calls of drivers stand in place of bodies.
         sizes: of the work vectors of all Functions, by name, as CasADi made them; of Functions with the same name the largest.
         functions: by name, without those that share a name.
+
+    Raises:
+        NotSupported: a driver has more numbers than the graph that it replaces, and its callers cannot make room for them.
     """
     exported = _EXPORTED.search(source)
     if exported is None:
@@ -200,7 +205,7 @@ def with_less_work(source: str, sizes: Mapping[str, int], functions: Mapping[str
         _need(key, bodies, sizes, needs)
     top = [key for key, body in bodies.items() if body.name == exported[1]]
     if len(top) != 1 or any(need is None for need in needs.values()):
-        return source
+        raise NotSupported("the work of its loops cannot be laid out")
     source = _BODY.sub(lambda m: m[0].replace(m[3], _moved(bodies[m[2]], needs)), source)
     return _SIZE.sub(lambda m: f"{m[1]}{needs[top[0]]}", source)
 
@@ -247,18 +252,22 @@ def _lengths(function: ca.Function) -> dict[int, int | None]:
 def _need(key: str, bodies: Mapping[str, _Body], sizes: Mapping[str, int], needs: dict[str, int | None]) -> int | None:
     """What a function needs after the move; None where that is not known."""
     if key not in bodies:
-        return 0 if key.endswith("_driver") else None
+        return _rooms.get(key, 0) if key.endswith("_driver") else None
     if key not in needs:
         body = bodies[key]
         inner = [_need(callee, bodies, sizes, needs) for callee in body.callees]
         below = None if None in inner else max((n for n in inner if n is not None), default=0)
-        if below is None or not body.plain:
-            needs[key] = sizes.get(body.name)
+        if below is None:
+            needs[key] = None
+        elif not body.plain:  # it stays as it is, and CasADi's begin of its own values must be behind its callees
+            begin, size = body.begin, sizes.get(body.name)
+            fits = size is not None and below <= (size if begin is None else begin)
+            needs[key] = size if fits else None
         elif body.begin is None:
             needs[key] = below
         else:
             size = body.end if body.end is not None else sizes.get(body.name)
-            needs[key] = None if size is None else size - max(body.begin - below, 0)
+            needs[key] = None if size is None else size - (body.begin - below)
     return needs[key]
 
 
@@ -267,5 +276,5 @@ def _moved(body: _Body, needs: Mapping[str, int | None]) -> str:
     if body.begin is None or not body.plain:
         return body.text
     below = max((needs.get(callee) or 0 for callee in body.callees), default=0)
-    shift = max(body.begin - below, 0)
+    shift = body.begin - below
     return _OWN.sub(lambda m: f"{m[1]}=w+{int(m[2]) - shift}", body.text)

@@ -33,9 +33,9 @@ def size_of(source: str) -> int:
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-@pytest.mark.parametrize(("name", "most"), [("two_mass", 3600), ("cart_pole", 2400)])
+@pytest.mark.parametrize(("name", "most"), [("two_mass", 4650), ("cart_pole", 3650)])
 def test_a_controller_with_twenty_stages_needs_and_touches_no_more(name, most, tmp_path):
-    """13 105 doubles before for two_mass; nothing is written behind the vector's end, and the results are those of the graph."""
+    """13 105 doubles before for two_mass. Nothing is written behind the end, and the results are those of the graph."""
     composite, task = controller_of(name, "RHC+FPI")
     texts, files = generate(composite.function), []
     size = size_of(texts[0])
@@ -110,9 +110,12 @@ def test_the_lengths_of_all_values_explain_where_they_begin(name, monkeypatch):
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-@pytest.mark.parametrize(("states", "most"), [({}, 5000), ({"q1": (1.85, 2.35)}, 7600)], ids=["plain", "state limits"])
+@pytest.mark.parametrize(("states", "most"), [({}, 6050), ({"q1": (1.85, 2.35)}, 11_200)], ids=["plain", "state limits"])
 def test_a_step_behind_its_gate_touches_no_more_than_it_says(states, most, tmp_path):
-    """10 254 and 16 094 doubles before. In no branch of the gate is something written behind the end, or overwritten."""
+    """10 254 and 16 094 doubles before, and 16.9 and 38.8 kB of stack, now 2.5 kB at most in one function.
+
+    In no branch of the gate is something written behind the end, or overwritten.
+    """
     task = fp.load_problem("two_mass")
     problem = replace(task.problem, limits=replace(task.problem.limits, states=states))
     stepper = fp.Stepper(problem, task.controllers["RHC+FPI"])
@@ -122,6 +125,8 @@ def test_a_step_behind_its_gate_touches_no_more_than_it_says(states, most, tmp_p
     for k, text in enumerate(texts):
         files.append(tmp_path / f"part{k}.c")
         files[-1].write_text(text)
+    small = [str(find_compiler()), "-Os", "-Werror=frame-larger-than=2500", "-c"]
+    subprocess.run([*small, *map(str, files)], check=True, cwd=tmp_path)
     library = tmp_path / "step.so"
     flags = ["-O1", "-ffp-contract=off", "-fPIC", "-shared"]
     subprocess.run([str(find_compiler()), *flags, "-o", str(library), *map(str, files), "-lm"], check=True)
