@@ -60,6 +60,11 @@ class ReviewGrid:
     real: Problem | None = None
     elsewhere: bool = False
 
+    @property
+    def outside(self) -> bool:
+        """Whether the plant is a simulator of somebody else, which a review does not run."""
+        return self.elsewhere and self.real is None
+
     @cached_property
     def drawn_states(self) -> np.ndarray:
         """States of the reference with the inner states that each draw has, shape (draws, m, nx)."""

@@ -94,7 +94,8 @@ class Case:
             try:
                 controller = self.controller.with_deformation(deformation)
                 trials = self.runs.trials(self.grid.real or self.problem, self.controller)
-                self._tried[name] = trials.errors(controller)
+                real, null = trials.errors(controller)
+                self._tried[name] = (None if self.grid.outside else real), null
             except FpirhcError as error:
                 self._tried[name] = f"it cannot be tried ({error})"
         return self._tried[name]

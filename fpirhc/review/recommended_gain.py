@@ -46,6 +46,7 @@ _ALONG, _DRAWN = 9, 8  # loops that are looked at
 FAR = 10.0  # times a map's own gain, up to which a limit on targets is sought
 _LEAST = 1e-3  # of the smallest other limit, down to which a stable gain is sought
 _STEPS, _BISECTIONS = 24, 12
+OUTSIDE = "the model knows no lag and no latency of the plant outside"
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,8 @@ def _own_per_effective(deformation: Deformation) -> float:
 
 
 def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended:
-    """Return the recommended gain of a controller; none where it fails the null test, or where a run with that gain does harm.
+    """Return the recommended gain of a controller; none where it fails the null test, where a run with that gain
+    does harm, and for a plant outside.
 
     Where its own gain is beyond the limits, the null test of a gain within them counts.
 
@@ -197,6 +199,8 @@ def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended
         return advice
     if null is not None and null.verdict == Verdict.NO:
         against = "adaptation does not leave a right model alone"
+    elif case.grid.outside:
+        against = OUTSIDE
     else:
         own = getattr(deformation, deformation.gain_name, None)
         size = advice.value if own is None else advice.value / float(own) * deformation.effective_gain()

@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from reviewed import answer as asked
 from reviewed import linear
 
 import fpirhc as fp
@@ -197,7 +198,7 @@ def test_doubts_and_steep_maps_speak_against_convergence(grid):
         ((0.5, 0.9), "yes", "in 100 % of 2 draws; the worst mode is multiplied by 0.9 per cycle"),
         ((0.5, 1.0), "unknown", "in 50 % of 2 draws; the worst mode is multiplied by 1 per cycle"),
         ((0.5, 0.9, 1.25), "unknown", "in 66.7 % of 3 draws; the worst mode is multiplied by 1.25 per cycle"),
-        ((), "yes", "in 100 % of 1 draws; the worst mode is multiplied by 0.25 per cycle"),
+        ((), "yes", "in 100 % of 1 draw; the worst mode is multiplied by 0.25 per cycle"),
     ],
 )
 def test_share_of_the_box_that_converges(grid, drawn, verdict, text, monkeypatch):
@@ -543,7 +544,7 @@ def test_share_of_the_limits(rows, limits, verdict, own, widest):
     assert one.verdict == verdict
     assert one.numbers == pytest.approx({"share_of_limits": own, "share_over_box": widest})
     assert one.evidence.endswith(f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box")
-    held = f"u {np.nanmin(rows):.3g} to {np.nanmax(rows):.3g}"
+    held = f"u {np.nanmin(rows):.3g} to {np.nanmax(rows):.3g} N"
     change = f"Slow the reference down or ask for less; limits that are a choice must hold {held}."
     assert one.change == ("" if verdict == "yes" else change)
 
@@ -552,7 +553,7 @@ def test_range_of_the_commands():
     """That of the plant's own parameters, at the points where there is a command."""
     assert (
         commands([[-1.25, 2.5, math.nan], [-9.0, 9.0, 9.0]], None).evidence
-        == "needed: u -1.25 to 2.5; no input has limits"
+        == "needed: u -1.25 to 2.5 N; no input has limits"
     )
     none = commands([[math.nan, math.nan]], (-4.0, 8.0))
     assert (none.verdict, none.evidence) == ("unknown", "no finite command is known")
@@ -584,3 +585,34 @@ def test_a_form_that_leaves_a_right_model_alone_is_not_told_to_use_one(null, sai
     answer = _no_gain("", {"without": 1.0, "with": 1.2, "null": null}, elsewhere=False)
     assert answer.verdict == "no"
     assert said in answer.change
+
+
+def test_a_right_model_that_costs_more_than_the_wrong_one_is_a_no():
+    """A map too narrow for its requests: 4.3 m on its own model, where the wrong model costs centimetres without adaptation."""
+    task = fp.load_problem("two_mass")
+    narrow, plain = (task.controllers[name] for name in ("RHC+FPI, stiff, small S", "RHC, stiff"))
+    one = asked(task.problem, narrow, "right model alone")
+    costs = fp.measure(task.problem, fp.simulate(task.problem, plain, seed=0, compiled=False)).rms_error["q1"]
+    assert one.verdict == "no"
+    assert one.numbers["with"] > 50 * costs
+
+
+def test_at_rest_no_parameter_is_reached():
+    """Nothing moves along a reference of zeros, so a response error shows none of them there."""
+    task = fp.load_problem("crane_slots")
+    one = asked(task.problem, task.controllers["RHC+FPI"], "reach the wrong parameters")
+    assert one.verdict == "unknown"
+    assert one.evidence == "along the reference the response is the same for all values of M, m, l, b"
+    assert one.change == "It corrects them off the reference: after a start or a disturbance."
+
+
+def test_a_simulator_of_somebody_else_is_recommended_no_gain():
+    """The loop of the model bears half of 4; the arm of MuJoCo, whose lag is not in the model, is a matter of the probe."""
+    task = fp.load_problem("mujoco_arm")
+    one = asked(task.problem, task.controllers["RHC+FPI"], "gain admissible")
+    assert one.verdict == "unknown"
+    assert one.evidence.endswith(
+        "no gain is recommended, because the model knows no lag and no latency of the plant outside"
+    )
+    assert one.change == "fpirhc probe measures them and recommends a gain."
+    assert math.isnan(one.numbers["recommended"])

@@ -5,11 +5,11 @@ B = d response / d input must stay regular and keep its orientation.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import casadi as ca
 import numpy as np
 
+from fpirhc.plant.motion import with_space
+from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, each
 from fpirhc.review.question import ProblemQuestion
@@ -74,7 +74,7 @@ def commands_inside(grid: ReviewGrid) -> Answer:
     lower, upper = grid.problem.limits.input_bounds(plant)
     # Inner states begin at the problem's start, and not where the reference would have led them before.
     commands = grid.commands[:, 1:] if grid.inner else grid.commands
-    text = "needed: " + _named_ranges(plant.inputs, commands[0])
+    text = "needed: " + _named_ranges(plant, commands[0])
     used = _used(commands, lower, upper)
     if not np.isfinite(used).any():
         return Answer(COMMANDS, Verdict.UNKNOWN, "no finite command is known", "See whether the problem is well posed.")
@@ -83,17 +83,20 @@ def commands_inside(grid: ReviewGrid) -> Answer:
     if not np.isfinite(np.concatenate([lower, upper])).any():
         return Answer(COMMANDS, Verdict.YES, f"{text}; no input has limits", "", numbers)
     text += f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box"
-    held = _named_ranges(plant.inputs, commands, np.nan_to_num(used).max(axis=(0, 1)) > 1)
+    held = _named_ranges(plant, commands, np.nan_to_num(used).max(axis=(0, 1)) > 1)
     change = f"Slow the reference down or ask for less; limits that are a choice must hold {held}."
     if own > 1:
         return Answer(COMMANDS, Verdict.NO, text, change, numbers)
     return Answer(COMMANDS, Verdict.UNKNOWN if widest > 1 else Verdict.YES, text, change if widest > 1 else "", numbers)
 
 
-def _named_ranges(names: Iterable[str], commands: np.ndarray, chosen: np.ndarray | None = None) -> str:
-    """The ranges of the inputs in words, or of the chosen ones."""
+def _named_ranges(plant: Plant, commands: np.ndarray, chosen: np.ndarray | None = None) -> str:
+    """The ranges of the inputs with their units, or of the chosen ones."""
     low, high = _range(commands.reshape(-1, commands.shape[-1]))
-    return ", ".join(f"{n} {low[k]:.3g} to {high[k]:.3g}" for k, n in enumerate(names) if chosen is None or chosen[k])
+    ranges = [
+        f"{n} {a:.3g} to {b:.3g}{with_space(u)}" for (n, u), a, b in zip(plant.inputs.items(), low, high, strict=True)
+    ]
+    return ", ".join(text for k, text in enumerate(ranges) if chosen is None or chosen[k])
 
 
 def _range(commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

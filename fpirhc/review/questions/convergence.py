@@ -89,7 +89,8 @@ def box_converges(case: Case) -> Answer:
     # Without draws the box is a point: approximate and exact parameters are the same.
     radii = np.array([one.radius for one in loops_over_box(grid, case.controller, own) or own.loops])
     share, worst = float((radii < 1).mean()), float(radii.max())
-    text = f"in {100 * share:.3g} % of {len(radii)} draws; the worst mode is multiplied by {worst:.6g} per cycle"
+    draws = f"{len(radii)} draw{'s' * (len(radii) > 1)}"
+    text = f"in {100 * share:.3g} % of {draws}; the worst mode is multiplied by {worst:.6g} per cycle"
     numbers = {"share": share, "radius": worst}
     if share == 1:
         return Answer(BOX, Verdict.YES, text, "", numbers)

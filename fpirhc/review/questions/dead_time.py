@@ -150,7 +150,7 @@ def pays_when_late(case: Case) -> Answer | None:
         errors = {name: _errors(scaled(short, p), case.controller) for name, p in _CHANGES.items()}
     except FpirhcError as error:
         return Answer(PAYS_LATE, Verdict.UNKNOWN, f"no run: {error}")
-    text = "; ".join(f"{name}: {_sentence(one)}" for name, one in errors.items())
+    text = "; ".join(f"{name}: {one.sentence}" for name, one in errors.items())
     numbers = {f"{name}_{which}": value for name, one in errors.items() for which, value in _numbers(one).items()}
     if all(one.passes for one in errors.values()):
         return Answer(PAYS_LATE, Verdict.YES, text, "", numbers)
@@ -166,11 +166,6 @@ def _errors(late: Problem, controller: Controller) -> ErrorPair:
     return errors_of(
         late, [simulate(late, one, seed=0, compiled=False) for one in (without_deformation(controller), controller)]
     )
-
-
-def _sentence(one: ErrorPair) -> str:
-    name = one.worst
-    return f"rms error of {name} {one.without[name]:.3g} without adaptation and {one.adapted[name]:.3g} with it"
 
 
 def _numbers(one: ErrorPair) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from fpirhc.contraction.gains import ContractionReport, assess_gain
 from fpirhc.contraction.large_errors import two_cycle_amplitudes
@@ -13,7 +14,7 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.right_model import RIGHT_MODEL
 from fpirhc.review.questions.speed import gain_times
-from fpirhc.review.recommended_gain import FAR, MARGIN, Recommended, gain_advice, limit_of_loop, secant_limit
+from fpirhc.review.recommended_gain import FAR, MARGIN, OUTSIDE, Recommended, gain_advice, limit_of_loop, secant_limit
 from fpirhc.review.spectra import largest_product
 
 GAIN = "Is the map's gain admissible?"
@@ -169,7 +170,11 @@ def _gain(case: Case) -> Answer | None:
     own, boxed = case.spectra
     deformation = case.controller.deformation
     limit = largest_product(case.problem, deformation, own.eigenvalues)
-    return gain_admissible(deformation, own, boxed, limit, gain_advice(case, boxed, case.answer(RIGHT_MODEL)))
+    advice = gain_advice(case, boxed, case.answer(RIGHT_MODEL))
+    answer = gain_admissible(deformation, own, boxed, limit, advice)
+    if answer.verdict == Verdict.UNKNOWN and advice.why_not == OUTSIDE:
+        return replace(answer, change="fpirhc probe measures them and recommends a gain.")
+    return answer
 
 
 QUESTIONS = (

@@ -42,6 +42,9 @@ def reaches_parameters(case: Case) -> Answer:
     numbers |= {f"effect_{name}": size for name, size in sizes.items()}
     idle = _without_task(plant, case.grid.inner, missed)
     text = "; ".join([*_reached(sizes), *_missed(missed, idle)])
+    if reached and not max(sizes.values()):
+        change = "It corrects them off the reference: after a start or a disturbance."
+        return Answer(REACHED, Verdict.UNKNOWN, text, change, numbers)
     if reached and not set(missed) - set(idle):
         return Answer(REACHED, Verdict.YES, text, "", numbers)
     change = f"Control a coordinate in whose response {missed[0]} is, or correct {', '.join(missed)} in the model."
@@ -71,9 +74,17 @@ def _wrong(plant: Plant, believed: np.ndarray) -> list[int]:
     return [k for k, (value, exact) in enumerate(zip(believed, plant.exact, strict=True)) if value != exact]
 
 
+_NOTHING = 1e-9  # of the largest effect, below which an effect is rounding
+
+
 def _reached(sizes: dict[str, float]) -> list[str]:
     ordered = sorted(sizes.items(), key=lambda pair: -pair[1])
-    return ["the response changes by up to " + ", ".join(f"{v:.3g} ({n})" for n, v in ordered)] if ordered else []
+    least = _NOTHING * max(sizes.values(), default=0.0)
+    shown, idle = [f"{v:.3g} ({n})" for n, v in ordered if v > least], [n for n, v in ordered if v <= least]
+    said = ["the response changes by up to " + ", ".join(shown)] if shown else []
+    return (
+        [*said, f"along the reference the response is the same for all values of {', '.join(idle)}"] if idle else said
+    )
 
 
 def _missed(names: list[str], idle: list[str]) -> list[str]:

@@ -49,7 +49,7 @@ def pays(case: Case) -> Answer:
     if not adapted < without:
         return _no_gain(text, numbers, elsewhere=case.grid.elsewhere)
     if null > _HARM * without:
-        change = "Adaptation would do harm with a slightly better model: raise the gain or shorten the period."
+        change = "Adaptation would do harm with a slightly better model: use a form that leaves a right model alone."
         return Answer(PAYS, Verdict.UNKNOWN, text, change, numbers)
     return Answer(PAYS, Verdict.YES, text, "", numbers)
 
@@ -148,13 +148,15 @@ def leaves_right_model_alone(case: Case) -> Answer:
 def _cures_more(case: Case, runs: ErrorPair, nominal: NominalRun | None, predicted: float | None) -> bool:
     """Whether the wrong model makes a larger error without adaptation than adaptation makes of a right model.
 
-    By the prediction; of a deformation of targets, which nothing predicts, by a run on the plant.
+    By runs on the plant; by the prediction where the plant is outside.
     """
-    if nominal is not None and predicted is not None:
-        return predicted < rms(nominal, errors_without_adaptation(nominal))
-    trial = case.trial(case.controller.deformation) if case.controller.deforms == "target" else ""
+    trial = case.trial(case.controller.deformation)
     real = None if isinstance(trial, str) else trial[0]
-    return real is not None and real.lowers and runs.adapted[runs.worst] < real.without[runs.worst]
+    if real is not None:
+        return real.lowers and runs.adapted[runs.worst] < real.without[runs.worst]
+    if nominal is None or predicted is None:
+        return False
+    return predicted < rms(nominal, errors_without_adaptation(nominal))
 
 
 def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, dict[str, float]]:

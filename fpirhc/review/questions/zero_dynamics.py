@@ -141,6 +141,8 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
     believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
     change = stiff_advice(grid, believed, planned=is_planned(controller)) or (
         "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
+        if cycles
+        else "Lower the rate, or shorten the period."
     )
     if radius < 1 + NEUTRAL:
         change = "A mode neither grows nor decays: weigh the state or the input in which it is."

@@ -198,7 +198,7 @@ class _Part:
             length = math.sqrt(one @ one)
             if length > _NEW:
                 if self.count >= _LARGEST:
-                    raise NotSupported(f"the loop moves in more than {_LARGEST} directions")
+                    raise NotSupported(f"more than {_LARGEST} entries of its memory move")
                 self._append((one / length)[:, None])
         return self.basis[:, before : self.count].copy()
 
