@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
     from fpirhc.simulation.pictures.base import Picture
     from fpirhc.simulation.run import Run
@@ -240,10 +242,26 @@ def _environment() -> Environment:
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters |= {
         "css_class": css_class,
+        "whole_numbers": whole_numbers,
         "blocks": blocks,
         "indented": lambda value: json.dumps(value, indent=1),
     }
     return environment
+
+
+# With its unit, or the word behind it.
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:e[-+]?\d+)?(?: \d{3})*(?: [^\s,;.()]{1,12})?")
+
+
+def whole_numbers(text: str) -> Markup:
+    """Return a sentence as HTML whose lines do not end inside a number, or between a number and its unit."""
+    from markupsafe import Markup, escape
+
+    parts, end = [], 0
+    for number in _NUMBER.finditer(text):
+        parts += [escape(text[end : number.start()]), Markup("<span class='number'>{}</span>").format(number.group())]
+        end = number.end()
+    return Markup("").join([*parts, escape(text[end:])])
 
 
 def css_class(outcome: Outcome | None) -> str:

@@ -18,7 +18,7 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.errors import OutputError
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.html import INTERVALS, blocks, chart_data, render, write_report
+from fpirhc.report.html import INTERVALS, blocks, chart_data, render, whole_numbers, write_report
 from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.view import to_json
@@ -166,7 +166,7 @@ def test_a_row_is_as_high_as_its_numbers(comparison, whole):
     """A name stands alone in its cell; what is noted of it stands in a list below the table."""
     assert "<th scope='row'>plain</th>" in whole
     note = next(note for note in comparison["plain"].notes if "Lyapunov" in note)
-    assert f"<li>plain: {note}</li>" in whole
+    assert f"<li>{whole_numbers(f'plain: {note}')}</li>" in whole
 
 
 def test_no_column_is_empty(comparison, whole):
@@ -237,3 +237,16 @@ def test_page_states_a_policy_that_allows_its_own_scripts_alone(whole):
     assert rules["img-src"] == "data:"
     assert "http" not in policy(page)
     assert page.index("Content-Security-Policy") < page.index("<script")
+
+
+@pytest.mark.parametrize(
+    ("text", "html"),
+    [
+        ("from 5.5e-5 to -2 m.", "from <span class='number'>5.5e-5 to</span> <span class='number'>-2 m</span>."),
+        ("5 800 times less", "<span class='number'>5 800 times</span> less"),
+        ("a < b is 0.52 1/min, x1", "a &lt; b is <span class='number'>0.52 1/min</span>, x1"),
+    ],
+)
+def test_a_line_does_not_end_inside_a_number_or_before_its_unit(text, html):
+    """Browsers break a line behind the hyphen of 5.5e-5 and at every space; other text is escaped."""
+    assert str(whole_numbers(text)) == html

@@ -85,7 +85,8 @@ def test_lines_stand_in_every_form_of_a_comparison(everything):
     assert document["information"] == list(everything.information)
     assert document["controllers"]["RHC"]["measures"] == ["y", "y'"]
     page = render(everything)
-    assert "with a new plan every 5 cycles, between plans its deformation acts in every cycle" in page
+    assert "in every cycle of <span class='number'>0.01 s</span>" in page
+    assert "between plans its deformation acts in every cycle" in page
     assert "all controllers are given" in everything._repr_html_()
 
 

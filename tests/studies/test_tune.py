@@ -223,10 +223,10 @@ def test_command_line_journey(task, capsys):
     command = ["compare", "line.py", "--no-compile", "--tuned", "t/tuning.json", "--out", "c"]
     assert main([*command, "--controllers", "CTC", "CTC exact"]) == 0
     page = Path("c/report.html").read_text()
-    assert "tuned (6 trials, seed 0" in page
+    assert "tuned (<span class='number'>6 trials</span>, seed <span class='number'>0</span>" in page
     assert "not tuned: settings of the problem file" in page
     assert main([*command, "--scenarios", "3", "--mismatch", "10", "--controllers", "CTC", "CTC+FPI"]) == 0
-    assert "tuned (6 trials, seed 0" in Path("c/report.html").read_text()
+    assert "tuned (<span class='number'>6 trials</span>" in Path("c/report.html").read_text()
 
 
 def test_a_file_of_another_problem_is_refused(task):
