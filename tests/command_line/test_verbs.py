@@ -21,6 +21,7 @@ from fpirhc.cli import verbs as package
 from fpirhc.cli.discovery import shipped
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import OF_EVERY_VERB, ExitCode
+from fpirhc.probing.probe import Probe, probe
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
@@ -438,8 +439,15 @@ def test_seeds_is_scenarios_for_one_version(name, capsys):
 # --- probe ------------------------------------------------------------------------------------------------------------
 
 
-def test_journey_of_probe(folder, capsys):
-    """The estimates of a problem whose plant is 1.6 times as strong as its model, as text and as JSON."""
+def test_journey_of_probe(folder, capsys, monkeypatch):
+    """The estimates of a problem whose plant is 1.6 times as strong as its model, as text and as JSON; both tell of one probe."""
+    found: list[Probe] = []
+
+    def probed(*words: Any, **more: Any) -> Probe:
+        found.append(found[0] if found else probe(*words, **more))
+        return found[-1]
+
+    monkeypatch.setattr("fpirhc.probing.probe.probe", probed)
     words = ["probe", "line.py", "--cycles", "60", "--controller", "CTC", "--no-trials"]
     assert main(words) == ExitCode.FINISHED
     printed = capsys.readouterr().out
@@ -449,6 +457,7 @@ def test_journey_of_probe(folder, capsys):
     assert main([*words, "--json"]) == ExitCode.FINISHED
     facts = json.loads(capsys.readouterr().out)
     assert set(facts) == {"gain", "dead_time", "lag", "noise", "drift", "lines", "why", "trials", "notes"}
+    assert len(found) == 2
 
 
 def test_review_asks_the_plant_as_estimated(folder, capsys):

@@ -128,16 +128,16 @@ def rms_errors(plant: str, tuned: bool, gain: float = -0.5) -> tuple[float, ...]
 
 @pytest.mark.parametrize(("product", "components"), [(0.5, 2), (0.9, 1), (0.9, 3), (1.5, 1)])
 def test_false_alarms_are_as_rare_as_stated(product, components):
-    """White noise, 200 000 cycles the cap is the floor: at most one alarm up to a product of 0.9, one in 7000 cycles at 1.5."""
+    """White noise, 100 000 cycles the cap is the floor: at most one alarm up to a product of 0.9, one in 7000 cycles at 1.5."""
     tuned = fp.Tuned(fp.Affine(gain=-2 * product), largest_gain=product)
     layout = tuned.memory(tuple(f"q{k}" for k in range(components)))
     r, n, m = (ca.SX.sym(name, size) for name, size in (("r", components), ("n", components), ("m", layout.size)))
     request, next_memory = tuned.step(r, r + n, ca.SX.zeros(components), layout.split(m))
     step = ca.Function("s", [ca.vertcat(r, m), n], [ca.vertcat(request, layout.join(next_memory))])
-    noise = np.random.default_rng(0).standard_normal((components, 200_000))
+    noise = np.random.default_rng(0).standard_normal((components, 100_000))
     log = step.mapaccum("run", noise.shape[1])(np.append(np.zeros(components), layout.start()), noise).full()
     factor = log[components + layout.slice("tuner_factor").start]
-    assert np.sum(np.diff(factor) < -0.3) <= (1 if product < 1 else 28)
+    assert np.sum(np.diff(factor) < -0.3) <= (1 if product < 1 else 14)
     assert factor.max() == 1.0
     # Below the floor the target is a product of 1: there, or at the floor, the factor ends.
     assert factor.mean() > (0.99 if product < 1 else 0.8)

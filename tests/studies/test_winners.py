@@ -13,7 +13,7 @@ CELL = re.compile(r"(?:[-FGRVB]+ [\d.]+|none)")
 
 def test_at_equal_information_iteration_and_filter_are_one_estimate():
     """With b = 1 and little noise F and R are level, and both beat the velocity alone; with much noise the velocity beats both."""
-    little, much = (winners.errors(share, (1.0,), (0,))[1.0, 0] for share in (0.01, 100.0))
+    little, much = (winners.errors(share, (1.0,), (0,), "FRV", seeds=(0,))[1.0, 0] for share in (0.01, 100.0))
     assert little["F"] == pytest.approx(little["R"], rel=0.05)
     assert little["V"] > 2 * little["F"]
     assert much["F"] > 5 * much["V"]
@@ -21,15 +21,16 @@ def test_at_equal_information_iteration_and_filter_are_one_estimate():
 
 def test_limits_of_the_gain():
     """At b = 5 what is tuned for b = 1 on the response diverges; the gentle iteration and the velocity bear it."""
-    found = winners.errors(0.01, (5.0,), (0,))[5.0, 0]
+    found = winners.errors(0.01, (5.0,), (0,), seeds=(0,))[5.0, 0]
     assert all(math.isinf(found[name]) for name in "FRB")
     assert found["V"] < found["G"] < 1.1 * found["V"] < 0.1 * found["-"]
 
 
 def test_a_latency_leaves_the_iteration_level_until_it_diverges():
-    found = winners.errors(1.0, (0.5, 1.0), (3, 8))
+    found = winners.errors(1.0, (0.5, 1.0), (3, 8), "F", seeds=(0,))
     assert found[0.5, 3]["F"] == pytest.approx(found[0.5, 8]["F"], rel=0.15)
-    assert min(found[0.5, 8][name] for name in "RVB") > 3 * found[0.5, 8]["F"]
+    filters = winners.errors(1.0, (0.5,), (8,), "RVB", seeds=(0,))[0.5, 8]
+    assert min(filters.values()) > 3 * found[0.5, 8]["F"]
     assert math.isinf(found[1.0, 8]["F"])
 
 
