@@ -10,12 +10,14 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.errors import NotSupported
 from fpirhc.export.cortex import Board, Image
 from fpirhc.export.target import device_of, processor_of, target_called, write
 from fpirhc.symbolic.native import find_compiler
@@ -32,6 +34,7 @@ CASES = (
 WEB = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("anaesthesia", "RHC+FPI"))
 BOARDS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("leaking_tanks", "RHC+FPI"))
 UNITS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"))
+SMALL = (("two_mass", "CTC+FPI (eq 6)"), ("fishery", "RHC+FPI"), ("two_mass", "RHC+FPI"))
 CYCLES = 2000
 
 
@@ -134,6 +137,70 @@ def cortex_row(problem: str, title: str) -> list[str]:
             f"{apart:.1g}", *hashes]  # fmt: skip
 
 
+_REASONS = {
+    "2.2": "a value that a later line overwrites, in generated code",
+    "2.3": "a type of the settings that the optimiser can do without",
+    "2.4": "a tag of a type that is used by its name",
+    "2.5": "macros of sizes for the caller",
+    "5.5": "a macro has the name of the symbol that it stands for",
+    "5.9": "names of functions that are static in several files",
+    "8.4": "the function of another file is declared where it is called",
+    "8.7": "the same function has external linkage in files of its own",
+    "8.9": "tables of start values stand at file scope, next to each other",
+    "8.14": "restrict: the optimiser's numbers are nobody else's",
+    "9.3": "a table of zeros has one initialiser",
+    "10.3": "comparisons are numbers in generated code",
+    "10.4": "whole numbers and flags in one expression",
+    "10.8": "a whole number becomes a real one after its sum",
+    "11.3": "a struct of numbers alone is read as their array, without gaps",
+    "11.9": "0 for a pointer, in generated code",
+    "12.1": "precedence of conditional expressions",
+    "12.3": "declarations and assignments joined by commas",
+    "13.3": "copies of generated code advance two pointers in one line",
+    "13.4": "a number is assigned to several places",
+    "14.2": "the loop of the optimiser ends within",
+    "14.4": "a pointer that may be null, or a comparison that is a number, is a condition",
+    "15.5": "a function returns where it is done",
+    "15.6": "a body of one line without braces",
+    "17.7": "memcpy and memset return what nobody needs",
+    "18.4": "places in the array of numbers are reached by addition",
+    "20.7": "a macro of a type",
+}
+
+
+def misra_rows() -> list[list[str]]:
+    """Lines of the table of deviations: the rule, how often each controller deviates, and why."""
+    counts: list[dict[str, int]] = []
+    for title in ("CTC+FPI (eq 6)", "RHC+FPI"):
+        task = fp.load_problem("two_mass")
+        device = device_of(task.problem, task.controllers[title], title, name="c", cycles=1)
+        with tempfile.TemporaryDirectory() as name:
+            write(device, target_called("c"), Path(name))
+            files = [str(path) for path in sorted(Path(name).glob("c*.c"))]
+            command = ["cppcheck", "--addon=misra", "--std=c99", "-q", "--template={id}", *files]
+            said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+        counts.append(dict(Counter(re.findall(r"misra-c2012-([\d.]+)", said))))
+    rules = sorted(set().union(*counts), key=lambda rule: [int(part) for part in rule.split(".")])
+    return [[rule, *(str(count.get(rule, 0)) for count in counts), _REASONS.get(rule, "")] for rule in rules]
+
+
+def board_row(problem: str, title: str, bare: bool) -> list[str]:
+    """One line of the table of small boards: what a controller takes of them."""
+    task = fp.load_problem(problem)
+    device = device_of(task.problem, task.controllers[title], title, name="c", cycles=1, bare=bare)
+    try:
+        said = str(target_called("arduino").files(device)["sizes.txt"])
+    except NotSupported as error:
+        said = str(error)
+    flash = re.search(r"Uno: (\d+) of", said)
+    uno, mega = (
+        re.search(rf"{board}(?:: .*: (?:does not fit: )?| )(fits|lacks [^;.\n]*)", said)
+        for board in ("Uno", "Mega 2560")
+    )
+    words = [found[1] if found else "" for found in (uno, mega)]
+    return [f"{problem}, {title}{', bare' if bare else ''}", f"{int(flash[1]) / 1000:.1f}" if flash else "", *words]
+
+
 def _said(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
@@ -165,13 +232,16 @@ def main() -> None:
         "answers here",
     ]
     text = _filled(text, "cortex", head, [cortex_row(*case) for case in BOARDS])
+    text = _filled(text, "misra", ["rule", "CTC+FPI (eq 6)", "RHC+FPI", "why it stays"], misra_rows())
+    head = ["controller", "flash, kB", "Uno", "Mega 2560"]
+    text = _filled(text, "boards", head, [board_row(*case, bare) for case in SMALL for bare in (True, False)])
     head = ["controller", "module, kB", "compressed, kB", "commands in Node", "commands in C here"]
     PAGE.write_text(_filled(text, "web", head, [web_row(*case) for case in WEB]), encoding="utf-8")
 
 
 def _filled(text: str, place: str, head: list[str], rows: list[list[str]]) -> str:
     table = "\n".join("| " + " | ".join(one) + " |" for one in [head, ["---"] * len(head), *rows])
-    return re.sub(rf"(<!-- {place} -->\n).*?(\n<!-- end -->)", rf"\1{table}\2", text, flags=re.DOTALL)
+    return re.sub(rf"(<!-- {place} -->\n).*?(<!-- end -->)", rf"\1{table}\n\2", text, flags=re.DOTALL)
 
 
 if __name__ == "__main__":

@@ -83,7 +83,8 @@ def _parts(text: str, visible: str) -> Iterator[_Part]:
     """Split a text into definitions; lines of the preprocessor are parts of their own."""
     lines, comment = iter(text.splitlines(keepends=True)), ""
     for line in lines:
-        if line.startswith("#"):
+        if line.lstrip().startswith("#"):
+            line = line.lstrip()
             while line.endswith("\\\n"):
                 line += next(lines)
             macro = _MACRO.match(line)

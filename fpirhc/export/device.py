@@ -6,7 +6,7 @@ The C is that of `Stepper.function`; no target computes anything of the controll
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,13 +15,14 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import BRIDGED
+from fpirhc.controllers.sensing_chain import compose_seeing
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.c_text import portable
 from fpirhc.simulation.clock import most_missed
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
-from fpirhc.symbolic.native import generate
+from fpirhc.symbolic.native import generate, native
 from fpirhc.task.problem import Problem
 
 _RAW = "fpirhc_native"  # name of the generated function, before it has its own
@@ -52,15 +53,17 @@ class Device:
         stepper: of the controller; compiled where there is a compiler, so that its numbers are those of C to the last bit.
         cycles: number of cycles that are recorded for a replay.
         libm: "system" or "own": exp, log, pow, sin, cos, tanh and atanh of the machine, or those with the same bits everywhere.
+        bare: whether the step is the controller's alone, without gate, watch and missed cycles.
     """
 
     name: str
     title: str
     problem: Problem
     controller: Controller
-    stepper: Stepper
+    stepper: Stepper | BareStep
     cycles: int
     libm: str = "system"
+    bare: bool = False
 
     @cached_property
     def inputs(self) -> Layout:
@@ -113,6 +116,50 @@ class Device:
 
     def _read(self, wanted: Callable[[str], bool]) -> Layout:
         return Layout(tuple(s for s in self.stepper.reads.signals if wanted(s.name)))
+
+
+class BareStep:
+    """A controller's own step, with what targets ask a `Stepper`.
+
+    A sample that is no number, or beyond all reason, reaches its memory, and stays there until the next reset. Missed cycles are
+    not made up for.
+
+    Args:
+        problem: of the controller.
+        controller: to be composed.
+        behind: the step of the same controller behind its gate; its data are taken.
+    """
+
+    def __init__(self, problem: Problem, controller: Controller, behind: Stepper) -> None:
+        composite = compose_seeing(problem, controller)
+        self.function, self.memory, self.signals = composite.function, composite.memory, composite.trace
+        self.reads = Layout(tuple(behind.reads[name] for name in composite.reads.names))
+        self.numbers = behind.numbers
+        ready = native(self.function)
+        self.compiled, self._step, self._trace = ready.compiled, ready.function, self.signals.start()
+
+    def start(self) -> np.ndarray:
+        """Return the first memory."""
+        return self.memory.start()
+
+    def bounds(self) -> Mapping[str, tuple[float, float]]:
+        """Nothing is live."""
+        return {}
+
+    def outdated(self) -> dict[str, str]:
+        """Nothing is live."""
+        return {}
+
+    def trace(self) -> dict[str, np.ndarray]:
+        """Return the signals of the last step."""
+        return self.signals.unpack(self._trace)
+
+    def step_measured(self, time: float, measured: np.ndarray, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (command, memory for the next cycle), as `Stepper.step_measured`."""
+        values = np.concatenate([[time], measured, self.reads.start()[1 + len(measured) :]])
+        after, trace, command = self._step(memory, *self.reads.unpack(values).values())
+        self._trace = trace.full().ravel()
+        return command.full().ravel(), after.full().ravel()
 
 
 def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, int]]:

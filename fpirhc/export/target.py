@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.errors import InvalidName, NotSupported, OutputError, nearest, not_writable
-from fpirhc.export.device import Device, check_name, default_name
+from fpirhc.errors import InvalidName, InvalidValue, NotSupported, OutputError, nearest, not_writable
+from fpirhc.export.device import BareStep, Device, check_name, default_name
 from fpirhc.export.processor import Processor
 from fpirhc.members import within
 from fpirhc.simulation.simulate import simulate
@@ -69,6 +69,7 @@ def device_of(
     live: Sequence[str] = (),
     cycles: int = 2000,
     libm: str = "system",
+    bare: bool = False,
 ) -> Device:
     """Return a controller for a device.
 
@@ -80,18 +81,23 @@ def device_of(
         live: paths of live settings.
         cycles: to be recorded for a replay.
         libm: "system", or "own" for the same bits on every machine.
+        bare: whether the step is to be the controller's alone, without gate, watch and missed cycles.
 
     Raises:
         InvalidName: no C name, or no setting.
+        InvalidValue: live settings of a bare step, which has constants.
         NotSupported: a controller that needs a solver's own library, or settings that Python must follow up.
     """
     whole = f"{problem.name} {title}"
     chosen = default_name(whole) if name is None else name
     check_name(chosen)
+    if bare and live:
+        raise InvalidValue(f"--bare has no live settings, since nothing checks them: leave out '{live[0]}' or --bare")
     try:
         # A solver without a bound of its time is refused below, for what it is.
         stepper = Stepper(problem, controller, live=live, bounded=False)
-        device = Device(chosen, whole, problem, controller, stepper, cycles, libm)
+        step = BareStep(problem, controller, stepper) if bare else stepper
+        device = Device(chosen, whole, problem, controller, step, cycles, libm, bare)
         _ = device.sources, device.bounds
     except NotSupported as error:
         raise NotSupported(f"'{title}' cannot be exported: {error}{_instead(controller)}") from None
@@ -112,6 +118,7 @@ def write(device: Device, target: Target, folder: Path) -> list[Path]:
         contents = target.files(device)
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in contents.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     except OSError as error:
         if isinstance(error, OutputError):

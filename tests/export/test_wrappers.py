@@ -40,6 +40,7 @@ def answered(device: Device) -> tuple[np.ndarray, np.ndarray]:
     rows = np.tile([0.0, 1.9, 5.4, 0.0, 0.0, 0.1, -0.2], (CYCLES, 1)) + 1e-3 * generator.standard_normal((CYCLES, 7))
     rows[:, 0] = period * np.arange(CYCLES)
     rows[20, 1] = np.nan
+    assert isinstance(device.stepper, fp.Stepper)
     device.stepper.change({"deformation.gain": GAIN})
     memory, answers = device.stepper.start(), []
     for row in rows:

@@ -17,7 +17,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
         metavar="TARGET",
         default="c",
         help="c: C99 for every compiler (default); cortex-m: boards; library: LabVIEW, MATLAB, ctypes; simulink: S-function; "
-        "ros2_control: plugin; fmu, fmu2: units for other simulators; wasm: web pages",
+        "ros2_control: plugin; arduino: a library of the Arduino IDE; fmu, fmu2: units for other simulators; wasm: web pages",
     )
     parser.add_argument("--out", metavar="FOLDER", required=True, help="folder for the files, new or empty")
     text = "prefix of everything in C (default: made of the names of problem and controller)"
@@ -28,11 +28,17 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--libm", choices=("system", "own"), help=text)
     text = "cycles that are recorded for the replay, faults among them (default: 2000)"
     parser.add_argument("--cycles", type=whole(1), default=2000, metavar="N", help=text)
+    text = (
+        "the controller alone, for the smallest boards: no gate, so a bad sample stays in its memory; no watch; missed cycles "
+        "are not made up for; no live settings"
+    )
+    parser.add_argument("--bare", action="store_true", help=text)
     text = "build what was exported, here or for an emulated Cortex-M7, run the plant with it, and say how far apart the runs are"
     parser.add_argument("--check", action="store_true", help=text)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.export.footprint import worst_case
     from fpirhc.export.target import device_of, in_the_loop, processor_of, target_called, write
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.studies.comparison.compare import select
@@ -50,11 +56,18 @@ def _run(options: argparse.Namespace) -> ExitCode:
         live=options.live,
         cycles=options.cycles,
         libm=options.libm or target.libm,
+        bare=options.bare,
     )
     for file in write(device, target, Path(options.out)):
         print(f"wrote {file}")
     sizes = {"memory": device.stepper.memory.size, "trace": device.stepper.signals.size, "work": device.sizes["w"]}
     print(f"numbers of one controller: {', '.join(f'{size} of {what}' for what, size in sizes.items())}")
+    print(f"worst case: {worst_case(device)}")
+    if options.bare:
+        print(
+            "bare: no sample is checked; one that is no number stays in the memory until the next reset. Missed cycles are not "
+            "made up for, and no failure is watched for"
+        )
     for path, (low, high) in device.bounds.items():
         print(f"setting {path}: from {low:.6g} to {high:.6g}, now {device.stepper.numbers[path]:.6g}")
     if options.check:
@@ -81,6 +94,10 @@ VERB = Verb(
         (
             'fpirhc export two_mass "RHC+FPI" --to cortex-m --out board --check',
             "libraries, and a run in an emulated board",
+        ),
+        (
+            'fpirhc export two_mass "CTC+FPI (eq 6)" --to arduino --bare --out uno',
+            "a library for the Arduino IDE, as small as it gets",
         ),
         ('fpirhc export two_mass "RHC+FPI" --to fmu --out device', "an FMI 3.0 unit for co-simulation"),
         ('fpirhc export two_mass "RHC+FPI" --to wasm --out web', "WebAssembly with a wrapper in JavaScript"),

@@ -203,6 +203,16 @@ def _controller(device: Device) -> str:
     for part, layout in data_of(device).items():
         tables[part.upper()] = layout.start()
     texts = [_table(key, values) for key, values in tables.items()]
+    words = {
+        "declaration": f"int {name}_raw{SIGNATURE};",
+        "status": str(trace.slice("status").start),
+        "command": str(trace.slice("command").start),
+        "bind": "\n".join(_bound(device)),
+        "init": "\n".join(f"  memcpy(&c->{part}, {part.upper()}, sizeof {part.upper()});" for part in data_of(device)),
+        "set": _setter(device),
+    }
+    if device.bare:
+        return filled(device, "bare.c", tables=of_type("\n".join(texts)), **words)
     texts += [
         f"#define PERIOD ((casadi_real){literal(device.problem.period)})",
         f"#define LONGEST ((casadi_real){LONGEST})",
@@ -213,17 +223,12 @@ def _controller(device: Device) -> str:
         device,
         "controller.c",
         tables=of_type("\n".join(texts)),
-        declaration=f"int {name}_raw{SIGNATURE};",
         before=str(memory.slice(MEMORY.name).start),
         held=str(memory.slice(HELD).start),
         skipped=str(memory.slice(f"{SKIPPED}_before").start),
-        status=str(trace.slice("status").start),
         skipped_now=str(trace.slice(SKIPPED).start),
-        command=str(trace.slice("command").start),
         first=str(device.inputs.slice(device.inputs.names[missing]).start),
-        bind="\n".join(_bound(device)),
-        init="\n".join(f"  memcpy(&c->{part}, {part.upper()}, sizeof {part.upper()});" for part in data_of(device)),
-        set=_setter(device),
+        **words,
     )
 
 

@@ -23,7 +23,7 @@ static int run(@name@_controller* c, const @name@_inputs* in, casadi_real* comma
 /* Cycles between two steps, whose samples are missing; 0 where the later step is the next cycle, or cannot follow the other. */
 static long missed_cycles(casadi_real time, casadi_real before) {
   casadi_real cycles = (time - before) / PERIOD;
-  return before > -FINITE / 2 && cycles >= (casadi_real)1.5 && cycles <= LONGEST ? (long)rint(cycles) - 1 : 0;
+  return before > -FINITE / 2 && cycles >= (casadi_real)1.5 && cycles <= LONGEST ? lrint(cycles) - 1 : 0;
 }
 
 /* After a solver that failed: the last command, and the memory as it was. The next step makes up for this cycle. */

@@ -43,6 +43,7 @@ double @name@_atanh(double x);
 #define floor floorf
 #define ceil ceilf
 #define rint rintf
+#define lrint lrintf
 #define hypot hypotf
 #else
 #define exp @name@_exp

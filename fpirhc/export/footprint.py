@@ -1,0 +1,95 @@
+"""The worst case of an exported controller, from its code: operations of a cycle, and bytes of flash, RAM and stack.
+
+Iterations, stages and branches are fixed, so the largest number of operations is that of the composed graph, which the loops in C
+follow: of a switch the longest case counts.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+
+import casadi as ca
+
+from fpirhc.export.device import Device
+from fpirhc.export.targets.c import sources
+from fpirhc.symbolic.native import find_compiler
+
+_STILL = frozenset((ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_PARAMETER))
+
+
+def worst_case(device: Device) -> str:
+    """Return the worst case as a line: operations always, bytes where there is a compiler that counts them."""
+    most = operations(device.stepper.function)
+    text = f"{most} operations of a step"
+    missed = 0 if device.bare else device.most_missed
+    text += f", {missed + 1} times as many after {missed} missed cycles" if missed else ""
+    sizes = _bytes(device)
+    if sizes is None:
+        return text
+    flash, ram, stack = sizes
+    return f"{text}; {flash} bytes of code without exp and the like, {ram} of RAM, {stack} of stack (double, -Os, this machine)"
+
+
+def operations(function: ca.Function) -> int:
+    """Return the largest number of operations of one evaluation: arithmetic, comparisons and elementary functions of numbers."""
+    return _operations(function, {})
+
+
+def _operations(function: ca.Function, known: dict[int, int]) -> int:
+    key = function.__hash__()
+    if key not in known:
+        known[key] = _counted(function, known)
+    return known[key]
+
+
+def _counted(function: ca.Function, known: dict[int, int]) -> int:
+    if function.class_name() == "SXFunction":
+        return sum(function.instruction_id(k) not in _STILL for k in range(function.n_instructions()))
+    if function.class_name() == "Switch":
+        own = function.info()
+        return max(_operations(one, known) for one in (*own["f"], own["f_def"]) if not one.is_null())
+    if function.class_name() == "Map":
+        own = function.info()
+        return int(own["n"]) * _operations(own["f"], known)
+    return sum(_of_instruction(function, k, known) for k in range(function.n_instructions()))
+
+
+def _of_instruction(function: ca.Function, k: int, known: dict[int, int]) -> int:
+    if function.instruction_id(k) in _STILL:
+        return 0
+    made = function.instruction_MX(k)
+    if made.is_call():
+        return _operations(made.which_function(), known)
+    if function.instruction_id(k) == ca.OP_MTIMES:
+        return 2 * int(made.dep(1).size1()) * int(made.nnz())
+    moves = made.is_unary() or made.is_binary()
+    return int(made.nnz()) if moves else 0
+
+
+def _bytes(device: Device) -> tuple[int, int, int] | None:
+    """Code, struct and the deepest frames of the files added up; None without a compiler that counts them."""
+    compiler = find_compiler()
+    if compiler is None:
+        return None
+    files = sources(device)
+    probe = f'#include "{device.name}.h"\nchar size[sizeof({device.name}_controller)];\n'
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in {**files, "size_of_it.c": probe}.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        texts = [file for file in (*files, "size_of_it.c") if file.endswith(".c")]
+        commands = [
+            [compiler, "-std=c99", "-Os", "-ffp-contract=off", "-fstack-usage", "-c", *texts],
+            ["size", *[f"{Path(file).stem}.o" for file in texts]],
+        ]
+        try:
+            done = [subprocess.run(c, capture_output=True, text=True, check=True, cwd=folder) for c in commands][-1]
+        except (OSError, subprocess.CalledProcessError):
+            return None
+        rows = [[int(word) for word in line.split()[:3]] for line in done.stdout.splitlines()[1:]]
+        frames = [re.findall(r"\t(\d+)\t", path.read_text()) for path in folder.glob("*.su")]
+        struct = rows[-1][1] + rows[-1][2]
+        return sum(row[0] + row[1] for row in rows[:-1]), struct, sum(max(map(int, own), default=0) for own in frames)

@@ -1,0 +1,31 @@
+/* @title@ on an Arduino: one step per period; `longest` has the microseconds of the longest step. Write the two functions. */
+
+#include <@name@.h>
+
+const unsigned long MICROSECONDS_PER_UNIT = 1000000; /* of @NAME@_PERIOD, which is in @unit@ */
+const unsigned long TICKS = (unsigned long)(@NAME@_PERIOD * MICROSECONDS_PER_UNIT + 0.5);
+
+static @name@_controller controller;
+static @name@_inputs in;
+static @name@_command out;
+static unsigned long due, cycle, longest;
+
+void read_sample(@name@_inputs* in) { (void)in; }           /* all but the time */
+void write_command(const @name@_command* out) { (void)out; }
+
+void setup() {
+  @name@_init(&controller);
+  due = micros();
+}
+
+void loop() {
+  unsigned long begun = micros(), took;
+  if ((long)(begun - due) < 0) return;
+  due += TICKS;
+  in.time = cycle++ * @NAME@_PERIOD;
+  read_sample(&in);
+  @name@_step(&controller, &in, &out);
+  write_command(&out);
+  took = micros() - begun;
+  if (took > longest) longest = took;
+}

@@ -1,0 +1,135 @@
+"""A library folder of the Arduino IDE, in float, with an example; where avr-gcc is installed, its size on two boards.
+
+What fits no board is refused with the bytes that it lacks.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from fpirhc.errors import CompileError, NotSupported
+from fpirhc.export.device import Device
+from fpirhc.export.target import Target
+from fpirhc.export.targets.c import filled, layout_of, sources
+
+_FLAGS = ("-std=gnu99", "-Os", "-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections", "-fstack-usage")
+_LARGE = (
+    "-Wl,--defsym=__DATA_REGION_LENGTH__=0xfe00",
+    "-Wl,--defsym=__TEXT_REGION_LENGTH__=0x800000",
+)  # so that all is counted
+_ATANH = (
+    "#include <math.h>\n#ifdef __AVR__\n#define atanh(x) (0.5f * log((1 + (x)) / (1 - (x)))) /* it has none */\n#endif"
+)
+_STARTED = 900  # bytes of flash of Arduino's own core, without what a sketch calls
+
+
+@dataclass(frozen=True)
+class _Board:
+    """Memory of a board, less what its loader takes: bytes."""
+
+    name: str
+    processor: str
+    flash: int
+    ram: int
+
+
+_BOARDS = (_Board("Uno", "atmega328p", 32256, 2048), _Board("Mega 2560", "atmega2560", 253_952, 8192))
+
+
+@dataclass(frozen=True)
+class _Size:
+    """What one controller takes of a board: bytes of flash, of static RAM, and of stack at its deepest."""
+
+    flash: int
+    ram: int
+    stack: int
+
+    def lacks(self, board: _Board) -> str:
+        """What the board has too little of, empty where all fits."""
+        over = {"flash": self.flash - board.flash, "RAM": self.ram + self.stack - board.ram}
+        return " and ".join(f"{bytes_} bytes of {what}" for what, bytes_ in over.items() if bytes_ > 0)
+
+
+def _files(device: Device) -> Mapping[str, str | bytes]:
+    if device.libm != "system":
+        raise NotSupported("the target arduino computes in float, and --libm own in double; leave --libm out")
+    own = {file: _in_float(text) for file, text in sources(device).items()}
+    sizes = {board: size_on(own, device.name, board) for board in _BOARDS} if shutil.which("avr-gcc") else {}
+    lacking = {board.name: size.lacks(board) for board, size in sizes.items()}
+    if sizes and all(lacking.values()):
+        least = "; ".join(f"{board} lacks {what}" for board, what in lacking.items())
+        smaller = "fewer stages" if device.bare else "--bare, fewer stages"
+        raise NotSupported(f"'{device.title}' fits no board: {least}. Use {smaller}, or --to cortex-m")
+    sketch = filled(device, "arduino.ino", unit=device.problem.plant.time_unit)
+    return {
+        "library.properties": _properties(device),
+        **{f"src/{file}": text for file, text in own.items()},
+        f"examples/{device.name}/{device.name}.ino": sketch,
+        "layout.json": json.dumps(layout_of(device), indent=1),
+        "sizes.txt": "".join(_line(board, size) for board, size in sizes.items()) or "avr-gcc is not installed\n",
+    }
+
+
+TARGET = Target("arduino", "a library folder of the Arduino IDE, in float, with an example", _files)
+
+
+def size_on(files: Mapping[str, str], name: str, board: _Board) -> _Size:
+    """Return what one controller takes of a board.
+
+    Args:
+        files: C files and headers by name.
+        name: prefix of the controller.
+        board: with its processor.
+
+    Raises:
+        CompileError: avr-gcc refuses them.
+    """
+    main = f'#include "{name}.h"\n{name}_controller c; {name}_inputs in; {name}_command out;\n'
+    main += f"int main(void) {{ {name}_init(&c); for (;;) {name}_step(&c, &in, &out); }}\n"
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for file, text in {**files, "main.c": main}.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        texts = [file for file in (*files, "main.c") if file.endswith(".c")]
+        # The processor with most flash, so that what is too large for a board is measured too.
+        for command in (
+            ["avr-gcc", "-mmcu=atmega2560", *_FLAGS, *_LARGE, "-o", "program", *texts, "-lm"],
+            ["avr-size", "program"],
+        ):
+            done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+            if done.returncode:
+                raise CompileError(f"no program for the board {board.name}: {done.stderr.strip()[-2000:]}")
+        code, data, bss = (int(word) for word in done.stdout.splitlines()[1].split()[:3])
+        frames = [[int(line.split("\t")[1]) for line in p.read_text().splitlines()] for p in folder.glob("*.su")]
+        return _Size(code + data + _STARTED, data + bss, sum(max(own, default=0) for own in frames) + 32)
+
+
+def _in_float(text: str) -> str:
+    """C whose numbers are float, and whose whole numbers are those of the processor."""
+    text = text.replace("#define casadi_real double", "#define casadi_real float")
+    text = text.replace("#define casadi_int long long int", "#define casadi_int int")
+    return text.replace("#include <math.h>", _ATANH, 1) if re.search(r"\batanh\(", text) else text
+
+
+def _line(board: _Board, size: _Size) -> str:
+    lacks = size.lacks(board)
+    verdict = f"does not fit: lacks {lacks}" if lacks else "fits"
+    return (
+        f"{board.name}: {size.flash} of {board.flash} bytes of flash, {size.ram} + {size.stack} of stack of {board.ram} bytes "
+        f"of RAM: {verdict}\n"
+    )
+
+
+def _properties(device: Device) -> str:
+    return (
+        f"name={device.name}\nversion=1.0.0\nauthor=fpirhc\nmaintainer=fpirhc\nsentence={device.title}\n"
+        "paragraph=A controller written from its symbolic step.\ncategory=Signal Input/Output\nurl=\narchitectures=*\n"
+        f"includes={device.name}.h\n"
+    )
