@@ -397,7 +397,7 @@ def test_a_learner_that_does_worse_than_its_fixed_model_is_named():
     both = [entry("RHC"), entry("FPI", "RHC")]
     assert said(*both, entry("RLS", errors={"y": 3.3}, **fixed))[1] == (
         "RLS does worse than RHC, whose model does not change (1 m): it has an rms error of y of 3.3 m (3.3 times more). Let it "
-        "learn more slowly: a smaller drift of its disturbances, a longer memory; or mend the model."
+        "learn more slowly (a smaller drift of disturbances, a longer memory, a smaller gain of adaptation), or mend the model."
     )
     assert (
         " RHC, whose model does not change (1 m): it does not finish."
