@@ -80,6 +80,7 @@ from .simulation.lyapunov_view import lyapunov_view
 from .simulation.machine import RunMonitor
 from .simulation.metrics import Metric, figures, measure
 from .simulation.pictures.base import Quantity
+from .simulation.pictures.heat_map import HeatMap
 from .simulation.pictures.over_time import OverTime
 from .simulation.pictures.portrait import Portrait
 from .simulation.pictures.raster import Raster
@@ -153,6 +154,7 @@ __all__ = [
     "GradientFixedPoint",
     "Guarded",
     "HarmfulAdaptation",
+    "HeatMap",
     "HoldPlan",
     "Horizon",
     "Identity",

@@ -44,13 +44,8 @@ rate.set_xlabel("time [h]")
 # What the iteration holds back: the densities of the six segments. The ramp joins the
 # fifth one.
 
-figure, axes = plt.subplots(figsize=(8, 2.5), layout="constrained")
-densities = [runs["CTC+FPI"][f"plant_state.rho{i}"] for i in range(1, 7)]
-time = runs["CTC+FPI"].time
-image = axes.pcolormesh(time, range(1, 7), densities, shading="nearest", cmap="magma")
-figure.colorbar(image, label="veh/km per lane")
-axes.set_xlabel("time [h]")
-axes.set_ylabel("segment")
+density, _ = metering.pictures
+density.draw(plt.figure(figsize=density.size(len(runs)), layout="constrained"), runs)
 
 # %%
 # Emission is another task. It settles when traffic has settled, and the model of the

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fpirhc.errors import InvalidName
+from fpirhc.errors import FpirhcError
 from fpirhc.report.figures import contraction_figure, limits_figure, lyapunov_figure, mismatch_figure, pair_figures
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
 from fpirhc.simulation.log import shown_motion
@@ -158,7 +158,7 @@ def _own(wanted: Picture, runs: Mapping[str, Run]) -> Image | None:
     figure = new_figure(*wanted.size(len(shown)))
     try:
         wanted.draw(figure, shown)
-    except InvalidName as error:
+    except FpirhcError as error:
         return Image("", "", f"{wanted.title} is not drawn: {error}")
     return Image(figure.address, f"{wanted.title}: {', '.join(shown)}", f"{wanted.title}. {wanted.caption}".strip())
 

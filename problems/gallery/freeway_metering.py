@@ -137,3 +137,18 @@ controllers = {
     "CTC exact model": fp.ExactModel(fp.ComputedTorque(law)),
 }
 headline = ("CTC", "CTC+FPI")
+pictures = (
+    fp.HeatMap(
+        "Density along the road",
+        rows=tuple(f"plant_state.rho{i}" for i in range(1, SEGMENTS + 1)),
+        place="segment",
+        quantity="density",
+        caption="The ramp joins the fifth segment.",
+    ),
+    fp.HeatMap(
+        "Speed along the road",
+        rows=tuple(f"plant_state.v{i}" for i in range(1, SEGMENTS + 1)),
+        place="segment",
+        quantity="speed",
+    ),
+)

@@ -12,9 +12,10 @@ import pytest
 from matplotlib.figure import Figure
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, ProblemFileError
+from fpirhc.errors import InvalidName, InvalidValue, ProblemFileError
 from fpirhc.report.html import own_pictures, render
 from fpirhc.simulation.pictures.base import extremes
+from fpirhc.simulation.pictures.heat_map import averaged
 from fpirhc.simulation.pictures.raster import passages
 
 
@@ -140,3 +141,35 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path, monkey
     absent = replace(first, controllers=("RHC",))
     assert own_pictures(replace(comparison, pictures=(absent,))) == []
     assert "Pictures of this problem" not in render(replace(comparison, pictures=()))
+
+
+def test_a_heat_map_has_one_scale_for_all_runs(runs):
+    """A row for each signal from the bottom up, and the extremes of all panels as the ends of the colours."""
+    figure = Figure()
+    fp.HeatMap("h", rows=("error.q", "reference.q"), place="rod", quantity="position").draw(figure, runs)
+    slow, quick, scale = figure.axes
+    values = [np.array([run["error.q"], run["reference.q"]]) for run in runs.values()]
+    for axis, own in zip((slow, quick), values, strict=True):
+        [mesh] = axis.collections
+        np.testing.assert_array_equal(mesh.get_array(), own)
+        assert mesh.get_clim() == (np.min(values), np.max(values))
+    assert [axis.get_title() for axis in (slow, quick)] == ["slow", "quick"]
+    assert (slow.get_ylabel(), quick.get_xlabel(), scale.get_ylabel()) == ("rod", "time [s]", "position [m]")
+
+
+def test_many_cycles_of_a_heat_map_are_averaged():
+    """A column is the mean of its interval, so the mean of the whole is kept."""
+    values = np.random.default_rng(3).normal(size=20_000)
+    columns = averaged(values)
+    assert columns.shape == (1000,)
+    assert columns[0] == pytest.approx(values[:20].mean())
+    np.testing.assert_array_equal(averaged(values[:1000]), values[:1000])
+
+
+def test_a_heat_map_has_rows_of_one_unit(runs):
+    """The scale has one unit; without a row there is nothing to draw."""
+    mixed = fp.HeatMap("h", rows=("state.q", "state.q'"))
+    with pytest.raises(InvalidValue, match=r"one scale of colours shows one unit, and rows have m, m/s"):
+        mixed.draw(Figure(), runs)
+    with pytest.raises(InvalidValue, match=r"expected at least one signal, such as 'state.q'"):
+        fp.HeatMap("h", rows=())

@@ -29,7 +29,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import cast
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -367,9 +367,9 @@ def output_ahead(plant: Plant) -> ca.Function:
 
 def other_predictions(controller: Controller) -> dict[str, Controller]:
     """Return the controller with the other predictors that its own one names, by their texts; none where nothing predicts."""
-    if isinstance(controller, Predicted):
-        others = controller.by.others(controller.inputs + controller.measurement)
-        return {str(other): replace(controller, by=other) for other in others}
+    around: Any = controller
+    if isinstance(getattr(around, "by", None), Predictor):
+        return {str(other): replace(around, by=other) for other in around.by.others(around.inputs + around.measurement)}
     if controller.inner is None:
         return {}
     return {name: with_inner(controller, other) for name, other in other_predictions(controller.inner).items()}

@@ -37,7 +37,10 @@ _LOWER = "Lower the map's gain"
 _PASSING = (
     "Use a form that passes the desired response at once (ModelReferenced, Increment)"  # a lower gain is later still
 )
-SLOWER = "Let it learn more slowly (a smaller drift of disturbances, a longer memory, a smaller gain of adaptation), or mend the model."
+SLOWER = (
+    "Let it learn more slowly (a smaller drift of disturbances, a longer memory, a smaller gain of adaptation), or mend "
+    "the model."
+)
 
 
 def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: bool, learner: bool = False) -> Answer:
