@@ -62,13 +62,32 @@ def program(sources: Sequence[Path], made: Path, *flags: str) -> None:
         NotSupported: there is no compiler.
         CompileError: it refuses the files.
     """
+    command = [
+        own_compiler(),
+        "-std=c99",
+        "-O2",
+        "-ffp-contract=off",
+        *flags,
+        *map(str, sources),
+        "-o",
+        str(made),
+        "-lm",
+    ]
+    _done(command, "no program")
+
+
+def own_compiler() -> str:
+    """Return the C compiler of this machine.
+
+    Raises:
+        NotSupported: there is none.
+    """
     own = find_compiler()
     if own is None:
         raise NotSupported(
             "a program of this machine needs a C compiler: install gcc or clang, or name one by FPIRHC_CC"
         )
-    command = [own, "-std=c99", "-O2", "-ffp-contract=off", *flags, *map(str, sources), "-o", str(made), "-lm"]
-    _done(command, "no program")
+    return own
 
 
 def web_module(files: Mapping[str, str]) -> bytes:

@@ -33,6 +33,7 @@ class Target:
         libm: whose exp, sin and the like it takes, unless told otherwise: "system" or "own".
         processor: function (folder of the files, prefix) -> program with its arguments that answers samples, see `Processor`; None:
             the target has none.
+        builder: function that raises where this program cannot be built here.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Target:
     files: Callable[[Device], Mapping[str, str | bytes]]
     libm: str = "system"
     processor: Callable[[Path, str], Sequence[str]] | None = None
+    builder: Callable[[], object] | None = None
 
 
 @cache
@@ -131,11 +133,13 @@ def processor_of(target: Target) -> Callable[[Path, str], Sequence[str]]:
     """Return the function that gives a target's program.
 
     Raises:
-        NotSupported: it has none.
+        NotSupported: it has none, or it cannot be built here.
     """
     if target.processor is None:
         there = ", ".join(one.name for one in targets().values() if one.processor is not None)
         raise NotSupported(f"--check is there for {there}, not for {target.name}")
+    if target.builder is not None:
+        target.builder()
     return target.processor
 
 

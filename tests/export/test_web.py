@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
+import struct
 import subprocess
 from pathlib import Path
 
@@ -102,6 +104,49 @@ def test_webassembly_has_the_commands_of_this_machine_bit_by_bit(name, tmp_path)
     )
     assert answers(done.stdout) == answers(here.stdout)
     assert done.stdout.splitlines()[-1] in here.stdout  # statuses
+
+
+def in_wasmtime(folder: Path) -> str:
+    """Hash of the commands of the recorded cycles, as main.c makes it, by a module in wasmtime."""
+    wasmtime = pytest.importorskip("wasmtime", reason="wasmtime is not installed: pip install wasmtime")
+    store = wasmtime.Store()
+    module = wasmtime.Module.from_file(store.engine, str(folder / "arm.wasm"))
+    e = wasmtime.Instance(store, module, []).exports(store)
+    if "_initialize" in e:
+        e["_initialize"](store)
+    e["init"](store)
+    memory, given, made, kept = e["memory"], *(e[n](store) for n in ("inputs", "command", "memory_of_controller"))
+    data = (folder / "samples.bin").read_bytes()
+    cycles, inputs, commands, _ = struct.unpack_from("<4i", data)
+    size, answers, statuses = 8 * (inputs + 1 + commands + 2), 0xCBF29CE484222325, set[int]()
+    for k in range(cycles):
+        row = data[16 + k * size : 16 + (k + 1) * size]
+        [damaged] = struct.unpack_from("<d", row, 8 * inputs)
+        if damaged >= 0:
+            memory.write(store, struct.pack("<d", math.nan), kept + 8 * int(damaged))
+        memory.write(store, row[: 8 * inputs], given)
+        statuses.add(e["step"](store))
+        for word in struct.unpack(f"<{commands}Q", bytes(memory.read(store, made, made + 8 * commands))):
+            answers = (answers ^ word) * 0x100000001B3 & (1 << 64) - 1
+    assert len(statuses) > 1  # faults are among them
+    return f"{answers:016x}"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("name", CASES)
+def test_ten_thousand_cycles_in_wasmtime_have_the_bits_of_c(name, tmp_path):
+    """Another engine than Node's, and other machine code: the same hash of all commands, faults included."""
+    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
+    exported(name, tmp_path / "wasm", "wasm", cycles=10_000)
+    exported(name, tmp_path / "c", "c", cycles=10_000)
+    program, sources = tmp_path / "program", sorted(str(path) for path in (tmp_path / "c").glob("*.c"))
+    command = [str(find_compiler()), "-std=c99", "-O2", "-ffp-contract=off", *sources, "-o", str(program), "-lm"]
+    subprocess.run(command, check=True)
+    here = subprocess.run(
+        [str(program), str(tmp_path / "c" / "samples.bin")], capture_output=True, text=True, check=True
+    )
+    assert in_wasmtime(tmp_path / "wasm") == answers(here.stdout)
 
 
 @pytest.mark.slow

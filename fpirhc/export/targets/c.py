@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from fpirhc.controllers.gate import HELD
-from fpirhc.export.binaries import program
+from fpirhc.export.binaries import own_compiler, program
 from fpirhc.export.device import Device, identifiers, literal
 from fpirhc.export.samples import recorded
 from fpirhc.export.target import Target
@@ -77,6 +77,7 @@ TARGET = Target(
     "C99 without heap, files and globals: header, controller, layout, replay, CMake file",
     _files,
     processor=_processor,
+    builder=own_compiler,
 )
 
 
