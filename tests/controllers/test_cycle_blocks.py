@@ -35,6 +35,7 @@ from fpirhc.controllers.contract import (
     checked,
     resolved,
     tracking_law,
+    with_lateness,
     with_optimiser,
     without_deformation,
 )
@@ -415,8 +416,9 @@ def test_a_filtered_command_asks_for_its_largest_change_in_a_cycle():
 
 
 def test_demands_count_the_beginning_of_the_reference():
-    """Along e^(-3 t) everything is largest at t = 0: 27 per second, and an error of (9, 3 / 8)."""
+    """Along e^(-3 t) everything is largest at t = 0: 27 per second, and an error of (9, 3 / 8); with 2 kg u falls by 54 N/s."""
     problem = replace(masses(), reference=fp.Trajectory(lambda t: {"a": ca.exp(-3 * t), "b": 1 + 0 * t}))
+    assert command_demand(problem, np.array([2.0, 4.0])).change == pytest.approx(54.0 * PERIOD, rel=1e-2)
     demand = reference_demand(problem, TRACK)
     assert demand.change == pytest.approx(27.0 * PERIOD, rel=1e-2)
     assert demand.recovery == pytest.approx(step_for_basin(np.hypot(9.0, 3 / 8), 3, 2.0, PERIOD), rel=1e-9)
@@ -442,6 +444,21 @@ def test_a_jump_is_that_of_the_slope_between_the_limits():
     reference, limits = fp.Trajectory(lambda t: {"y": 4 * t**2}), fp.Limits(inputs={"u": (1.0, 3.0)})
     problem = fp.Problem(plant, reference, start={"y": 0.0}, period=PERIOD, duration=1.0, limits=limits)
     assert plan_demand(problem).change == pytest.approx(12.0)
+
+
+# What a form believes
+
+
+@pytest.mark.parametrize(
+    ("cycles", "late", "believed"), [(None, True, (3.0, 0.0)), (2.0, True, 2.0), (None, False, None)]
+)
+def test_a_form_believes_the_dead_times_that_it_leaves_open(cycles, late, believed):
+    """In cycles of each input, zero where none is stated. What is given stays, and a controller that is told nothing is itself."""
+    problem = masses(period=1 / 8, dead_time=fp.DeadTime(inputs={"u": 3 / 8 if late else 0.0}))
+    controller: Any = fp.ComputedTorque(TRACK, fp.ModelReferenced(fp.Affine(-1.0), cycles=cycles))
+    told: Any = with_lateness(problem, controller)
+    assert told.deformation.cycles == believed
+    assert (told is controller) == (believed == cycles)
 
 
 # What a plan is made for, and steps inside of others
@@ -526,3 +543,5 @@ def test_a_reference_that_jumps_asks_for_its_largest_change_in_a_cycle():
     aims = fp.Setpoint({"a": 2.0, "b": 0.0}, rate=3.0, order=2, start={"a": 0.0, "b": 0.0})
     jump = replace(masses(), reference=aims, start={"a": 0.0, "b": 0.0})
     assert reference_demand(jump).change == pytest.approx(18.0, rel=1e-9)
+    later = fp.Setpoint({"a": [(0.0, 1.0), (3.0, 4.0)], "b": 0.0}, rate=3.0, order=2, start={"a": 0.0, "b": 0.0})
+    assert reference_demand(replace(jump, reference=later)).change == pytest.approx(27.0, rel=1e-2)

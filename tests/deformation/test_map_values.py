@@ -37,7 +37,7 @@ def test_affine():
     assert one.with_effective_gain(0.3).effective_gain() == 0.3
 
 
-@pytest.mark.parametrize(("offset", "sign"), [(50.0, -1), (-50.0, 1), (50.0, 1)])
+@pytest.mark.parametrize(("offset", "sign"), [(50.5, -1), (-50.5, 1), (50.5, 1)])
 def test_robust_fixed_point_transformation(offset, sign):
     """r+ = (K_c + r) [1 + B_c tanh(A_c (f - d))] - K_c, and A = -K_c B_c A_c."""
     one = fp.RFPT(offset=offset, sign=sign, gain=0.01)
@@ -49,7 +49,7 @@ def test_robust_fixed_point_transformation(offset, sign):
     assert (other.offset, other.sign) == (offset, sign)
     assert other.gain == pytest.approx(-0.2 / (offset * sign))
     assert other.effective_gain() == pytest.approx(0.2)
-    assert one.iteration.reach == Reach("offset", 50.0)
+    assert one.iteration.reach == Reach("offset", 50.5)
 
 
 @pytest.mark.parametrize(("offset", "sign"), [(50.0, -1), (-50.0, 1)])

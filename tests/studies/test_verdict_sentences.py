@@ -93,6 +93,14 @@ def test_the_headline_comes_first():
     assert said(*rows)[0].startswith("a+")
 
 
+def test_a_run_without_adaptation_that_is_no_row_is_told():
+    """It ran for its pair alone; a row needs no such sentence."""
+    plain, adaptive = entry("CTC"), entry("CTC+FPI", "CTC")
+    told = " CTC is no row: it ran for this."
+    apart, row = findings([adaptive], {}, None, partners=[plain])[0], findings([plain, adaptive], {}, None)[0]
+    assert apart.text == row.text + told
+
+
 def test_where_nobody_finishes_every_end_is_told():
     assert said(entry("a", stop="x is not finite"), entry("b", stop="the plan is not finite"))[0] == (
         "No controller finished its run: a: x is not finite; b: the plan is not finite."
