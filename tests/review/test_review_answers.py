@@ -608,6 +608,7 @@ def test_at_rest_no_parameter_is_reached():
 
 def test_a_simulator_of_somebody_else_is_recommended_no_gain():
     """The loop of the model bears half of 4; the arm of MuJoCo, whose lag is not in the model, is a matter of the probe."""
+    pytest.importorskip("mujoco", reason="it needs the extra fpirhc[outside]")
     task = fp.load_problem("mujoco_arm")
     one = asked(task.problem, task.controllers["RHC+FPI"], "gain admissible")
     assert one.verdict == "unknown"
