@@ -114,7 +114,7 @@ def test_the_lengths_of_all_values_explain_where_they_begin(name, monkeypatch):
     ("states", "most"), [({}, 6050), ({"q1": (1.85, 2.35)}, 11_200)], ids=["plain", "state limits"]
 )
 def test_a_step_behind_its_gate_touches_no_more_than_it_says(states, most, tmp_path):
-    """10 254 and 16 094 doubles before, and 16.9 and 38.8 kB of stack, now 2.5 kB at most in one function.
+    """10 254 and 16 094 doubles before, and 16.7 and 34.3 kB of stack, now 2.5 kB at most in one function.
 
     In no branch of the gate is something written behind the end, or overwritten.
     """

@@ -164,7 +164,8 @@ static pair reduced(double x, int* quarter) {
     for (k = 0; k < 4; ++k) p = sum(r.high, -(n * TURN[k])), r.low += p.low, r.high = p.high;
     r = sum(r.high, r.low);
   }
-  n = whole(r.high * 0.63661977236758138), *quarter = (int)((long long)n & 3);
+  n = whole(r.high * 0.63661977236758138), *quarter = (int)n & 3; /* below 2^20 */
+  if (n == 0) return r;
   for (k = 0; k < 4; ++k) p = sum(r.high, -(n * TURN[k])), r.low += p.low, r.high = p.high;
   return sum(r.high, r.low);
 }
