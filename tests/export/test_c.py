@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import re
 import subprocess
 from dataclasses import replace
 from functools import cache
@@ -293,6 +294,15 @@ def test_header_and_layout_have_the_names_and_units(tmp_path):
     text = "".join(path.read_text() for path in tmp_path.glob("arm*.c"))
     for word in ("malloc", "stdio", "__builtin_cpu_supports", "CASADI_SYMBOL_EXPORT"):
         assert word not in text
+
+
+@pytest.mark.parametrize("libm", ["system", "own"])
+def test_the_cmake_file_names_files_that_are_there(libm):
+    """A name of another file stops the very first command of the page."""
+    problem, controllers = two_mass()
+    files = target_called("c").files(device_of(problem, controllers["CTC"], "CTC", cycles=1, libm=libm))
+    named = re.findall(r"\S+\.c\b", str(files["CMakeLists.txt"]))
+    assert set(named) == {name for name in files if name.endswith(".c")}
 
 
 def test_names_in_c():
