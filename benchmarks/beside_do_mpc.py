@@ -14,11 +14,9 @@ from __future__ import annotations
 
 import itertools
 import sys
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ import fpirhc as fp
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+from beside import Step, flown, ours  # noqa: E402
 from table import write_table  # noqa: E402
 
 from tests.abroad import cstr  # noqa: E402
@@ -109,9 +108,6 @@ class Reactor:
         return np.asarray(self._simulator.make_step(np.asarray(command, float).reshape(-1, 1))).ravel()
 
 
-Step = Callable[[float, np.ndarray], np.ndarray]  # time, h, and measured state -> command
-
-
 @dataclass(frozen=True)
 class Score:
     """What a run is judged by: rms of C_b - 0.6 in the second half, mol/l; largest T_R, C; median time of a command, ms."""
@@ -123,17 +119,9 @@ class Score:
 
 def score(step: Step, body: Reactor) -> Score:
     """The loop of do-mpc's example: measure, command, move."""
-    x = body.reset(0)
-    states, seconds = [], []
-    for k in range(CYCLES):
-        states.append(x)
-        begun = time.perf_counter()
-        command = step(k * cstr.PERIOD, x)
-        seconds.append(time.perf_counter() - begun)
-        x = body.step(k * cstr.PERIOD, command)
-    run = np.array(states)
-    error = float(np.sqrt(np.mean((run[SETTLED:, 1] - 0.6) ** 2)))
-    return Score(error, float(run[:, 2].max()), 1e3 * float(np.median(seconds)))
+    states, _, milliseconds = flown(step, body.reset(0), lambda _, u: body.step(0.0, u), cstr.PERIOD, CYCLES)
+    error = float(np.sqrt(np.mean((states[SETTLED:-1, 1] - 0.6) ** 2)))
+    return Score(error, float(states[:-1, 2].max()), milliseconds)
 
 
 def theirs(controller: Any) -> Step:
@@ -142,22 +130,6 @@ def theirs(controller: Any) -> Step:
     controller.x0 = np.array(START)
     controller.set_initial_guess()
     return lambda _, x: controller.make_step(x.reshape(-1, 1))
-
-
-def ours(controller: fp.Controller, alpha: float, beta: float) -> Step:
-    """The controller's own step; the true values are for the controller that knows them."""
-    task = problem(alpha, beta)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fp.HarmfulAdaptation)  # the table shows it
-        stepper = fp.Stepper(task, controller)
-    memory = stepper.start()
-
-    def step(now: float, x: np.ndarray) -> np.ndarray:
-        nonlocal memory
-        command, memory = stepper.step_measured(now, x, memory)
-        return command
-
-    return step
 
 
 def problem(alpha: float, beta: float) -> fp.Problem:
@@ -199,7 +171,7 @@ def main() -> None:
         "do-mpc": lambda *_: theirs(mpc(do_mpc, model, nominal)),
         "do-mpc, robust over the nine pairs": lambda *_: theirs(mpc(do_mpc, model, robust)),
         "do-mpc, knows the values": lambda *pair: theirs(mpc(do_mpc, model, [pair])),
-        **{f"fpirhc, {name}": partial(ours, one) for name, one in OURS.items()},
+        **{f"fpirhc, {n}": lambda *pair, one=one: ours(problem(*pair), one) for n, one in OURS.items()},
     }
     scores = {
         name: [score(make(*pair), Reactor(do_mpc, model, *pair)) for pair in robust] for name, make in makers.items()
