@@ -103,8 +103,10 @@ def test_a_decaying_mode_of_the_zero_dynamics_takes_the_pole_beside_it(share, le
     rate = -2.0
     exact = math.exp(rate * PERIOD)
     pole = exact + share * _NEAR * (1 - exact)
-    both = linear(np.diag([pole, 0.5]), np.eye(2), np.eye(2), np.arange(2), PERIOD)
+    both, turned = (linear(np.diag(d), np.eye(2), np.eye(2), np.arange(2), PERIOD) for d in ([pole, 0.5], [0.5, pole]))
     assert _without(both, np.array([rate])) == pytest.approx(pole if left is None else left)
+    assert _without(turned, np.array([rate])) == pytest.approx(pole if left is None else left)
+    assert _without(loop(exact), np.array([rate])) == 0.0
     assert _without(both, np.array([-rate])) == pytest.approx(max(pole, 0.5))
     assert _without(loop(1.0), np.array([-1e-9])) == 1.0
 
