@@ -127,10 +127,9 @@ def _widest(
     nominal: NominalRun, adapted: ResponseErrors, mismatch: float | None, seed: int
 ) -> tuple[np.ndarray | None, str]:
     gain = nominal.controller.deformation.effective_gain()
-    grid = review_grid(nominal.problem, 0.0, 0)
-    loops = own_loops(grid, nominal.controller)
     if not np.isfinite(adapted.error).all():
         return None, "no tube: the predicted response errors do not stay finite"
+    loops = own_loops(review_grid(nominal.problem, 0.0, 0), nominal.controller)
     if loops.loops and loops.radii.max() >= 1:
         return None, f"no tube: the loop with its deformation does not converge, {loops.radii.max():.6g} per cycle"
     try:

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
-from fpirhc.review.questions.margins import LEAST_GAIN, LEAST_PHASE, _turning, keeps_margins, margins
+from fpirhc.review.questions.margins import (
+    _DECADES,
+    _STEPS,
+    LEAST_GAIN,
+    LEAST_PHASE,
+    _first,
+    _turning,
+    keeps_margins,
+    margins,
+)
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
 
@@ -60,3 +71,37 @@ def test_margins_are_sought_no_farther_than_to_the_first_pole_outside(monkeypatc
     sizes.clear()
     assert not keeps_margins(one, 0)
     assert sum(sizes) <= 3  # its own poles, those of no change and of the first step
+
+
+def test_a_smaller_command_is_tried_no_farther_than_a_larger_one_and_the_margin_is_the_smaller_of_both():
+    """Whichever way the margin is, it is that of two whole searches."""
+    ways = set()
+    for seed in range(30):
+        one = loop(seed, 3)
+        poles = _turning(one, 0)
+        up, (down, _) = _first(partial(scaled, poles, 1), _DECADES), searched(poles, np.inf)
+        shorter, farthest = searched(poles, up)
+        assert margins(one, 0)[0] == np.exp(min(up, down)) == np.exp(min(up, shorter))
+        assert farthest <= min(up, _DECADES) + _DECADES / _STEPS
+        ways.add(up < down)
+    assert ways == {True, False}
+
+
+def test_a_pole_that_leaves_just_before_the_end_of_a_search_is_found():
+    assert _first(lambda x: x[:, None] / 2.02, 3.0, 2.03) == pytest.approx(2.02)
+
+
+def scaled(poles, sign, x):
+    """The poles with a command that is multiplied by exp(sign x)."""
+    return poles(np.exp(sign * x))
+
+
+def searched(poles, enough):
+    """The logarithm of the factor downwards, and the largest one that was tried."""
+    tried = [0.0]
+
+    def noted(x):
+        tried.extend(x)
+        return scaled(poles, -1, x)
+
+    return _first(noted, _DECADES, enough), max(tried)

@@ -207,7 +207,7 @@ def _of_a_period(loop: LinearLoop, place: int) -> tuple[float, float, float]:
     """
     turned = _turning(loop, place)
     up = _first(lambda x: turned(np.exp(x)), _DECADES)
-    down = _first(lambda x: turned(np.exp(-x)), _DECADES)
+    down = _first(lambda x: turned(np.exp(-x)), _DECADES, up)
     angle = _first(lambda x: turned(np.exp(-1j * x)), math.pi)
     poles = turned(np.exp([-1j * angle]))[0] if math.isfinite(angle) else np.ones(1)
     turns = np.angle(poles[np.abs(np.abs(poles) - 1) < 1e-3])
@@ -244,13 +244,17 @@ def _turning(loop: LinearLoop, place: int) -> Callable[[np.ndarray], np.ndarray]
     return poles_of
 
 
-def _first(poles: Callable[[np.ndarray], np.ndarray], most: float) -> float:
-    """The smallest argument up to `most` where a pole leaves the unit circle; infinite where none does."""
+def _first(poles: Callable[[np.ndarray], np.ndarray], most: float, enough: float = math.inf) -> float:
+    """The smallest argument up to `most` where a pole leaves the unit circle; infinite where none does.
+
+    No step beyond `enough` is looked at.
+    """
 
     def outside(x: np.ndarray) -> np.ndarray:
         return np.asarray(np.abs(poles(x)).max(axis=1, initial=0.0)) - 1
 
     steps, values = np.linspace(0, most, _STEPS + 1), np.empty(0)
+    steps = steps[: np.searchsorted(steps, enough) + 1]
     while len(values) < len(steps):
         values = np.append(values, outside(steps[len(values) : len(values) + _TOGETHER]))
         beyond = np.flatnonzero(values >= 0)
