@@ -10,7 +10,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.contract import named_in_task
-from fpirhc.errors import FpirhcError, InvalidShape, InvalidValue
+from fpirhc.errors import FpirhcError, InvalidShape
 from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 
@@ -107,24 +107,6 @@ def test_a_wrong_argument_is_refused_and_the_stepper_stays_usable(wrong):
         one.step(wrong[0], wrong[1], wrong[2], one.start())
     np.testing.assert_array_equal(one.step(*SAMPLE, one.start())[0], expected)
     one.trace()
-
-
-def test_other_forms_of_numbers_are_the_same():
-    """Lists, rows of 32 bits and whole numbers, by way of the same step."""
-    one = plain()
-    expected = one.step(0.0, np.array([1.0, 2.0]), np.array([3.0]), one.start())[0]
-    for state, realised in (([1, 2], [3]), (np.array([1, 2]), np.array([3.0], dtype=np.float32))):
-        np.testing.assert_array_equal(one.step(0, state, realised, list(one.start()))[0], expected)  # type: ignore[arg-type]
-
-
-def test_the_memory_of_another_controller_is_refused():
-    """Also where it has the same size."""
-    one, other = plain(), stepper(controller=fp.ComputedTorque(fp.Exponential(rate=5.0), fp.Affine(gain=-0.6)))
-    assert one.memory.size == other.memory.size
-    with pytest.raises(InvalidValue, match="memory"):
-        one.step(*SAMPLE, other.start())
-    with pytest.raises(InvalidShape):
-        one.step(*SAMPLE, np.zeros(one.memory.size - 1))
 
 
 def test_a_solver_that_fails_holds_the_command():

@@ -29,7 +29,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -367,8 +367,8 @@ def output_ahead(plant: Plant) -> ca.Function:
 
 def other_predictions(controller: Controller) -> dict[str, Controller]:
     """Return the controller with the other predictors that its own one names, by their texts; none where nothing predicts."""
-    around: Any = controller
-    if isinstance(getattr(around, "by", None), Predictor):
+    if isinstance(getattr(controller, "by", None), Predictor):
+        around = cast(Predicted, controller)  # or what has its fields
         return {str(other): replace(around, by=other) for other in around.by.others(around.inputs + around.measurement)}
     if controller.inner is None:
         return {}
