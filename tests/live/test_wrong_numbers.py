@@ -122,9 +122,12 @@ def test_right_numbers_of_every_kind_are_taken(stepper):
         stepper.set_reference({"q1": [0.1, 0.2]})
 
 
-@pytest.mark.parametrize("time", [np.timedelta64(1, "s"), np.datetime64("2020-01-01"), "0", None, HUGE, [0.0], 1j])
+NO_TIMES = [np.timedelta64(1, "s"), np.datetime64("2020-01-01"), "0", None, HUGE, [0.0], 1j, True, np.bool_(0)]
+
+
+@pytest.mark.parametrize("time", NO_TIMES, ids=lambda v: repr(v)[:20])
 def test_what_is_no_time_is_named(time, stepper):
-    """Also in the time stamp of a sample."""
+    """Also numpy's truth values, which are numbers to an assignment."""
     with pytest.raises(InvalidValue, match="'time' must be a number of seconds, got"):
         stepper.step(time, *sample(stepper)[1:])
 

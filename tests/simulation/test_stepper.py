@@ -217,8 +217,6 @@ def misuses(memory: np.ndarray) -> dict[str, tuple[type[FpirhcError], str, tuple
         "ragged": (InvalidValue, "'state' is not made of numbers", (0.0, [[1.0], [1.0, 2.0]], r, memory)),
         "complex": (InvalidValue, "real numbers", (0.0, x + 0j, r, memory)),
         "dictionary": (InvalidValue, "'state' is not made of numbers", (0.0, {"a": 1.0}, r, memory)),
-        "text as time": (InvalidValue, "'time' must be a number of seconds", ("0", x, r, memory)),
-        "no time": (InvalidValue, "'time' must be a number of seconds", (None, x, r, memory)),
         "short memory": (InvalidShape, "'memory' has", (0.0, x, r, memory[:-1])),
         "memory of another": (InvalidValue, "not this controller's", (0.0, x, r, memory + 1)),
     }
