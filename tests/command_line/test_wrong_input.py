@@ -80,7 +80,7 @@ ROWS = {
     ),
     "fpirhc export two_mass RHC --to matlab --out o": (
         2,
-        "the target 'matlab' is unknown. Valid: c, cortex-m, fmu, fmu2, library, ",
+        "the target 'matlab' is unknown. Valid: arduino, c, cortex-m, fmu, fmu2, library, ",
     ),
     "fpirhc export two_mass CTC --out o --name int": (
         2,
