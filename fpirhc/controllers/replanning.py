@@ -8,7 +8,8 @@ the response error goes to zero the plant becomes the model for the optimiser, s
 tracking law keeps the plant on it. The law corrects errors within a stage; the tracking error is forgotten at every new plan.
 
 `FromPlan` -- the plan starts from the model's own propagated state and is independent of the measured one; a tracking law keeps
-the plant on the planned motion. The plant cannot destabilise the optimiser, but limits bind the model's motion, not the plant's.
+the plant on the planned motion. Limits bind the model's motion, not the plant's. A deformation still shifts the limits of the
+planned inputs by its last change of the command, so with one the plans are not the same for every plant.
 """
 
 from __future__ import annotations

@@ -112,12 +112,33 @@ def test_lost_samples_are_limited_by_the_held_command(share):
     )
 
 
-@pytest.mark.parametrize("controller", [LAW, ADAPTIVE])
-def test_limits_agree_with_the_margins_of_the_review(controller):
+def moved_by_force(response) -> fp.Problem:
+    """A body of order two, led from 5 cm or 0.05 rad to rest at zero."""
+    gain = fp.Parameter(1.0, 1.0, "1", bounds=(1e-6, 1e6))
+    return replace(pump(), plant=fp.Plant({"y": "1"}, {"u": "1"}, {"b": gain}, response), start={"y": 0.05})
+
+
+def trolley() -> fp.Problem:
+    """Y'' = b u."""
+    return moved_by_force(lambda q, v, u, p: {"y": p.b * u.u})
+
+
+def pendulum() -> fp.Problem:
+    """Y'' = b u - 9.81 sin y - 0.2 y', which hangs."""
+    return moved_by_force(lambda q, v, u, p: {"y": p.b * u.u - 9.81 * ca.sin(q.y) - 0.2 * v.y})
+
+
+@pytest.mark.parametrize(
+    ("problem", "controller"),
+    [(pump, LAW), (pump, ADAPTIVE), (trolley, LAW), (trolley, ADAPTIVE), (pendulum, ADAPTIVE)],
+)
+def test_limits_agree_with_the_margins_of_the_review(problem, controller):
     """One input, one gain: the factor of the plant's gain and the latency at which runs fail are the margins within 10 %."""
-    answers = review(pump(), {"law": controller}, mismatch=0.0, seed=0).controllers["law"]
-    [numbers] = [one.numbers for one in answers if "delay_margin" in one.numbers]
-    gain, late = limit_of("b", "b up", controller), limit_of("latency", controller=controller)
+    one = problem()
+    answers = review(one, {"law": controller}, mismatch=0.0, seed=0).controllers["law"]
+    [numbers] = [answer.numbers for answer in answers if "delay_margin" in answer.numbers]
+    gain = limit_of("b", "b up", controller, problem=one)
+    late = limit_of("latency", controller=controller, problem=one)
     assert near(gain, numbers["gain_margin"], 0.1)
     assert late.holds * 0.9 <= numbers["delay_margin"] <= late.fails * 1.1
 
