@@ -244,18 +244,19 @@ def ideal_places(grid: ReviewGrid, believed: np.ndarray, count: int) -> list[int
     Raises:
         NotSupported: there is none.
     """
-    needed = grid.needed(believed)
-    finite = [k for k in range(len(grid.times)) if np.isfinite(needed[k]).all()]
-    if not finite:
-        raise NotSupported("the model's inverse does not exist along the reference")
-    return thinned(finite, count)
+    return thinned(_finite(grid.needed(believed), "model's inverse"), count)
 
 
 def usable(grid: ReviewGrid) -> list[int]:
     """Return the points of the reference whose command is finite."""
-    finite = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
+    return _finite(grid.commands[0], "inverse")
+
+
+def _finite(commands: np.ndarray, inverse: str) -> list[int]:
+    """Points whose command is finite; raises where there is none."""
+    finite = [k for k, command in enumerate(commands) if np.isfinite(command).all()]
     if not finite:
-        raise NotSupported("the inverse does not exist along the reference")
+        raise NotSupported(f"the {inverse} does not exist along the reference")
     return finite
 
 

@@ -64,8 +64,7 @@ class Step:
             self._slopes = Evaluator(_derivative(self.loop.function))
         size, nu = memory.size, self._evaluator.arguments[1].size
         slopes = self._slopes(memory, np.zeros(nu))
-        if not all(np.isfinite(m).all() for m in slopes):
-            raise NotSupported("the loop has no finite slope at a point of its run")
+        _finite(*slopes)
         by_memory, by_input = (m.reshape(columns, -1).T for m, columns in zip(slopes, (size, nu), strict=True))
 
         def move(deviations: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -84,8 +83,7 @@ class Step:
             ahead, behind = self._each(memory + by_memory, by_input), self._each(memory - by_memory, -by_input)
             moved[:, some] = ((ahead[0] - behind[0]) / (2 * h * scales)).T
             traces[:, some] = ((ahead[1] - behind[1]) / (2 * h)).T
-            if not np.isfinite(moved).all():
-                raise NotSupported("the loop has no finite slope at a point of its run")
+            _finite(moved)
             return np.where(np.abs(moved) > _ROUNDING * sizes, moved, 0.0), traces
 
         return move
@@ -239,3 +237,9 @@ def _derivative(function: ca.Function) -> ca.Function:
     rest = [ca.DM.zeros(*function.size_in(k)) for k in range(2, function.n_in())]
     results = ca.vertcat(*function(z, w, *rest))
     return ca.Function("fpirhc_loop_slopes", [z, w], [ca.densify(ca.jacobian(results, v)) for v in (z, w)])
+
+
+def _finite(*slopes: np.ndarray) -> None:
+    """Raise if a slope is not finite."""
+    if not all(np.isfinite(m).all() for m in slopes):
+        raise NotSupported("the loop has no finite slope at a point of its run")
