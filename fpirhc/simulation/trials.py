@@ -70,7 +70,7 @@ class Trials:
         """
         self.problem = shortened(problem, cycles)
         end = min(problem.duration, problem.measure_from + cycles * problem.period)
-        later = goes_on and 2 * problem.measure_from > cycles * problem.period and problem.foreign is None
+        later = goes_on and 2 * problem.measure_from > cycles * problem.period
         self._later = replace(problem, duration=end) if later else None
         self._model = ModelAsPlant(self.problem, seed=0)
         self._bare = loop_of(self.problem, bare)
