@@ -79,7 +79,9 @@ def plain_step(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:
     """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
     name = "fpirhc_fixed_point_converging" if settings.converging else "fpirhc_fixed_point"
     driver = plain_driver(ocp, settings)
-    library = native(_outline(ocp, registered(name, driver))) if plans_are_compiled() else None
+    # A plan that converges is the first one of a run: the virtual machine solves it in less time than a compiler takes.
+    compiles = plans_are_compiled() and not settings.converging
+    library = native(_outline(ocp, registered(name, driver))) if compiles else None
     if library is not None and library.compiled:
         return library.function
     return with_driver(name, driver, lambda unique: plain_graph(ocp, settings, unique))

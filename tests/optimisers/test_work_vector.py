@@ -6,6 +6,7 @@ import ctypes
 import re
 import subprocess
 from dataclasses import replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.controllers.base import compose_controller
 from fpirhc.symbolic import driver
-from fpirhc.symbolic.driver import with_less_work
+from fpirhc.symbolic.driver import compiled_plans, with_less_work
 from fpirhc.symbolic.native import find_compiler, generate
 
 REAL = ctypes.POINTER(ctypes.c_double)
@@ -149,3 +150,20 @@ def test_a_step_behind_its_gate_touches_no_more_than_it_says(states, most, tmp_p
         np.testing.assert_array_equal(results[0], memory)
         np.testing.assert_array_equal(results[2], command)
         values[0][:] = results[0]
+
+
+def test_the_first_plan_of_a_run_is_not_compiled(monkeypatch):
+    """It is solved once: a compiler would take longer than the virtual machine. The plans of the run are compiled."""
+    sought: list[str] = []
+
+    def native(function):
+        sought.append(function.name())
+        return SimpleNamespace(compiled=False)
+
+    monkeypatch.setattr("fpirhc.optimisers.plain.native", native)
+    task = fp.load_problem("van_der_pol")
+    problem = replace(task.problem, duration=10 * task.problem.period, measure_from=0.0)
+    with compiled_plans():
+        fp.simulate(problem, task.controllers["RHC"], seed=0, compiled=False)
+    assert sought
+    assert not [name for name in sought if "converging" in name]
