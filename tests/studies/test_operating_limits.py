@@ -130,7 +130,7 @@ def pendulum() -> fp.Problem:
 
 @pytest.mark.parametrize(
     ("problem", "controller"),
-    [(pump, LAW), (pump, ADAPTIVE), (trolley, LAW), (trolley, ADAPTIVE), (pendulum, ADAPTIVE)],
+    [(pump, LAW), (pump, ADAPTIVE), (trolley, LAW), (trolley, ADAPTIVE), (pendulum, LAW), (pendulum, ADAPTIVE)],
 )
 def test_limits_agree_with_the_margins_of_the_review(problem, controller):
     """One input, one gain: the factor of the plant's gain and the latency at which runs fail are the margins within 10 %."""

@@ -30,6 +30,7 @@ LEAST_PHASE = 25.0  # degrees
 _LARGEST = 400  # states of a loop whose margins are computed
 _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
+_REAL = 1e-2  # share of an imaginary part with which L is real at rest; one that is large there has an integrator
 _DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
 _STEPS, _TOGETHER = 60, 5
 _ITERATIONS = 60  # of a root
@@ -125,8 +126,9 @@ def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
     opened = _response(loop, place)
     values = opened(frequencies)
     turned = opened(_roots(lambda w: opened(w).imag, frequencies[:-1], values[:-1].imag))
-    # At the Nyquist frequency, where most sampled loops leave the unit circle, L is real and crosses no phase.
-    gains = [-1 / value.real for value in (*turned, values[-1]) if value.real < 0]
+    # At rest and at the Nyquist frequency, where most sampled loops leave the unit circle, L is real and crosses no phase.
+    ends = values[[0, -1]] if abs(values[0].imag) < _REAL * abs(values[0]) < 1 else values[-1:]
+    gains = [-1 / value.real for value in (*turned, *ends) if value.real < 0]
     factors = [max(gain, 1 / gain) for gain in gains]
     crossings = _roots(lambda w: np.abs(opened(w)) - 1, frequencies, np.abs(values) - 1)
     phases = np.angle(-opened(crossings))
