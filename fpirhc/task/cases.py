@@ -351,8 +351,9 @@ def _read(make: Callable[..., Cases], path: Path) -> Cases:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InvalidProblem(f"cases: cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
     mistakes = Mistakes(path.name)
-    head = [cell.strip() for cell in lines[0][1]] if lines else []
-    _check_head(head, mistakes)
+    first, cells_of_head = lines[0] if lines else (1, [])
+    head = [cell.strip() for cell in cells_of_head]
+    _check_head(f"row {first}", head, mistakes)
     changes: dict[str, dict[str, object]] = {}
     places: dict[str, str] = {}
     for number, row in lines[1:]:
@@ -375,16 +376,16 @@ def _read(make: Callable[..., Cases], path: Path) -> Cases:
     return make(changes, places=places)
 
 
-def _check_head(head: Sequence[str], mistakes: Mistakes) -> None:
+def _check_head(row: str, head: Sequence[str], mistakes: Mistakes) -> None:
     if _CASE not in head:
         apart = "; columns are separated by commas" if head and ";" in head[0] else ""
-        mistakes.add(f"row 1: there is no column '{_CASE}' with the names of the cases{apart}.{nearest(_CASE, head)}")
+        mistakes.add(f"{row}: there is no column '{_CASE}' with the names of the cases{apart}.{nearest(_CASE, head)}")
     for column in dict.fromkeys(head):
         if not column or head.count(column) > 1:
             mistakes.add(
-                f"row 1: column '{column}' stands {head.count(column)} times"
+                f"{row}: column '{column}' stands {head.count(column)} times"
                 if column
-                else "row 1: a column has no name"
+                else f"{row}: a column has no name"
             )
     mistakes.raise_if_any()
 

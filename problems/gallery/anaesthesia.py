@@ -71,10 +71,10 @@ plant = fp.Plant.of_states(
     outputs={"bis": fp.Output("1", bis)},
     time_unit="min",
     parameters={
-        "ke0": fp.Parameter(approximate=0.309, exact=0.1898, unit="1/min"),
-        "E0": fp.Parameter(approximate=92.0, exact=92.96, unit="1"),
-        "C50": fp.Parameter(approximate=4.53, exact=4.138, unit="mg/l"),
-        "steepness": fp.Parameter(approximate=1.57, exact=1.358, unit="1"),
+        "ke0": fp.Parameter(approximate=0.309, exact=0.1898, unit="1/min", bounds=(0.01, 10.0)),
+        "E0": fp.Parameter(approximate=92.0, exact=92.96, unit="1", bounds=(50.0, 100.0)),
+        "C50": fp.Parameter(approximate=4.53, exact=4.138, unit="mg/l", bounds=(0.5, 20.0)),
+        "steepness": fp.Parameter(approximate=1.57, exact=1.358, unit="1", bounds=(0.5, 10.0)),
     },
 )
 

@@ -436,3 +436,35 @@ def test_wrong_requests(task):
 def test_wrong_commands(options, message, task, capsys):
     assert main(["compare", "line.py", *options]) == ExitCode.BAD_INPUT
     assert message in capsys.readouterr().err
+
+
+# --- The shipped table of patients ------------------------------------------------------------------------------------
+
+FIRST_CURVE = "patient 01,elderly,2.367,91.1,6.722,1.793"
+WRONG_PATIENTS = {
+    "a misspelt column": (
+        "exact.C50",
+        "exact.EC50",
+        r"column 'exact\.EC50': .* Did you mean 'C50'\? Valid: ke0, E0, C50",
+    ),
+    "no column of names": ("case,group", "group", r"row 3: there is no column 'case'"),
+    "a cell too few": (FIRST_CURVE, FIRST_CURVE.replace("91.1,", ""), "row 4: it has 5 cells, expected 6"),
+    "a negative concentration": (
+        "6.722",
+        "-6.722",
+        r"row 4 \(patient 01\), column 'exact\.C50': expected 0\.5 to 20 mg/l, got -6\.722",
+    ),
+    "a word": ("6.722", "unknown", r"row 4 \(patient 01\), column 'exact\.C50': expected a number, .* got 'unknown'"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_PATIENTS)
+def test_wrong_patients(wrong, tmp_path):
+    """A curve that no patient can have is refused before a run: its row, its column, and what was expected."""
+    patients = Path(fp.__file__).parents[1] / "problems" / "gallery" / "anaesthesia_patients.csv"
+    right, other, message = WRONG_PATIENTS[wrong]
+    text = patients.read_text()
+    assert right in text
+    (tmp_path / "cases.csv").write_text(text.replace(right, other, 1))
+    with pytest.raises(InvalidProblem, match=message):
+        fp.Cases.from_csv(tmp_path / "cases.csv").check(fp.load_problem("anaesthesia").problem)
