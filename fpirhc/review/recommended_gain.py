@@ -197,13 +197,14 @@ def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended
     advice = recommended_gain(deformation, report, share, case.by_gain)
     if advice.why_not:
         return advice
+    size, limit = (value / _own_per_effective(deformation) for value in (advice.value, advice.limit))
+    if null is not None and null.verdict == Verdict.NO and abs(deformation.effective_gain()) >= abs(limit):
+        null = leaves_right_model_alone(_case_with(case, size))
     if null is not None and null.verdict == Verdict.NO:
         against = "adaptation does not leave a right model alone"
     elif case.grid.outside:
         against = OUTSIDE
     else:
-        own = getattr(deformation, deformation.gain_name, None)
-        size = advice.value if own is None else advice.value / float(own) * deformation.effective_gain()
         harm = case.harm(deformation.with_effective_gain(size))
         against = f"with {advice.value:.3g}, half of it, {harm}" if harm else ""
     return replace(advice, value=math.nan, why_not=against) if against else advice
