@@ -149,13 +149,36 @@ def test_the_range_along_the_reference_is_told(grid):
 
 
 OUTER = "The outer loop does not converge even with the right model: lower its rate, or predict over the dead time."
-OWN = "See the question about the gain; under dead time pair the deformation."
+OWN = "See the questions about the gain, the form and the tracking law."
 
 
 @pytest.mark.parametrize(("ideal", "change"), [(1.0, OUTER), (0.999, OWN), (None, OWN)])
 def test_the_fault_of_an_outer_loop_is_not_the_gains(grid, ideal, change):
     """A loop that does not converge with the right model needs another rate, and no other gain."""
     assert convergence(grid, loops(2.0, ideal=ideal)).change == change
+
+
+@pytest.mark.parametrize(
+    ("deformation", "change"),
+    [
+        (fp.Affine(-0.5), "Pair the deformation through the dead time, and see the question about the gain."),
+        (fp.Paired(fp.Affine(-0.5), cycles=3), OWN),
+    ],
+)
+def test_only_the_plain_form_behind_a_dead_time_is_told_to_pair(deformation, change):
+    """One that is paired has other cures: a leak, the model-referenced form, another gain."""
+    late = review_grid(mass(dead_time=fp.DeadTime(inputs={"u": 3 * PERIOD})), 0.0, 0)
+    assert convergence(late, loops(2.0), deformation).change == change
+
+
+def test_a_box_around_a_loop_that_diverges_is_not_told_to_shrink(grid, monkeypatch):
+    """The cure is that of the loop with the exact parameters; where that one converges, the box is too wide for the gain."""
+    monkeypatch.setattr("fpirhc.review.questions.convergence.loops_over_box", lambda *_: (loop(1.25),))
+    cases: list[Any] = [SimpleNamespace(grid=grid, controller=None, loops=loops(r)) for r in (1.25, 0.5)]
+    assert [box_converges(one).change for one in cases] == [
+        "It does not converge along the reference either: see there.",
+        "Lower the gain, or narrow the box of the parameters.",
+    ]
 
 
 @pytest.mark.parametrize(

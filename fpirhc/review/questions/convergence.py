@@ -22,6 +22,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict, duration, per_cycle
 from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.late import is_late
 from fpirhc.review.loops import Loops, is_planned, loops_over_box
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.zero_dynamics import of_zero_dynamics, zero_dynamics_modes
@@ -94,7 +95,11 @@ def box_converges(case: Case) -> Answer:
     numbers = {"share": share, "radius": worst}
     if share == 1:
         return Answer(BOX, Verdict.YES, text, "", numbers)
-    change = _OF_THE_PLANT if of_zero_dynamics(grid, worst) else "Lower the gain, or narrow the box of the parameters."
+    change = "Lower the gain, or narrow the box of the parameters."
+    if of_zero_dynamics(grid, worst):
+        change = _OF_THE_PLANT
+    elif own.radii.min() >= 1:
+        change = "It does not converge along the reference either: see there."
     return Answer(BOX, Verdict.UNKNOWN, text, change, numbers)
 
 
@@ -120,7 +125,10 @@ def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
         stiff = stiff_advice(grid, believed, planned=is_planned(controller)) if advised else ""
         outer = "The outer loop does not converge even with the right model"
         return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
-    return "See the question about the gain; under dead time pair the deformation."
+    iteration = controller.deformation.iteration
+    if is_late(grid.problem) and iteration.slows_desired and iteration.pairing is None:
+        return "Pair the deformation through the dead time, and see the question about the gain."
+    return "See the questions about the gain, the form and the tracking law."
 
 
 def _own_radii(grid: ReviewGrid, loops: Loops) -> tuple[np.ndarray, bool]:

@@ -44,7 +44,7 @@ def pays(case: Case) -> Answer:
     if case.loops.loops and case.loops.radii.min() >= 1 and not case.loops.learns:
         change = "The prediction leaves the outer loop out, and this one does not converge: see the convergence."
         return Answer(PAYS, Verdict.NO, f"{text}, but errors grow in every cycle", change, numbers)
-    if max(without, adapted) <= ROUNDING * nominal_size(nominal):
+    if max(without, adapted) <= ROUNDING * nominal_size(nominal) and not case.grid.elsewhere:
         return Answer(PAYS, Verdict.UNKNOWN, f"{text}: there is no error to lower", "", numbers)
     if not adapted < without:
         return _no_gain(text, numbers, elsewhere=case.grid.elsewhere)

@@ -84,8 +84,10 @@ def bears_lag(case: Case) -> Answer | None:
     (rate, poles), product = law, _products(case)[1]
     longest = bearable_lag(product, period, rate, poles, damping=_DAMPING)
     limit = 1 / (poles * rate)
+    size = f"{longest / period:.3g}"
+    cycles = f"{size} cycle{'s' * (size != '1')}"
     text = (
-        f"up to {longest:.3g} {unit} ({longest / period:.3g} cycles) of an actuator or a sensor with damping {_DAMPING:g}; beyond "
+        f"up to {longest:.3g} {unit} ({cycles}) of an actuator or a sensor with damping {_DAMPING:g}; beyond "
         f"{limit:.3g} {unit} a fast iteration is unstable at any gain"
     )
     numbers = {"lag": longest, "limit": limit}
