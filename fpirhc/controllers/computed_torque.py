@@ -30,7 +30,6 @@ class ComputedTorque(Controller):
     deformation: Deformation = field(default_factory=Identity)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update."""
         return tracked_blocks(problem, self.tracking, self.deformation)
 
 

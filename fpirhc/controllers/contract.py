@@ -194,7 +194,6 @@ class Controller(Checked, ABC):
         inner = None
 
     def _lacks(self) -> Iterator[str]:
-        """Yield what a controller must have and this one has not: its deformation; what it wraps, by name."""
         name, inner = type(self).__name__, self.inner
         if inner is not None and not isinstance(inner, Controller):
             yield f"{name}: `inner` is the controller that it wraps, or None, got {described(inner)}"

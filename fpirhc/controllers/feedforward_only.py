@@ -47,7 +47,6 @@ class FeedforwardOnly(Undeformed):
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, feedforward, limit, judge, running."""
         closing, delays = commanding_blocks(problem, [scalar(_SEEN)])
         return [reference_block(problem), self._block(problem), *closing], delays
 

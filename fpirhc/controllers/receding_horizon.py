@@ -96,7 +96,6 @@ class HoldPlan(OnFailure):
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
-        """Return the plan that the optimiser returns."""
         del feedforward
         return planned, ca.if_else(failed, int(Status.HELD), status)
 
@@ -107,13 +106,11 @@ class Feedforward(OnFailure):
 
     @property
     def uses_feedforward(self) -> bool:
-        """Whether the feedforward is applied: it is."""
         return True
 
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
-        """Return the feedforward in place of the plan."""
         return ca.if_else(failed, feedforward, planned), ca.if_else(failed, int(Status.HELD), status)
 
 
@@ -123,13 +120,11 @@ class StopRun(OnFailure):
 
     @property
     def stops(self) -> bool:
-        """True: a failed solve ends the run."""
         return True
 
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
-        """Return NaN in place of the plan."""
         del feedforward
         return ca.if_else(failed, nan_where(failed), planned), status
 
@@ -163,7 +158,6 @@ class RecedingHorizon(Controller):
 
     @property
     def planner(self) -> Planner:
-        """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
         ways = self.replanning
         adapts = self.deformation.adapts
         consistent, follows = ways.consistent, self.follows_model
@@ -184,7 +178,6 @@ class RecedingHorizon(Controller):
         self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, plan (every n-th cycle), nominal, deform, invert, limit, judge, running, command shift."""
         problem = self.planner.planned(problem)
         assert problem.horizon is not None
         plant = problem.plant

@@ -78,16 +78,13 @@ class FromMeasurement(Replanning):
 
     @property
     def restarts(self) -> bool:
-        """True: every plan starts from the measured state."""
         return True
 
     @property
     def law(self) -> None:
-        """None: there is no tracking law."""
         return
 
     def parts(self, problem: Problem) -> Parts:
-        """Return the blocks plan_state before the plan and nominal after it."""
         plant = problem.plant
         start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
         response = without_disturbances(plant).equations.controlled_response
@@ -113,17 +110,13 @@ class FromMeasurementTracked(Replanning):
 
     @property
     def restarts(self) -> bool:
-        """True: every plan starts from the measured state."""
         return True
 
     @property
     def law(self) -> Tracking:
-        """The tracking law."""
         return self.tracking
 
     def parts(self, problem: Problem) -> Parts:
-        """Return the blocks of a tracked motion that begins at the measured state with every plan."""
-
         def start(s: Signals) -> dict[str, Expression]:
             fresh = ca.logic_or(s.warm_up < 0.5, s._due > 0.5)
             return {"_plan_state": s.state, "_target": ca.if_else(fresh, s.state, s._target_before)}
@@ -143,17 +136,13 @@ class FromPlan(Replanning):
 
     @property
     def restarts(self) -> bool:
-        """False: plans start from the model's own state."""
         return False
 
     @property
     def law(self) -> Tracking:
-        """The tracking law."""
         return self.tracking
 
     def parts(self, problem: Problem) -> Parts:
-        """Return the blocks of a tracked motion that begins at the measured state once, in the first cycle."""
-
         def start(s: Signals) -> dict[str, Expression]:
             target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)
             return {"_plan_state": target, "_target": target}

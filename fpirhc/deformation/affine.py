@@ -47,7 +47,6 @@ class Affine(Deformation):
         return self.effective_gain()
 
     def largest_step(self) -> float:
-        """Infinite: the map does not saturate."""
         return float("inf")
 
     def with_effective_gain(self, gain: float) -> Self:

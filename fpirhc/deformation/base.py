@@ -147,7 +147,6 @@ class Deformation(Checked, ABC):
         inner = None  # a plain attribute, so that a dataclass may have a field of this name
 
     def _lacks(self) -> Iterator[str]:
-        """Yield what a map must have and this one has not: what it wraps, by name."""
         if self.inner is not None and not isinstance(self.inner, Deformation):
             yield f"{type(self).__name__}: `inner` is the map that it is around, or None, got {described(self.inner)}"
         else:
@@ -321,23 +320,18 @@ class Wrapper(Deformation, ABC):
         return float(getattr(self.map, self.map.gain_name))
 
     def shown(self) -> Mapping[str, str]:
-        """The signals of the map."""
         return self.map.shown()
 
     def effective_gain(self) -> float:
-        """The effective gain of the map."""
         return self.map.effective_gain()
 
     def secant_gain(self) -> float:
-        """The secant gain of the map."""
         return self.map.secant_gain()
 
     def largest_step(self) -> float:
-        """The largest step of the map."""
         return self.map.largest_step()
 
     def with_effective_gain(self, gain: float) -> Self:
-        """Return the same wrapper around the map with that gain."""
         return replace(self, map=self.map.with_effective_gain(gain))
 
 

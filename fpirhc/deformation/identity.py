@@ -20,31 +20,25 @@ class Identity(Deformation):
 
     @property
     def adapts(self) -> bool:
-        """False: the response does not change the request."""
         return False
 
     @property
     def iteration(self) -> Iteration:
-        """None: the request is the desired response."""
         return Iteration(slows_desired=False)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the desired response."""
         del request, response, memory
         return desired, {}
 
     def effective_gain(self) -> float:
-        """Zero: the response does not change the request."""
         return 0.0
 
     def secant_gain(self) -> float:
-        """Zero: the response does not change the request."""
         return 0.0
 
     def largest_step(self) -> float:
-        """Infinite: the request jumps with the desired response."""
         return float("inf")
 
     def with_effective_gain(self, gain: float) -> Self:

@@ -81,7 +81,6 @@ class ModelReferenced(Wrapper):
 
     @property
     def mirror(self) -> Mirror:
-        """The believed dead times and lag between a command and its response."""
         return Mirror(self._cycles, self.measurement, self._lag, self.longest)
 
     def opened(self, paths: tuple[str, ...]) -> Self:
@@ -93,7 +92,6 @@ class ModelReferenced(Wrapper):
 
     @property
     def iteration(self) -> Iteration:
-        """That of the map, on deformations that leak and are paired; the desired response is added after it."""
         longest, several_channels = max(every(nominal(self._delays))), isinstance(self._cycles, tuple)
         return replace(
             self.map.iteration,
@@ -109,18 +107,15 @@ class ModelReferenced(Wrapper):
         return chosen_pole(self.map.effective_gain(), self._delays, self.uncertainty, self.pole)
 
     def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:  # noqa: ARG002
-        """Nothing: the request before is the model's response, which goes on beside it."""
         return {}
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The deformations on their way, newest first, and the map's own memory."""
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         return Layout((Signal("own_deformation", past),)) + self.map.memory(elements)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the next request; `request` is the model's response, behind the mirror."""
         size, queue, past = request.numel(), self._queue, memory["own_deformation"]
         before, pole = past[:size], self._leak
         undeformed = request - queue.delayed(past, size)

@@ -49,7 +49,6 @@ class _Transformation(Deformation):
         return self.effective_gain()
 
     def largest_step(self) -> float:
-        """Infinite: the bound grows with the request."""
         return float("inf")
 
     def with_effective_gain(self, gain: float) -> Self:

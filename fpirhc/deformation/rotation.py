@@ -85,19 +85,15 @@ class Rotation(Deformation):
         return request + along * first[0] + across * second[0], {}
 
     def effective_gain(self) -> float:
-        """The effective gain a is the fraction."""
         return self.fraction
 
     def secant_gain(self) -> float:
-        """1.21 times the fraction: on vectors up to R / 2 the arc is at most that much longer than |f - d|."""
         return _SECANT * self.fraction
 
     def largest_step(self) -> float:
-        """Infinite: R grows with the vectors."""
         return float("inf")
 
     def with_effective_gain(self, gain: float) -> Self:
-        """Return the map with another fraction."""
         return replace(self, fraction=gain)
 
     def _coefficients(self, chord2: Expression) -> tuple[Expression, Expression]:

@@ -135,7 +135,6 @@ class Sigmoid(Deformation):
         return -self.gain * self.slope
 
     def secant_gain(self) -> float:
-        """The secant gain: -A_c times the steepest secant of zeta at x*."""
         return -self.gain * self.steepest_secant
 
     def largest_step(self) -> float:

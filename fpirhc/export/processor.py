@@ -89,7 +89,6 @@ class Processor(Undeformed):
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, processor, limit, judge, running."""
         closing, delays = commanding_blocks(problem, [scalar(_ANSWER)])
         return [reference_block(problem), self._block(problem), *closing], delays
 

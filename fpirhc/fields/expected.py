@@ -58,11 +58,9 @@ class Anything(Expected):
 
     @property
     def words(self) -> str:
-        """Anything."""
         return "anything"
 
     def fits(self, value: object) -> bool:
-        """Every value."""
         del value
         return True
 
@@ -76,11 +74,9 @@ class Number(Expected):
 
     @property
     def words(self) -> str:
-        """A number, with its range."""
         return self.within.words if self.within else "a whole number" if self.whole else "a number"
 
     def fits(self, value: object) -> bool:
-        """Whether it is such a number; truth values are none."""
         if type(value) not in _OFTEN:  # the tests of abstract classes are slow
             if isinstance(value, SymbolicNumber):
                 return True
@@ -102,13 +98,11 @@ class Instance(Expected):
 
     @property
     def words(self) -> str:
-        """The class's name, or Python's own types in words."""
         if self.one in _WORDS:
             return _WORDS[self.one]
         return f"{'an' if self.one.__name__[0] in 'AEIOU' else 'a'} {self.one.__name__}"
 
     def fits(self, value: object) -> bool:
-        """Whether it is one; numbers are expressions, too."""
         if self.one in (
             ca.SX,
             ca.MX,
@@ -120,7 +114,6 @@ class Instance(Expected):
         return isinstance(value, np.bool_ if isinstance(value, np.bool_) and self.one is bool else self.one)
 
     def contract(self) -> type | None:
-        """The class."""
         return self.one
 
 
@@ -133,22 +126,18 @@ class Entries(Expected):
 
     @property
     def words(self) -> str:
-        """{name: what}."""
         return f"{{name: {self.value.words}}}"
 
     def fits(self, value: object) -> bool:
-        """Whether it is a mapping."""
         return isinstance(value, Mapping)
 
     def parts(self, value: object) -> Iterator[tuple[str, Expected, object]]:
-        """Every key and every entry."""
         assert isinstance(value, Mapping)
         for key, entry in value.items():
             yield f": name {shortened(key)}", self.key, key
             yield f"[{shortened(key)}]", self.value, entry
 
     def completed(self, part: object) -> str:
-        """One entry needs a name."""
         return "give it a name: {'name': ...}" if accepts(self.value, part) else ""
 
 
@@ -161,25 +150,21 @@ class Items(Expected):
 
     @property
     def words(self) -> str:
-        """(one, two) or a sequence."""
         if self.fixed:
             return f"({', '.join(item.words for item in self.items)})"
         return f"({self.items[0].words}, ...)"
 
     def fits(self, value: object) -> bool:
-        """Whether it is a sequence of that length; a text is none."""
         if isinstance(value, np.ndarray):
             return value.ndim == 1 and (not self.fixed or len(value) == len(self.items))
         ordered = isinstance(value, Sequence) and not isinstance(value, str | bytes)
         return ordered and (not self.fixed or len(typing.cast(Sequence[object], value)) == len(self.items))
 
     def parts(self, value: object) -> Iterator[tuple[str, Expected, object]]:
-        """Every entry."""
         for k, part in enumerate(typing.cast(Sequence[object], value)):
             yield f"[{k}]", self.items[k] if self.fixed else self.items[0], part
 
     def completed(self, part: object) -> str:
-        """One entry needs a comma."""
         return "" if self.fixed or not accepts(self.items[0], part) else f"write ({shortened(part)},)"
 
 
@@ -191,13 +176,11 @@ class Call(Expected):
 
     @property
     def words(self) -> str:
-        """A function of that many arguments."""
         if self.arguments is None:
             return "a function"
         return f"a function of {self.arguments} argument{'' if self.arguments == 1 else 's'}"
 
     def fits(self, value: object) -> bool:
-        """Whether it can be called so; what has no signature is taken at its word."""
         return callable(value) and takes(value, self.arguments)
 
 
@@ -209,26 +192,21 @@ class Choice(Expected):
 
     @property
     def words(self) -> str:
-        """One or another."""
         return " or ".join(option.words for option in self.options)
 
     def fits(self, value: object) -> bool:
-        """Whether one of them fits."""
         return any(option.fits(value) for option in self.options)
 
     def parts(self, value: object) -> Iterator[tuple[str, Expected, object]]:
-        """The parts by the option that accepts all of them, or by the first one that fits."""
         fitting = [option for option in self.options if option.fits(value)]
         accepting = next((option for option in fitting if accepts(option, value)), fitting[0])
         yield from accepting.parts(value)
 
     def contract(self) -> type | None:
-        """The first contract among the options."""
         named = (option.contract() for option in self.options if option.contract() not in _WORDS)
         return next((one for one in named if one is not None), None)
 
     def completed(self, part: object) -> str:
-        """By the first option of which it is a part."""
         return next((text for option in self.options if (text := option.completed(part))), "")
 
 

@@ -147,7 +147,6 @@ class Quadratic(Cost):
 
     @property
     def weighs_effort(self) -> bool:
-        """Whether `effort` has weights."""
         return bool(self.effort)
 
     @property
@@ -159,12 +158,10 @@ class Quadratic(Cost):
 
     @property
     def uses_rate(self) -> bool:
-        """Whether the change of some input is weighed."""
         return bool(self.rate)
 
     @property
     def uses_feedforward(self) -> bool:
-        """Whether some input is weighed relative to the feedforward."""
         return bool(self.deviation)
 
     def check(self, plant: Plant) -> None:
@@ -218,7 +215,6 @@ class Quadratic(Cost):
         return self.outputs or self.states
 
     def stage(self, view: View) -> dict[str, Expression]:
-        """Return the term 'states', and the terms 'effort', 'deviation', 'rate' where they have weights."""
         terms = {"outputs" if self.outputs else "states": _squares(self._errors, view.output, view.reference)}
         if self.effort:
             terms["effort"] = total(w * view.input[n] ** 2 for n, w in self.effort.items())
@@ -242,7 +238,6 @@ class Quadratic(Cost):
         return ca.bilin(ca.reshape(values, error.numel(), error.numel()), error, error)
 
     def derived(self, plant: Plant, linearise: Callable[[], Linearisation]) -> dict[str, float]:
-        """Return the entries of P, column by column, where `terminal` computes it."""
         if self.terminal is None or isinstance(self.terminal, Mapping):
             return {}
         weight = np.asarray(self.terminal.weight(self, plant, linearise()))
@@ -314,19 +309,16 @@ class CustomCost(Cost):
 
     @property
     def uses_rate(self) -> bool:
-        """Whether `terms` uses view.input_before."""
         return self.rate
 
     @property
     def uses_feedforward(self) -> bool:
-        """Whether `terms` uses view.feedforward."""
         return self.feedforward
 
     def check(self, plant: Plant) -> None:
         """Accept every plant: mistakes show when the terms are built."""
 
     def stage(self, view: View) -> Mapping[str, Expression]:
-        """Return the user's terms."""
         return called("cost", self.terms, view)
 
     def terminal_cost(
@@ -336,7 +328,6 @@ class CustomCost(Cost):
         linearise: Callable[[], Linearisation],  # noqa: ARG002
         step: float,  # noqa: ARG002
     ) -> Expression:
-        """Return the user's terminal cost, or zero."""
         return ca.SX(0) if self.terminal is None else called("cost: terminal", self.terminal, view)
 
 

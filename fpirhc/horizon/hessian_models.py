@@ -39,7 +39,6 @@ class GaussNewton(HessianModel):
     """The Hessian of the stage cost alone."""
 
     def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:  # noqa: ARG002
-        """Return l."""
         return cost
 
 

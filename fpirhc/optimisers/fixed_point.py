@@ -68,7 +68,6 @@ class FixedPoint(Optimiser):
 
     @property
     def in_data(self) -> tuple[str, ...]:
-        """Tolerance, damping and map; with limits of states they are in the code."""
         return "tolerance", "damping", "map"
 
     def check(self, ocp: OptimalControl) -> None:
@@ -98,27 +97,22 @@ class FixedPoint(Optimiser):
             )
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan, its states and feedback, and the line search's step lengths; or what limits of states need."""
         return limited_memory(ocp) if ocp.bounds_states else plain_memory(ocp)
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-        """The memory one stage later; the last stage, which is repeated, has no feedback."""
         return shifted_limited(ocp, memory) if ocp.bounds_states else shifted_plain(ocp, memory)
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Every call does the same `iterations`; with limits of states it ends where the plan is solved."""
         if ocp.bounds_states:
             return limited_step(ocp, self._limited(self.most_iterations))
         return plain_step(ocp, self._plain(self.iterations, converging=False))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
-        """Stop where the tolerance is met, or where the iteration does not contract."""
         if ocp.bounds_states:
             return limited_step(ocp, self._limited(_MOST_LIMITED))
         return plain_step(ocp, self._plain(MOST, converging=True))
 
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:
-        """Interior steps for a plan without limits of states that did not converge."""
         if ocp.bounds_states:
             return None
         # Here the settings are numbers: a rescue runs outside the loop, for the numbers of one call.
@@ -127,7 +121,6 @@ class FixedPoint(Optimiser):
         return _rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
-        """The memory after the first horizon is solved to the tolerance, as far as that succeeds."""
         memory = first_plan(self, ocp, state, data, calls=_FIRST_CALLS)[2]
         return memory if np.isfinite(memory).all() else self.memory(ocp).start()
 

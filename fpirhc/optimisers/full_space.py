@@ -74,14 +74,12 @@ class FullSpaceFixedPoint(Optimiser):
                 )
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan, its states and multipliers."""
         n = ocp.stages
         states = tuple(f"{s}@{k}" for k in range(1, n + 1) for s in ocp.state.elements)
         plan = tuple(f"{i}@{k}" for k in range(n) for i in ocp.input.elements)
         return Layout((Signal("plan_states", states), Signal("plan_inputs", plan), Signal("plan_multipliers", states)))
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-        """Everything one stage later."""
         rows = {"plan_states": ocp.state.size, "plan_inputs": ocp.input.size, "plan_multipliers": ocp.state.size}
         parts = self.memory(ocp).split(memory)
         return self.memory(ocp).join(
@@ -89,7 +87,6 @@ class FullSpaceFixedPoint(Optimiser):
         )
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Every call does the same `iterations`."""
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
         s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", n * (2 * ns + nu))

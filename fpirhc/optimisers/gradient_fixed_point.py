@@ -76,17 +76,14 @@ class GradientFixedPoint(Optimiser):
             )
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan."""
         return Layout(
             (Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements)),)
         )
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-        """The plan one stage later."""
         return ca.vec(shift(ca.reshape(memory, ocp.input.size, ocp.stages), ocp))
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Every call does the same `iterations`."""
         nu, n = ocp.input.size, ocp.stages
         s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", nu * n)

@@ -38,33 +38,27 @@ class Ladder(Optimiser):
 
     @property
     def exportable(self) -> bool:
-        """Whether both are exportable."""
         return self.first.exportable and self.second.exportable
 
     @property
     def unbounded(self) -> str:
-        """Why one of them may take any time."""
         return self.first.unbounded or self.second.unbounded
 
     @property
     def logged(self) -> Mapping[str, str]:
-        """Number of plans of the second optimiser since the run began."""
         return {"second_plans": _COUNT}
 
     def check(self, ocp: OptimalControl) -> None:
-        """Raise what either optimiser raises; both must serve the problem."""
         self.first.check(ocp)
         self.second.check(ocp)
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan, the rest of both memories, and the number of plans of the second optimiser."""
         first, second = self.first.memory(ocp), self.second.memory(ocp)
         own = [Signal(f"first_{s.name}", s.elements, s.units, s.start) for s in first.signals if s.name != _PLAN]
         other = [Signal(f"second_{s.name}", s.elements, s.units, s.start) for s in second.signals if s.name != _PLAN]
         return Layout((first[_PLAN], *own, *other, scalar(_COUNT)))
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-        """Both memories one stage later."""
         parts = self.memory(ocp).split(memory)
         one = self.first.shifted(ocp, self._part(ocp, self.first, "first", parts))
         other = self.second.shifted(ocp, self._part(ocp, self.second, "second", parts))
@@ -72,15 +66,12 @@ class Ladder(Optimiser):
         return self._joined(ocp, plan, one, other, parts[_COUNT])
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """One step of the first, and one of the second where it is needed."""
         return self._laddered(ocp, self.first.step(ocp), self.second.step(ocp))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
-        """The same with both converging."""
         return self._laddered(ocp, self.first.converging(ocp), self.second.converging(ocp))
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
-        """The memory with which the first begins; the second begins from its plan."""
         layout, one = self.memory(ocp), self.first.first_memory(ocp, state, data)
         parts = self.first.memory(ocp).unpack(one)
         return layout.pack({(n if n == _PLAN else f"first_{n}"): value for n, value in parts.items()})

@@ -64,11 +64,9 @@ class MultipleShooting(Optimiser):
 
     @property
     def exportable(self) -> bool:
-        """Solver libraries are called, not written out."""
         return False
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan, and the multipliers of variables and constraints."""
         variables, constraints = sizes(ocp)
         plan = tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements)
         return Layout(
@@ -80,7 +78,6 @@ class MultipleShooting(Optimiser):
         )
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-        """The plan and the multipliers one stage later."""
         parts = self.memory(ocp).split(memory)
         shifted_parts = {
             "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], ocp.input.size, ocp.stages), ocp)),
@@ -254,16 +251,13 @@ class Ipopt(MultipleShooting):
 
     @property
     def unbounded(self) -> str:
-        """Without a time limit its restoration phase may take long."""
         return "" if self.time_limit else "IPOPT has no time limit here: give Ipopt(time_limit=...), in s"
 
     @property
     def plugin(self) -> str:
-        """CasADi's name of the solver."""
         return "ipopt"
 
     def options(self, ocp: OptimalControl) -> Options:  # noqa: ARG002
-        """Quiet, with a warm start."""
         return {
             **_QUIET,
             "ipopt.sb": "yes",
@@ -293,7 +287,6 @@ class Fatrop(MultipleShooting):
 
     @property
     def unbounded(self) -> str:
-        """It has no time limit, and some samples make it iterate for ever."""
         return (
             "fatrop has no time limit, and after an outlier its call may never return: use FixedPoint(), "
             "or Ipopt(time_limit=...)"
@@ -301,11 +294,9 @@ class Fatrop(MultipleShooting):
 
     @property
     def plugin(self) -> str:
-        """CasADi's name of the solver."""
         return "fatrop"
 
     def options(self, ocp: OptimalControl) -> Options:
-        """Quiet, with the stages detected."""
         return {
             **_QUIET,
             "structure_detection": "auto",
@@ -345,11 +336,9 @@ class Qrqp(QuadraticSolver):
 
     @property
     def plugin(self) -> str:
-        """CasADi's name of the solver."""
         return "qrqp"
 
     def options(self) -> Options:
-        """Quiet, with an iteration limit."""
         quiet = {"print_iter": False, "print_header": False, "print_info": False, "print_lincomb": False}
         return {**quiet, "max_iter": self.iterations, "error_on_fail": False}
 
@@ -368,17 +357,14 @@ class Osqp(QuadraticSolver):
 
     @property
     def plugin(self) -> str:
-        """CasADi's name of the solver."""
         return "osqp"
 
     def options(self) -> Options:
-        """Quiet, with the accuracy for both residuals and without polishing."""
         inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": self.iterations}
         return {"osqp": inner, "error_on_fail": False}
 
     @property
     def unbounded(self) -> str:
-        """An infeasible program takes all iterations."""
         if self.iterations <= _OSQP_BOUNDED:
             return ""
         return (
@@ -403,16 +389,13 @@ class SequentialQuadratic(MultipleShooting):
 
     @property
     def unbounded(self) -> str:
-        """As its quadratic solver."""
         return self.quadratic.unbounded
 
     @property
     def plugin(self) -> str:
-        """CasADi's name of the solver."""
         return "sqpmethod"
 
     def options(self, ocp: OptimalControl) -> Options:
-        """With the Gauss-Newton Hessian, which is positive semi-definite for convex stage costs."""
         return {
             **_QUIET,
             "print_header": False,

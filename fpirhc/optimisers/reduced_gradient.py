@@ -53,17 +53,14 @@ class ReducedGradient(Optimiser):
         require_settings("ReducedGradient", self.iterations, self.tolerance)
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan and the spectral step length."""
         plan = Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements))
         return Layout((plan, scalar("plan_step_length", start=0.0)))
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-        """The plan one stage later, and the same step length."""
         plan = ca.reshape(memory[:-1], ocp.input.size, ocp.stages)
         return ca.vertcat(ca.vec(shift(plan, ocp)), memory[-1])
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Every call does the same `iterations`."""
         nu, n = ocp.input.size, ocp.stages
         s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)

@@ -84,7 +84,6 @@ class RungeKutta4(Integrator):
     substeps: Few = 1
 
     def finer(self, times: int) -> RungeKutta4:
-        """The same method with `times` times the sub-steps."""
         return RungeKutta4(self.substeps * times)
 
     def growth(self, modes: np.ndarray) -> np.ndarray:
@@ -142,11 +141,9 @@ class Cvodes(Integrator):
 
     @property
     def opaque(self) -> bool:
-        """Whether the step is a call: it is, of CVODES."""
         return True
 
     def finer(self, times: int) -> Cvodes:  # noqa: ARG002
-        """The same method with a tenth of the tolerance."""
         return Cvodes(self.tolerance / 10)
 
     def step(self, plant: Plant, period: float) -> ca.Function:
@@ -172,7 +169,6 @@ class MapSteps(Integrator):
 
     @property
     def steps_maps(self) -> bool:
-        """Whether it moves maps: it does."""
         return True
 
     def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:

@@ -211,7 +211,6 @@ class LogNormal(Spread):
         return float(exact * self.factor ** (share * z))
 
     def mistake(self, exact: float) -> str:
-        """Return why zero cannot be spread."""
         return (
             "" if exact else "has the value 0, which a factor does not change; use Uniform or Normal with absolute=..."
         )

@@ -199,7 +199,6 @@ class Plant(Motion):
 
     @cached_property
     def equations(self) -> Equations:
-        """The CasADi Functions of the motion, the outputs and the inverse."""
         return Equations(self)
 
     @cached_property

@@ -44,24 +44,20 @@ class Excitation(Deformation):
 
     @property
     def iteration(self) -> Iteration:
-        """Of no limit: nothing is iterated."""
         return Iteration(limited=False)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """Both responses of the last cycle, and the number of the cycle."""
         del elements
         return Layout(
             (*(scalar(f"{name}_before") for pair in self._names for name in pair), scalar("excitation_cycle"))
         )
 
     def shown(self) -> Mapping[str, str]:
-        """Both responses."""
         return {name: f"{name}_before" for pair in self._names for name in pair}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the desired response and the sequence."""
         table = sequence(self.cycles, len(self.amplitude), self.seed) * np.array(self.amplitude)
         cycle = memory["excitation_cycle"]
         grid = [np.arange(self.cycles, dtype=float).tolist()]
@@ -79,15 +75,12 @@ class Excitation(Deformation):
         return 1e-9
 
     def secant_gain(self) -> float:
-        """The effective gain."""
         return self.effective_gain()
 
     def largest_step(self) -> float:
-        """Infinite."""
         return float("inf")
 
     def with_effective_gain(self, gain: float) -> Self:
-        """Return the excitation itself."""
         del gain
         return replace(self)
 

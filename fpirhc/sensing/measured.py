@@ -19,19 +19,15 @@ class Measured(DerivativeEstimator):
 
     @property
     def measures_all(self) -> bool:
-        """Whether state and response are both measured: they are."""
         return True
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
-        """The whole state and every controlled coordinate's highest derivative; an output of order 0 is both, and measured once."""
         return tuple(dict.fromkeys(plant.output.elements + response_names(plant)))
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
-        """The highest derivatives."""
         return response_names(plant)
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
-        """Block that names the measured quantities."""
         del period, start
         realised = plant.response_signal("realised")
         responses = [seen.elements.index(name) for name in response_names(plant)]
@@ -44,21 +40,17 @@ class Measured(DerivativeEstimator):
 
     @property
     def shows_response(self) -> bool:
-        """Whether the response itself is measured: it is."""
         return True
 
     def weights(self, order: int, period: float) -> Array:
-        """One: the response to the last request."""
         del order, period
         return np.ones(1)
 
     def delay(self, order: int, period: float) -> float:
-        """Zero."""
         del order, period
         return 0.0
 
     def fills(self, order: int) -> int:
-        """One: no command acted before the first cycle."""
         del order
         return 1
 

@@ -42,19 +42,15 @@ class _Finite(DerivativeEstimator):
         """Rows c_0 ... c_n, newest sample first, shape (order + 1, samples); the last row gives the response."""
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
-        """The coordinates themselves."""
         return tuple(plant.chains)
 
     def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
-        """Measured coordinates and their derivatives."""
         return known_by_positions(plant, measured)
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
-        """The controlled coordinates."""
         return plant.controlled_names
 
     def weights(self, order: int, period: float) -> Array:
-        """The response's formula as an average of n-th differences, each with its B-spline of requests."""
         del period
         average = self.coefficients(order)[-1]
         for _ in range(order):
@@ -63,7 +59,6 @@ class _Finite(DerivativeEstimator):
         return np.convolve(average[: average.size - order], spline_weights(order))
 
     def fills(self, order: int) -> int:
-        """One less than the samples of the response's formula."""
         return int(self.coefficients(order).shape[1]) - 1
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
@@ -147,7 +142,6 @@ class PositionDifference(_Finite):
     """
 
     def coefficients(self, order: int) -> Array:
-        """Alternating binomial coefficients."""
         rows = np.zeros((order + 1, order + 1))
         for s in range(order + 1):
             rows[s, : s + 1] = backward_difference(s)
@@ -170,18 +164,15 @@ class StepDifference(_Finite):
 
     @property
     def of_steps(self) -> bool:
-        """Whether it takes differences of a map's steps: it does."""
         return True
 
     def coefficients(self, order: int) -> Array:
-        """Alternating binomial coefficients."""
         rows = np.zeros((order + 1, order + 1))
         for s in range(order + 1):
             rows[s, : s + 1] = backward_difference(s)
         return rows
 
     def weights(self, order: int, period: float) -> Array:
-        """One for the request of n cycles ago."""
         del period
         return np.eye(order)[-1]
 
@@ -244,7 +235,6 @@ class SavitzkyGolay(_Finite):
             )
 
     def coefficients(self, order: int) -> Array:
-        """Rows of the pseudo-inverse of the Vandermonde matrix, shifted to the centre or to the newest sample."""
         half = (self.window - 1) // 2
         # Time counts in half windows from the centre, so that the powers stay of size one.
         unit = max(half, 1)

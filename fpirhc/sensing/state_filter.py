@@ -57,15 +57,12 @@ class StateVariableFilter(DerivativeEstimator):
             )
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
-        """The coordinates themselves."""
         return tuple(plant.chains)
 
     def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
-        """Measured coordinates and their derivatives."""
         return known_by_positions(plant, measured)
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
-        """The controlled coordinates."""
         return plant.controlled_names
 
     def weights(self, order: int, period: float) -> Array:
@@ -85,12 +82,10 @@ class StateVariableFilter(DerivativeEstimator):
         return order * pole / (1 - pole) + (order - 1) / 2
 
     def fills(self, order: int) -> int:
-        """One: the filter begins in the motion of the start."""
         del order
         return 1
 
     def settles(self, order: int, period: float) -> int:
-        """Cycles after which 1 % of a jump of the response is left."""
         return int(np.argmax(np.cumsum(self.weights(order, period)) >= 1 - _FORGOTTEN)) + 1
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:

@@ -31,11 +31,9 @@ class VelocityDifference(DerivativeEstimator):
     """Backward difference of the highest measured derivative over the period."""
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
-        """The whole state."""
         return plant.output.elements
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
-        """The highest derivatives of the controlled coordinates among the states."""
         return _highest(plant)
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
@@ -43,17 +41,14 @@ class VelocityDifference(DerivativeEstimator):
         return _difference_block(plant, period, start, seen, 0.0)
 
     def weights(self, order: int, period: float) -> Array:
-        """One: the mean response to the last request."""
         del order, period
         return np.ones(1)
 
     def delay(self, order: int, period: float) -> float:
-        """Zero."""
         del order, period
         return 0.0
 
     def fills(self, order: int) -> int:
-        """One: the difference needs two samples."""
         del order
         return 1
 
@@ -86,11 +81,9 @@ class LowPassDifference(DerivativeEstimator):
         return math.exp(-period / self.time_constant)
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
-        """The whole state."""
         return plant.output.elements
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
-        """The highest derivatives of the controlled coordinates among the states."""
         return _highest(plant)
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
@@ -110,7 +103,6 @@ class LowPassDifference(DerivativeEstimator):
         return self.pole(period) / (1 - self.pole(period))
 
     def fills(self, order: int) -> int:
-        """One: the filter begins with the first difference."""
         del order
         return 1
 

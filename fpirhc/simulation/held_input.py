@@ -19,7 +19,6 @@ class HeldInput(Undeformed):
     """Sends the input that stands in its memory, within the limits."""
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, hold, limit, judge, running."""
         plant, (closing, delays) = problem.plant, commanding_blocks(problem)
         before = tuple(map(float, problem.inputs_before))
         held = Signal(HELD_INPUT, plant.input.elements, plant.input.units, before)

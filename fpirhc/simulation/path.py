@@ -158,22 +158,18 @@ class Equations(Mover):
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Those of the same names, or seen in their place."""
         return self.problem.truth.shown(self.problem.plant.state.elements)
 
     @property
     def shows_truth(self) -> bool:
-        """Everything that is judged."""
         return True
 
     @property
     def reads(self) -> tuple[Signal, ...]:
-        """Nothing: it is a part of the step."""
         return ()
 
     @property
     def delays(self) -> list[Delay]:
-        """State, acting input and forcing of the last cycle, and the exact parameters."""
         problem, plant = self.problem, self.problem.real_plant
         start, acting = (tuple(map(float, v)) for v in (problem.real_start, problem.inputs_before))
         exact = tuple(map(float, problem.real_parameters))
@@ -211,7 +207,6 @@ class Equations(Mover):
         return Block("sense", Layout(reads), Layout((*writes, *own)), step)
 
     def advance(self, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
-        """Block of the plant that moves over one period with the arriving command held."""
         problem, plant = self.problem, self.problem.real_plant
         advance = problem.real_integrator.step(plant, problem.period)
         state, exact = like(plant.state, "_state_before"), like(plant.parameter, self.parameters)
@@ -240,24 +235,20 @@ class Body(Mover):
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Those that it measures beside outputs; of a plant without outputs the sensors say what is needed."""
         state, *outputs = measured_signals(self.problem.plant)
         return tuple(e for e in state.elements if e in self.measures) if outputs else state.elements
 
     @property
     def shows_truth(self) -> bool:
-        """Whether it measures everything that is judged."""
         plant = self.problem.plant
         return {*plant.output.elements, *response_names(plant)} <= set(self.measures)
 
     @property
     def reads(self) -> tuple[Signal, ...]:
-        """Its answer, and whether this is the last good one held."""
         return vector(_RAW, tuple(self.measures), tuple(self.measures.values())), scalar(_HELD)
 
     @property
     def delays(self) -> list[Delay]:
-        """Nothing: it remembers by itself."""
         return []
 
     def sense(self, motion: Sequence[Signal], response: Response) -> Block:

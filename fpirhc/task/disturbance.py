@@ -72,11 +72,9 @@ class Step(Disturbance):
 
     @property
     def jump(self) -> float:
-        """The size."""
         return abs(self.size)
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
-        """Return the step's values."""
         return np.where(times >= self.at, self.size, 0.0)
 
 
@@ -96,11 +94,9 @@ class Pulse(Disturbance):
 
     @property
     def jump(self) -> float:
-        """The size."""
         return abs(self.size)
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
-        """Return the pulse's values."""
         return np.where((times >= self.at) & (times < self.at + self.duration), self.size, 0.0)
 
 
@@ -129,7 +125,6 @@ class Sine(Disturbance):
         return self.amplitude * omega**order * np.sin(omega * times + self.phase + order * np.pi / 2)
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
-        """Return the sine's values."""
         return self.amplitude * np.sin(2 * np.pi * self.frequency * times + self.phase)
 
 
@@ -150,7 +145,6 @@ class Noise(Disturbance):
         _check_deviation(self)
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """Return the noise's values."""
         return random.normal(0.0, self.deviation, times.shape)
 
 
@@ -182,7 +176,6 @@ class ColouredNoise(Disturbance):
             )
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """Return the noise's values."""
         from scipy.signal import lfilter  # it takes longer to import than all the rest of a problem
 
         white = random.normal(0.0, self.deviation, times.shape)

@@ -66,7 +66,6 @@ class Known(Exogenous):
 
     @property
     def known(self) -> Course:
-        """The values."""
         return self.values
 
 
@@ -101,7 +100,6 @@ class Believed(Exogenous):
 
     @property
     def known(self) -> Course:
-        """What the model is told."""
         return self.model
 
 

@@ -102,7 +102,6 @@ class PathConstraint(Limit):
             raise InvalidValue("PathConstraint.expression: expected a function of 1 argument, the view of a stage")
 
     def value(self, view: OfStage) -> Value:
-        """Return the expression."""
         return self.expression(view)
 
 
@@ -171,7 +170,6 @@ class _Rate(Limit):
     unit: str
 
     def value(self, view: OfStage) -> Value:
-        """Return (u_i - u_{i-1}) / step."""
         return (view.input[self.input] - view.input_before[self.input]) / self.step
 
 

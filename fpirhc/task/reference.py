@@ -144,7 +144,6 @@ class Trajectory(Reference):
     motion: Callable[[Expression], Mapping[str, Expression]]
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
-        """Return {coordinate: expression of t}."""
         return {
             str(name): scalar_expression(f"reference: coordinate '{name}'", value, of=self.motion, symbols=(t,))
             for name, value in named_results("reference", called("reference", self.motion, t)).items()
@@ -184,11 +183,9 @@ class Table(Reference):
 
     @property
     def opaque(self) -> bool:
-        """Whether a table is looked up: it is."""
         return True
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
-        """Return {coordinate: spline of t}."""
         return {name: self._spline(name, np.asarray(v, dtype=float), t) for name, v in self.values.items()}
 
     def _spline(self, name: str, samples: np.ndarray, t: Expression) -> Expression:

@@ -274,7 +274,6 @@ class Setpoint(Reference):
 
     @property
     def set_points(self) -> Mapping[str, Steps]:
-        """The set-points of a run that is given no others."""
         return self.values
 
     def function(self, plant: Plant) -> ca.Function:
@@ -291,17 +290,14 @@ class Setpoint(Reference):
         return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
 
     def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
-        """Return the signal of the set-points in force; announced ones of the next nodes follow node by node, 'q1@1'."""
         bank = self._bank(plant, stages)
         first = tuple(pairs(name, self.values[name])[0][1] for name in plant.chains)
         return (replace(bank.given, start=first * bank.nodes),)
 
     def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
-        """Return one signal with the filter's state, what is given, and the rate where it is live."""
         return (self._bank(plant, stages).own,)
 
     def block(self, plant: Plant, stages: int, period: float) -> Block:
-        """Return the block of the filter, which also logs the set-points in force and the response of the reference."""
         bank, count = self._bank(plant, stages), len(plant.chains)
         motion = bank.motion(0.0)
         rest = {name: self._rest(name) for name in plant.chains}
@@ -344,13 +340,11 @@ class Setpoint(Reference):
         return self._bank(plant, len(nodes) - 1).preview(nodes)
 
     def rests(self, until: float) -> bool:
-        """Return whether no set-point changes up to some time, and the filter begins at the first ones."""
         steps = {name: pairs(name, values) for name, values in self.values.items()}
         still = all(time == 0 or time > until for one in steps.values() for time, _ in one)
         return still and all(value == steps[name][0][1] for name, value in self.start.items())
 
     def largest_jump(self, plant: Plant) -> float:
-        """Largest jump of the controlled responses at a change of `values`; zero where the filter's order is above the plant's."""
         jumps: dict[float, list[float]] = {}
         for name in plant.controlled_names:
             order = plant.chains[name]

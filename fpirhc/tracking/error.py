@@ -80,7 +80,6 @@ class IntegralLaw(Tracking):
         return integral_update(plant, period, self._useful(plant))
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
-        """The delay of the integral of the error; a block of the law may hold more."""
         return integral_delay(plant)
 
     @abstractmethod

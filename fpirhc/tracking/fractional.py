@@ -111,7 +111,6 @@ class Fractional(IntegralLaw):
 
     @property
     def speed(self) -> float:
-        """Lambda."""
         return self.rate
 
     def law(self, plant: Plant, period: float) -> Block:
@@ -179,7 +178,6 @@ class Fractional(IntegralLaw):
         return np.append(self.weights(cycles), (self.rate * period) ** self.order)
 
     def _useful(self, plant: Plant) -> list[Useful]:
-        """What the integrals may ask for by way of rate S."""
         if not self.largest:
             return []
         gains = [(*self.gains(order), 1.0, 0.0)[:2] for order in plant.response_orders.values()]

@@ -92,7 +92,6 @@ class LinearLaw(IntegralLaw):
         return Block("tracking", reads, writes, step, gains_before(plant, first_gains))
 
     def _useful(self, plant: Plant) -> list[Useful]:
-        """What the integrals may ask for; nothing where they are not fed back."""
         if not (self.integral and self.largest):
             return []
         gains = [(*self.gains(order), 1.0)[:2] for order in plant.response_orders.values()]
@@ -139,17 +138,14 @@ class Exponential(LinearLaw):
             raise InvalidValue(f"tracking rate must be positive (1/s), got {self.rate}")
 
     def gains(self, order: int) -> tuple[float, ...]:
-        """Gains of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first."""
         degree = order + 1 if self.integral else order
         return tuple([math.comb(degree, s) * power(self.rate, degree - s) for s in range(degree)])
 
     @property
     def speed(self) -> float:
-        """Lambda."""
         return self.rate
 
     def feedback(self, order: int) -> Feedback:
-        """The gains for that order."""
         return Feedback(self.gains(order), self.integral, self.bumpless, self.rate)
 
 
@@ -233,7 +229,6 @@ class ShiftPolynomial(LinearLaw):
         return max(abs(1 - z) for z in every) / self.step
 
     def feedback(self, order: int) -> Feedback:
-        """The gains for that order."""
         rate = (1 - self.poles) / self.step if not isinstance(self.poles, Sequence) else None
         return Feedback(self.gains(order), self.integral, self.bumpless, rate)
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import pkgutil
 import re
 import tomllib
 from functools import cache
 from pathlib import Path
+
+import fpirhc
 
 ROOT = Path(__file__).resolve().parents[2]
 LANES = (ROOT / "tests" / "lanes.txt").read_text(encoding="utf-8").splitlines()
@@ -52,3 +57,20 @@ def test_faults_are_made_in_modules_that_exist_and_in_each_once():
     assert len(modules) == len(set(modules))
     tests = [test.partition("::")[0] for target in targets for test in target["tests"]]
     assert [test for test in tests if not (ROOT / test).exists()] == []
+
+
+def test_what_overrides_nothing_documented_has_a_docstring_of_its_own():
+    """Ruff cannot see what a method inherits; where it inherits nothing, nobody would learn what it does."""
+    classes = {
+        value
+        for module in pkgutil.walk_packages(fpirhc.__path__, "fpirhc.")
+        if not module.name.endswith("__main__")
+        for value in vars(importlib.import_module(module.name)).values()
+        if inspect.isclass(value) and value.__module__ == module.name and value.__name__[0] != "_"
+    }
+    public = {
+        f"{c.__module__}.{c.__name__}.{name}": getattr(c, name) for c in classes for name in vars(c) if name[0] != "_"
+    }
+    described = {name: inspect.isfunction(value) or isinstance(value, property) for name, value in public.items()}
+    assert sum(described.values()) > 1000
+    assert sorted(name for name in public if described[name] and not inspect.getdoc(public[name])) == []

@@ -71,7 +71,6 @@ class AccelerationFeedback(Undeformed):
         return (1 + self.pole(period)) / (1 - self.pole(period))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, feedback, invert, limit, judge, running, tracking update."""
         return law_blocks(problem, self.tracking, self._feedback_block(problem), invert_block(problem.plant))
 
     def _feedback_block(self, problem: Problem) -> Block:

@@ -69,7 +69,6 @@ class AdaptiveInverseDynamics(Controller):
 
     @property
     def learns(self) -> bool:
-        """True: the parameters of the model change during a run."""
         return True
 
     def check(self, problem: Problem) -> None:
@@ -86,7 +85,6 @@ class AdaptiveInverseDynamics(Controller):
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, learn, deform, invert, limit, judge, running, tracking update."""
         plant, regressor = problem.plant, self._learning.regressor(problem)
         closing, delays = closing_blocks(replace(problem, plant=regressor.believed), self.deformation)
         believed = like(regressor.believed.parameter, "_believed")

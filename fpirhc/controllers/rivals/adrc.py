@@ -67,7 +67,6 @@ class ADRC(Undeformed):
             check_modes(self, problem.plant, decay_gains(self.bandwidth, order))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, observer, limit, judge, running, prediction."""
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         response = plant.response_signal("_reference_response")

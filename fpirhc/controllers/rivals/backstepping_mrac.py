@@ -83,7 +83,6 @@ class BacksteppingMRAC(Controller):
         return rows
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, reference model, nested errors, deform, invert, limit, judge, running."""
         plant = problem.plant
         closing, delays = closing_blocks(problem, self.deformation)
         own = model_block(plant, self.model_rate, problem.period), self._nested_block(plant)

@@ -46,7 +46,6 @@ class DisturbanceObserver(Undeformed):
     bandwidth: Positive
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, observer, limit, judge, running, tracking update."""
         return law_blocks(problem, self.tracking, self._observer_block(problem))
 
     def _observer_block(self, problem: Problem) -> Block:

@@ -52,19 +52,16 @@ class ForceMRAC(Controller):
     model: Mapping[str, float] = field(default_factory=dict)
 
     def with_defaults(self, problem: Problem) -> ForceMRAC:
-        """Return the controller with a scale for the command that the reference model needs along the reference."""
         if not automatic(self.deformation):
             return self
         demand = command_demand(problem, self.plant_model(problem).parameters(problem.plant))
         return replace(self, deformation=self.deformation.suited(demand))
 
     def plant_model(self, problem: Problem) -> PlantModel:
-        """Return the reference model."""
         return PlantModel(problem.plant, problem.signals, given=self.model)
 
     @property
     def deforms(self) -> Deforms:
-        """A command."""
         return "command"
 
     def check(self, problem: Problem) -> None:
@@ -89,7 +86,6 @@ class ForceMRAC(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, force, limit, judge, running, tracking update."""
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [

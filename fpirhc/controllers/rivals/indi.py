@@ -56,7 +56,6 @@ class INDI(Undeformed):
         return 2 * decay * cos(self.frequency * period * sqrt(1 - self.damping * self.damping)), -decay * decay
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, increment, limit, judge, running, tracking update."""
         return law_blocks(problem, self.tracking, self._increment_block(problem))
 
     def _increment_block(self, problem: Problem) -> Block:

@@ -77,7 +77,6 @@ class IntelligentPID(Undeformed):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, ultra-local model, limit, judge, running, tracking update."""
         return law_blocks(problem, self.tracking, self._model_block(problem))
 
     def _model_block(self, problem: Problem) -> Block:

@@ -58,7 +58,6 @@ class L1Adaptive(Undeformed):
         check_chains(problem, "L1Adaptive predicts a derivative below the response")
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, predictor, invert, limit, judge, running, tracking update, expected."""
         plant = problem.plant
         blocks, delays = law_blocks(problem, self.tracking, self._predictor_block(problem), invert_block(plant))
         expected = plant.response_signal("_expected")

@@ -74,7 +74,6 @@ class LyapunovMRAC(Undeformed):
 
     @property
     def learns(self) -> bool:
-        """True: the gains change during a run."""
         return True
 
     def weights(self, order: int) -> np.ndarray:
@@ -102,7 +101,6 @@ class LyapunovMRAC(Undeformed):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, reference model, law, limit, judge, running, adapt."""
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [

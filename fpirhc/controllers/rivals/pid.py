@@ -104,7 +104,6 @@ class PID(Undeformed):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, pid, limit, judge, running, integral."""
         plant = problem.plant
         response = plant.response_signal("_reference_response")
         closing, delays = commanding_blocks(problem)

@@ -74,11 +74,9 @@ class RepetitiveControl(Undeformed):
         return round(ratio)
 
     def check(self, problem: Problem) -> None:
-        """Raise if the period does not fit the control cycle, as `cycles` does."""
         self.cycles(problem)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, tracking, repetition, invert, limit, judge, running, tracking update."""
         plant = problem.plant
         blocks, delays = law_blocks(problem, self.tracking, self._repetition_block(problem), invert_block(plant))
         desired, request = plant.response_signal("_desired_last"), plant.response_signal("_deformed_last")

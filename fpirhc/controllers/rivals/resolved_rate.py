@@ -78,7 +78,6 @@ class ResolvedAccelerationRate(Undeformed):
         check_derivatives(problem, "ResolvedAccelerationRate prescribes")
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, rate, increment, invert, limit, judge, running."""
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [

@@ -83,7 +83,6 @@ class SlidingMode(Undeformed):
             check_modes(self, problem.plant, decay_gains(self.rate, order - 1))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, surface, deform, invert, limit, judge, running."""
         response = problem.plant.response_signal("_reference_response")
         closing, delays = closing_blocks(problem, self.deformation)
         blocks = [

@@ -69,11 +69,9 @@ class SlotineLi(Controller):
 
     @property
     def learns(self) -> bool:
-        """True: the parameters of the model change during a run."""
         return True
 
     def check(self, problem: Problem) -> None:
-        """Raise if plant, bounds or rule do not fit, as `Learning.check` does, or the damping does not name every coordinate."""
         self._learning.check(problem, inverts=self._deforms)
         odd = sorted(set(self.damping) ^ set(problem.plant.names))
         if odd:
@@ -82,7 +80,6 @@ class SlotineLi(Controller):
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, sliding, learn, [demand with a deformation], deform, force or invert, limit, judge."""
         regressor = self._learning.regressor(problem)
         believed = like(regressor.believed.parameter, "_believed")
         front = [reference_block(problem), self._sliding_block(problem), self._learn_block(problem, regressor)]

@@ -70,7 +70,6 @@ class FixedSchedule(Schedule):
     spans: Sequence[tuple[str, float, float]]
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
-        """Note unknown and missing coordinates, overlaps, gaps, and spans beyond the run."""
         unit = problem.time_unit
         wrong = [span for span in self.spans if not _is_span(span)]
         for span in wrong:
@@ -101,7 +100,6 @@ class FixedSchedule(Schedule):
             mistakes.add(f"FixedSchedule: no slot from {at:g} {unit} to the end of the run at {end:g} {unit}; add one")
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """Return the longest stretch of each coordinate; adjacent spans of one coordinate count as one."""
         del problem
         longest, before, stretch = dict.fromkeys(names, 0.0), "", 0.0
         for name, start, end in self._ordered():
@@ -129,19 +127,16 @@ class Periodic(Schedule):
     durations: Mapping[str, float]
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
-        """Note unknown and missing coordinates, and durations that are not positive or shorter than a cycle."""
         _check_visits("Periodic", self.durations, names, mistakes)
         for name, duration in self.durations.items():
             check_stretch(f"Periodic: duration of '{name}'", duration, problem, mistakes)
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """Return the durations; a single slot lasts as long as the run."""
         if len(self.durations) == 1:
             return dict.fromkeys(self.durations, problem.duration)
         return {n: self.durations.get(n, 0.0) for n in names}
 
     def sequence(self, problem: Problem) -> SlotSpans:
-        """Return one period, in whole cycles."""
         return tuple((n, round(d / problem.period) * problem.period) for n, d in self.durations.items())
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
@@ -345,7 +340,6 @@ class ByError(Schedule):
     hysteresis: float = 0.1
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
-        """Note unknown or missing weights, and values out of range."""
         mistakes.unknown("ByError: weight of coordinate", self.weights, names)
         for name in names:
             weight = self.weights.get(name)
@@ -354,7 +348,6 @@ class ByError(Schedule):
         _check_choice("ByError", self.dwell, self.hysteresis, problem, mistakes)
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """Return the shortest duration of a slot."""
         del problem
         return dict.fromkeys(names, self.dwell)
 
@@ -389,7 +382,6 @@ class ByLookAhead(Schedule):
     hysteresis: float = 0.1
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
-        """Note unknown weights, and values out of range."""
         del names
         mistakes.unknown("ByLookAhead: weight of state", self.weights, problem.plant.state.elements)
         weights = list(self.weights.values())
@@ -398,7 +390,6 @@ class ByLookAhead(Schedule):
         _check_choice("ByLookAhead", self.dwell, self.hysteresis, problem, mistakes)
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """Return the shortest duration of a slot."""
         del problem
         return dict.fromkeys(names, self.dwell)
 

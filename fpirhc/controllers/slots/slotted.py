@@ -105,11 +105,9 @@ class Slotted(Controller):
         return Response(by_slot(channels, "realised"), ca.Function("fpirhc_slots_realised", [x, u, p, w], [responses]))
 
     def with_deformation(self, deformation: Deformation) -> Slotted:
-        """Return the controller with this deformation in every slot."""
         return replace(self, slots=tuple(replace(slot, deformation=deformation) for slot in self.slots))
 
     def with_defaults(self, problem: Problem) -> Slotted:
-        """Return itself: the deformation of every slot needs its settings from the user."""
         del problem
         return self
 
@@ -118,7 +116,6 @@ class Slotted(Controller):
         return radius_of(problem, self.channels(problem), self.schedule, self.blend)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        """Return a sentence with the Floquet radius of the schedule and the largest real part in each slot."""
         floquet = self.floquet(problem)
         if floquet.radius is None:
             return (f"no Floquet radius: {floquet.reason}",)
@@ -174,7 +171,6 @@ class Slotted(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, schedule; per slot tracking, join, deform; then command, judge, tracking updates."""
         channels = self.channels(problem)
         blocks = [reference_block(problem)]
         blocks += [state_block(problem, one, self.smallest_gain) for one in channels]

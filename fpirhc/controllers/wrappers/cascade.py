@@ -64,16 +64,13 @@ class Shifted(Reference):
 
     @property
     def opaque(self) -> bool:
-        """As the reference."""
         return self.reference.opaque
 
     @property
     def set_points(self) -> Mapping[str, Steps]:
-        """Those of the reference."""
         return self.reference.set_points
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
-        """Return the motion without shift."""
         return self.reference.coordinates(t)
 
     def function(self, plant: Plant) -> ca.Function:
@@ -85,18 +82,15 @@ class Shifted(Reference):
         return self.reference.derivatives(coordinate, order)
 
     def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
-        """Return the own signals of the reference, and the shift."""
         every = followed_units(plant)
         units = tuple(every[name] for name in plant.controlled_names)
         return (*self.reference.own(plant, stages), Signal(SHIFT, plant.controlled_names, units))
 
     def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
-        """Return all of these and the time as one signal."""
         names = tuple(column for signal in self.given(plant, stages) for column in signal.columns)
         return (Signal(_OWN, (*names, "time")),)
 
     def block(self, plant: Plant, stages: int, period: float) -> Block:
-        """Return the block that packs what is given."""
         del period
         signals = self.given(plant, stages)
 
@@ -134,11 +128,9 @@ class Shifted(Reference):
         return ca.Function("fpirhc_target_preview", [own], [shifted, responses], ["own"], ["states", "responses"])
 
     def rests(self, until: float) -> bool:
-        """Return whether the motion without shift rests."""
         return self.reference.rests(until)
 
     def largest_jump(self, plant: Plant) -> float:
-        """Largest known jump of the motion without shift."""
         return self.reference.largest_jump(plant)
 
     def _symbols(self, plant: Plant, stages: int) -> tuple[Expression, Expression, list[Expression], ca.DM]:
@@ -295,12 +287,10 @@ class Cascade(Controller):
         return self.controller
 
     def inner_problem(self, problem: Problem) -> Problem:
-        """Return the problem with a reference that can be shifted."""
         return replace(problem, reference=Shifted(problem.reference))
 
     @property
     def deforms(self) -> Deforms:
-        """The target."""
         return "target"
 
     @property
@@ -308,11 +298,9 @@ class Cascade(Controller):
         """None: plans of the inner controller follow the target, and not the reference of the problem."""
 
     def with_deformation(self, deformation: Deformation) -> Controller:  # type: ignore[override]
-        """Return the cascade with another map; without adaptation the inner controller, whose target is then the reference."""
         return replace(self, deformation=deformation) if deformation.adapts else without_deformation(self.controller)
 
     def with_defaults(self, problem: Problem) -> Cascade:
-        """Return the cascade with lag and dead time of its pairing as numbers, and a scale of the map where it has none."""
         paired, map_ = self.paired, self.deformation
         return replace(
             self,
@@ -358,7 +346,6 @@ class Cascade(Controller):
             self.paired.queue(problem)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks reference, shift, and the inner controller as one block."""
         reference, shift = reference_block(problem), self._shift_block(problem)
         inner = compose_controller(self.inner_problem(problem), self.controller)
         written = {*reference.writes.names, *shift.writes.names}

@@ -53,7 +53,6 @@ class Estimating(ControllerWrapper):
     at_once: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
     def inner_problem(self, problem: Problem) -> Problem:
-        """Return the problem with the estimator's model of the plant."""
         return _MODELLED.of((self.estimator, problem), (), lambda: self._modelled(problem))
 
     def _modelled(self, problem: Problem) -> Problem:
@@ -62,17 +61,14 @@ class Estimating(ControllerWrapper):
 
     @property
     def feeds(self) -> Mapping[str, str]:
-        """Corrected parameters in place of the parameters."""
         return {"parameters": _BELIEVED, **self.controller.feeds}
 
     @property
     def learns(self) -> bool:
-        """True: the parameters of the model change during a run."""
         return True
 
     @property
     def planner(self) -> Planner | None:
-        """That of the wrapped controller, which a new estimate changes in every cycle where it acts at once."""
         planner, at_once = self.controller.planner, self.at_once or self.estimator.acts_at_once
         return replace(planner, follows_model=True) if planner is not None and at_once else planner
 
@@ -100,7 +96,6 @@ class Estimating(ControllerWrapper):
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the block estimate, and the wrapped controller as one block."""
         modelled = self.inner_problem(problem)
         following = with_setting(self.controller, "follows_model", True) if self.at_once else None
         controller = following or self.controller

@@ -26,18 +26,15 @@ class ExactModel(ControllerWrapper):
     """
 
     def inner_problem(self, problem: Problem) -> Problem:
-        """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
         model = self.plant_model(problem)
         plant = _EXACT.of((model.plant,), (), lambda: known_exactly(model.plant))
         return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
 
     def plant_model(self, problem: Problem) -> PlantModel:
-        """Return the plant that a run moves, its exact parameters, and the signals as they really are."""
         plant = problem.moves.as_model(problem.plant)
         return PlantModel(plant, really_known(problem.signals), exact=True)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the blocks of the wrapped controller."""
         return self.controller.blocks(self.inner_problem(problem))
 
 

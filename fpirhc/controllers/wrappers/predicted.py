@@ -112,22 +112,18 @@ class ByModel(Predictor):
             )
 
     def others(self, late: float) -> tuple[Predictor, ...]:
-        """A residual as slow as the dead time, and the desired responses; none where there is a residual, or no dead time."""
         return (ByModel(residual_time=late), ByDesired()) if late and self.residual_time is None else ()
 
     def check(self, plant: Plant) -> None:
         """Accept every plant."""
 
     def sent(self, plant: Plant) -> Signal:
-        """Return the signal of the commands."""
         return plant.input
 
     def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
-        """Return the commands of the problem before the run."""
         return tuple(map(float, problem.inputs_before))
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
-        """Return one Runge-Kutta step of the model, or one cycle of a map, as a Function."""
         step = one_step(plant, period)
         x, u, p = plant.symbols()
         w = ca.SX.sym("w", len(plant.names))
@@ -154,15 +150,12 @@ class ByDesired(Predictor):
             )
 
     def sent(self, plant: Plant) -> Signal:
-        """Return the signal of the desired responses."""
         return plant.response_signal("desired")
 
     def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
-        """Return zeros: before the run the plant was at rest or in steady motion."""
         return (0.0,) * len(problem.plant.controlled_names)
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
-        """Return Taylor's formula with the highest derivative held over the cycle, as a Function."""
         x, u, p = plant.symbols()
         d, w = ca.SX.sym("d", len(plant.controlled_names)), ca.SX.sym("w", len(plant.names))
         seen = plant.equations.output(x, 0 * u, p, 0 * w)
@@ -211,12 +204,10 @@ class Predicted(ControllerWrapper):
 
     @property
     def feeds(self) -> Mapping[str, str]:
-        """Time, state and outputs ahead in place of those of now."""
         ahead = {"time": "time_ahead", "state": "state_ahead", "output": "output_ahead"}
         return {**ahead, **self.controller.feeds}
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        """Return the notes of the wrapped controller; with set-points, that they are followed late by the dead time."""
         notes = self.controller.notes(problem)
         cycles = nominal(self)._queue(problem).cycles
         if not own_signals(problem) or not cycles:
@@ -246,7 +237,6 @@ class Predicted(ControllerWrapper):
             raise InvalidValue(f"Predicted: {self._length(problem)} cycles of dead time, more than {MOST}")
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Return the block predict, and the wrapped controller as one block; without dead time the controller's own blocks."""
         plant = problem.plant
         if not self._length(problem):
             return self.controller.blocks(problem)

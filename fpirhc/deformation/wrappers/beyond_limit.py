@@ -25,17 +25,14 @@ class BeyondLimit(Wrapper):
 
     @property
     def iteration(self) -> Iteration:
-        """That of the map, where a gain beyond the limit is asked for."""
         return replace(self.map.iteration, limited=False)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """That of the map."""
         return self.map.memory(elements)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the step of the map."""
         return self.map.step(request, response, desired, memory)
 
 

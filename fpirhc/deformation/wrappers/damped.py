@@ -40,7 +40,6 @@ class Damped(Wrapper):
     """
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """Factor, mean sign, cycles of rest left, count of growing errors, last error; and the memory of the map."""
         own = (
             scalar("damper_factor", start=1.0),
             scalar("damper_sign"),
@@ -51,7 +50,6 @@ class Damped(Wrapper):
         return Layout(own) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The factor, and the signals of the map."""
         return {"damping_factor": "damper_factor", **self.map.shown()}
 
     def step(

@@ -83,7 +83,6 @@ class _Queued(Wrapper):
         """The delays of the pairs."""
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The queues, the number of pairs in them, and the memory of the map."""
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         queues = Signal("queue_requests", past), Signal("queue_desired", past), Signal("queue_now", elements)
         return Layout((*queues, scalar("queue_filled"))) + self.map.memory(elements)
@@ -91,7 +90,6 @@ class _Queued(Wrapper):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the next request from the pair that caused the response."""
         inner, queue = discrete(self, memory, request.numel()), self._queue
         first = memory["queue_filled"] < 0.5
         # The first request of a run is the desired response itself.
@@ -111,7 +109,6 @@ class _Queued(Wrapper):
         return ca.if_else(valid, next_request, desired), {**queues, **remembered}
 
     def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
-        """Return the queues with the held request and its desired response once more."""
         queue, filled = self._queue, memory["queue_filled"]
         desired = ca.if_else(filled < 0.5, request, memory["queue_now"])
         return {
@@ -156,7 +153,6 @@ class Paired(_Queued):
 
     @property
     def iteration(self) -> Iteration:
-        """With the width of the mean."""
         return replace(
             super().iteration, pairing=Pairing(largest(every(self.cycles)), self.uncertainty, several(self.cycles))
         )
@@ -215,7 +211,6 @@ class Increment(_Queued):
 
     @property
     def iteration(self) -> Iteration:
-        """With a leak; the desired response is added after the map."""
         return replace(super().iteration, slows_desired=False, leak=self._leak)
 
     @property

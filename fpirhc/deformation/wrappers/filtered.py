@@ -43,17 +43,14 @@ class Filtered(Wrapper):
 
     @property
     def iteration(self) -> Iteration:
-        """That of the map, on the filtered error."""
         return replace(self.map.iteration, error_pole=self.pole)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The filtered error, and the memory of the map."""
         return Layout((Signal("filter_error", elements),)) + self.map.memory(elements)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the map's next request for the filtered error."""
         inner = discrete(self, memory, request.numel())
         error = self.pole * memory["filter_error"] + (1 - self.pole) * (response - desired)
         next_request, next_memory = self.map.step(request, desired + error, desired, inner)

@@ -58,19 +58,16 @@ class Guarded(Wrapper):
             raise InvalidValue(f"Guarded(largest_deformation={self.largest_deformation!r}): expected a positive number")
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """Factor, mean sign, counts and means of the guard, the last error, and the memory of the map."""
         numbers = ("sign", "oscillating", "growing", "fast", "slow", "pause", "trips", "clean", "event", "fallback")
         own = (scalar("guard_factor", start=1.0), *(scalar(f"guard_{n}") for n in numbers))
         return Layout((*own, Signal("guard_error", elements))) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The event of each cycle, the factor, and the signals of the map."""
         return {"adaptation_event": "guard_event", "adaptation_factor": "guard_factor", **self.map.shown()}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the map's next request, or the desired response after a trip and in a pause."""
         own = {name.removeprefix("guard_"): v for name, v in memory.items() if name.startswith("guard_")}
         inner = discrete(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)

@@ -50,25 +50,20 @@ class DelayWatched(Wrapper):
 
     @property
     def iteration(self) -> Iteration:
-        """That of the map: the estimate does not change it."""
         return self.map.iteration
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The memory of the estimate and of the map."""
         return _estimate_memory(elements, self.most) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The estimate, its confidence, and the signals of the map."""
         return {**_SIGNALS, **self.map.shown()}
 
     def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
-        """Return the past requests of the estimate with the held one once more."""
         return {**_estimate_held(request, memory), **self.map.held(request, memory)}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the next request of the map, unchanged."""
         inner = discrete(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
         return next_request, {**_estimated(request, response, memory, self.most), **next_memory}
@@ -97,24 +92,20 @@ class SelfPaired(Wrapper):
 
     @property
     def iteration(self) -> Iteration:
-        """With a pairing whose dead time is estimated on line."""
         return replace(super().iteration, pairing=Pairing(None))
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """Past requests, the dead time in use, the candidate and its age; the memory of the estimate and of the map."""
         past = tuple(f"{e}@{k}" for k in range(self.most + 1) for e in elements)
         counts = (scalar("pair_filled"), scalar("pair_stood"), scalar("pair_candidate"))
         own = Layout((Signal("pair_requests", past), scalar("pair_cycles", start=-1.0), *counts))
         return own + _estimate_memory(elements, self.most) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The dead time in use, the estimate, its confidence, and the signals of the map."""
         return {"paired_cycles": "pair_cycles", **_SIGNALS, **self.map.shown()}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the map's next request from the pair of the dead time in use."""
         inner = discrete(self, memory, request.numel())
         estimate = _estimated(request, response, memory, self.most)
         stood, candidate, cycles = self._adopted(estimate, memory)
@@ -133,7 +124,6 @@ class SelfPaired(Wrapper):
         return ca.if_else(valid, next_request, desired), {**pair, **estimate, **remembered}
 
     def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
-        """Return the queues with the held request once more."""
         requests: Expression = ca.vertcat(request, memory["pair_requests"])
         return {
             "pair_requests": requests[: request.numel() * (self.most + 1)],

@@ -75,14 +75,12 @@ class Tuned(Wrapper):
             )
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """Factor, counts of alternating errors that grew and that returned, the last two errors; and the memory of the map."""
         counts = scalar("tuner_growing"), scalar("tuner_returning")
         errors = Signal("tuner_error", elements), Signal("tuner_earlier", elements)
         own = (scalar("tuner_factor", start=1.0), *counts, *errors)
         return Layout(own) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The factor, and the signals of the map."""
         return {"gain_factor": "tuner_factor", **self.map.shown()}
 
     def step(
@@ -118,11 +116,9 @@ class Tuned(Wrapper):
         return ca.fmin(ca.fmax(factor * ca.exp(_RATE * rise), floor), largest)
 
     def largest_step(self) -> float:
-        """The largest step of the map times the largest factor."""
         return self.map.largest_step() * self.largest_gain / self.map.effective_gain()
 
     def with_effective_gain(self, gain: float) -> Self:
-        """Return the tuner around the map with that gain; the cap changes in the same proportion."""
         return replace(
             self,
             map=self.map.with_effective_gain(gain),

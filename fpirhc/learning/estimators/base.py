@@ -131,7 +131,6 @@ class Learner(ParameterEstimator):
     noise: Mapping[str, Deviation]
 
     def learned(self) -> tuple[str, ...]:
-        """The named parameters."""
         return tuple(self.parameters)
 
     def check(self, problem: Problem) -> None:

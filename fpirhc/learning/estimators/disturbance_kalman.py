@@ -109,11 +109,9 @@ class DisturbanceKalman(ParameterEstimator):
                 raise InvalidValue(f"DisturbanceKalman({name}={{}}): name at least one")
 
     def model(self, plant: Plant) -> Plant:
-        """The plant with the disturbances as parameters."""
         return disturbed(plant, tuple(self.drift))
 
     def learned(self) -> tuple[str, ...]:
-        """The disturbances."""
         return tuple(_disturbance_name(c) for c in self.drift)
 
     def modes(self, problem: Problem) -> Modes:
@@ -137,15 +135,12 @@ class DisturbanceKalman(ParameterEstimator):
 
     @property
     def acts_at_once(self) -> bool:
-        """Whether all disturbances are those of outputs' responses, which plans do not have and the inverse has."""
         return all("'" in name for name in self.drift)
 
     def reads_outputs(self, plant: Plant) -> bool:
-        """Whether some output that is no state, or a derivative below its response, is measured."""
         return any(n in plant.output.elements and n not in plant.state.elements for n in self.measured)
 
     def reads_response(self, plant: Plant) -> bool:
-        """Whether some response is measured."""
         return bool(self._responses(plant))
 
     def check(self, problem: Problem) -> None:
@@ -210,7 +205,6 @@ class DisturbanceKalman(ParameterEstimator):
         return np.asarray(gain)
 
     def memory(self, problem: Problem) -> Layout:
-        """The estimated state, and the modes of the disturbances."""
         model, modes = problem.plant, self.modes(problem).names
         units = [model.parameters[n].unit for n in self.learned() for _ in modes]
         return Layout(
@@ -221,12 +215,10 @@ class DisturbanceKalman(ParameterEstimator):
         )
 
     def following(self, problem: Problem) -> Following | None:
-        """The stationary gain, column by column."""
         fixed = nominal(problem)
         return following("gain", live_numbers(self), lambda v: settled(self, v).gain(fixed).ravel(order="F"), _STALE)
 
     def step(self, problem: Problem) -> Correct:
-        """Prediction by the model, and the correction by the gain."""
         model = problem.plant
         advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
         fixed = ca.DM(self.gain(problem)) if self.following(problem) is None else None
@@ -254,7 +246,6 @@ class DisturbanceKalman(ParameterEstimator):
         return correct
 
     def waiting(self, problem: Problem) -> Wait:
-        """Prediction by the model alone; the disturbances move by themselves."""
         model = problem.plant
         advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
         places = [model.parameter.elements.index(n) for n in self.learned()]

@@ -68,7 +68,6 @@ class MovingHorizon(Learner):
                 raise InvalidValue(f"MovingHorizon({name}={value!r}): expected a whole number from 1 to {most}")
 
     def memory(self, problem: Problem) -> Layout:
-        """The scaled estimate z, the prior's mean and information, and the window, newest pair first."""
         size, names = len(self.parameters), self.learned()
         information = tuple(f"{i},{j}" for j in range(size) for i in range(size))
         row = _row_size(problem)
@@ -83,7 +82,6 @@ class MovingHorizon(Learner):
         )
 
     def step(self, problem: Problem) -> Correct:
-        """Exchange of one pair in the window, and the Gauss-Newton steps."""
         plant, size, row = problem.plant, len(self.parameters), _row_size(problem)
         residual = self.residual(plant)
         pair = _pair_function(problem, residual)

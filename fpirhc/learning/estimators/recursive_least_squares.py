@@ -55,12 +55,10 @@ class RecursiveLeastSquares(Learner):
         self._require(self.time)
 
     def memory(self, problem: Problem) -> Layout:  # noqa: ARG002
-        """The scaled estimate z and its covariance P, column by column."""
         size = len(self.parameters)
         return Layout((_estimate(self.learned()), _covariance(size)))
 
     def step(self, problem: Problem) -> Correct:
-        """One update of the estimate and its covariance."""
         plant, size = problem.plant, len(self.parameters)
         residual = self.residual(plant)
         factor = forgetting_factor(self.time, problem.period)

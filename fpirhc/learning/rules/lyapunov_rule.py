@@ -36,7 +36,6 @@ class LyapunovRule(Rule):
 
     @property
     def reads_response(self) -> bool:
-        """Whether the rule uses the equation: it uses the gradient instead."""
         return False
 
     def check(self, bounds: Bounds) -> None:

@@ -46,7 +46,6 @@ class Projection(Rule):
 
     @property
     def reads_response(self) -> bool:
-        """Whether the rule uses the equation: it does."""
         return True
 
     def check(self, bounds: Bounds) -> None:
@@ -62,7 +61,6 @@ class Projection(Rule):
                 )
 
     def change(self, evidence: Evidence, bounds: Bounds, period: float) -> Expression:
-        """Return the gated projection step; `period` does not matter."""
         del period
         matrix, error = evidence.equation()
         widths = ca.DM([(upper - lower) ** 2 for lower, upper in bounds.values()])

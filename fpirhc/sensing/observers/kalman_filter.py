@@ -76,12 +76,10 @@ class KalmanFilter(StateObserver):
         name_mistakes("KalmanFilter", plant, measured, self.measured, self.noise, self.start).raise_if_any()
 
     def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
-        """The whole state: measured states come filtered."""
         del known
         return plant.state.elements
 
     def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
-        """The quantities whose noise is named."""
         del measured
         return tuple(self.measured)
 
@@ -104,7 +102,6 @@ class KalmanFilter(StateObserver):
         )
 
     def predict(self, model: Model) -> Predict:
-        """One cycle of the model."""
         calm = np.zeros(len(model.plant.names))
 
         def predicted(evidence: Evidence, memory: Remembered) -> Expression:
@@ -113,7 +110,6 @@ class KalmanFilter(StateObserver):
         return predicted
 
     def correct(self, model: Model) -> Correct:
-        """The correction by what is measured; a sample that shows the start once more corrects nothing."""
         spread, gain = self._spread_function(model), self._gain_function(model)
 
         def corrected(
@@ -131,7 +127,6 @@ class KalmanFilter(StateObserver):
         return corrected
 
     def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
-        """What cannot be observed along the reference."""
         del known
         return unobservable(slopes, shown)
 

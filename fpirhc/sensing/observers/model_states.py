@@ -33,16 +33,13 @@ class ModelStates(StateObserver):
         """Accept every plant."""
 
     def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
-        """All states that are not known."""
         return tuple(e for e in plant.state.elements if e not in known)
 
     def memory(self, model: Model) -> Layout:
-        """The state from which the model goes on."""
         state = model.plant.state
         return Layout((Signal("observer_state", state.elements, state.units, tuple(map(float, model.start))),))
 
     def predict(self, model: Model) -> Predict:
-        """One cycle of the model."""
         calm = np.zeros(len(model.plant.names))
 
         def predicted(evidence: Evidence, memory: Remembered) -> Expression:
@@ -51,7 +48,6 @@ class ModelStates(StateObserver):
         return predicted
 
     def correct(self, model: Model) -> Correct:
-        """The known states in their places."""
         elements = model.plant.state.elements
 
         def corrected(
@@ -64,7 +60,6 @@ class ModelStates(StateObserver):
         return corrected
 
     def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
-        """The states that are not known; all states where the model runs by itself."""
         del shown
         every = np.eye(len(slopes[0]))
         return np.delete(every, list(known), axis=1) if self.corrected else every

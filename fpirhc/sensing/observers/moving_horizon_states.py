@@ -312,18 +312,15 @@ class MovingHorizonStates(StateObserver):
         mistakes.raise_if_any()
 
     def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
-        """The whole state: measured states come filtered."""
         del known
         return plant.state.elements
 
     def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
-        """The quantities whose noise is named."""
         del measured
         return tuple(self.measured)
 
     @property
     def opaque(self) -> bool:
-        """True: the window is a loop, and not written out."""
         return True
 
     def memory(self, model: Model) -> Layout:
@@ -355,7 +352,6 @@ class MovingHorizonStates(StateObserver):
         )
 
     def predict(self, model: Model) -> Predict:
-        """One cycle of the model from the newest state of the window."""
         calm, size = np.zeros(len(model.plant.names)), model.plant.state.size
         smoother = self._smoother(model)
 
@@ -367,7 +363,6 @@ class MovingHorizonStates(StateObserver):
         return predicted
 
     def correct(self, model: Model) -> Correct:
-        """The exchange of one sample in the window, and the Gauss-Newton steps."""
         smoother, count = self._smoother(model), self.window + 1
         size, few, step = model.plant.state.size, len(self.noise), smoother.step(count)
 
@@ -392,7 +387,6 @@ class MovingHorizonStates(StateObserver):
         return corrected
 
     def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
-        """What cannot be observed along the reference."""
         del known
         return unobservable(slopes, shown)
 

@@ -33,30 +33,24 @@ class LinearMap(Deformation):
         return Iteration(limited=False)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The gain."""
         del elements
         return Layout((scalar(GAIN, start=self.gain),))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return r - a (f - d)."""
         return request - memory[GAIN] * (response - desired), {GAIN: memory[GAIN]}
 
     def effective_gain(self) -> float:
-        """The gain a."""
         return self.gain
 
     def secant_gain(self) -> float:
-        """The gain a."""
         return self.gain
 
     def largest_step(self) -> float:
-        """Infinite."""
         return float("inf")
 
     def with_effective_gain(self, gain: float) -> Self:
-        """Return the map with another gain."""
         return replace(self, gain=gain)
 
 

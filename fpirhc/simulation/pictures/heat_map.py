@@ -47,7 +47,6 @@ class HeatMap(Picture):
             raise InvalidValue(f"HeatMap({self.title!r}, rows=()): expected at least one signal, such as 'state.q'")
 
     def size(self, count: int) -> tuple[float, float]:
-        """Return a height of 1.6 inches for each panel."""
         return 11.0, 1.6 * count + 0.6
 
     def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:

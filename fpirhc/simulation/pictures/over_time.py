@@ -37,7 +37,6 @@ class OverTime(Picture):
     controllers: tuple[str, ...] = ()
 
     def size(self, count: int) -> tuple[float, float]:
-        """Return a height of 2.3 inches for each panel, whatever the number of controllers."""
         del count
         return 11.0, 2.3 * len(self.panels) + 0.6
 

@@ -36,7 +36,6 @@ class Portrait(Picture):
     controllers: tuple[str, ...] = ()
 
     def size(self, count: int) -> tuple[float, float]:
-        """Return a width of 3.7 inches for each panel."""
         return max(5.5, 3.7 * count), 3.6
 
     def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:

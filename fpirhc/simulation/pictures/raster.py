@@ -35,7 +35,6 @@ class Raster(Picture):
     controllers: tuple[str, ...] = ()
 
     def size(self, count: int) -> tuple[float, float]:
-        """Return a height of a third of an inch for each row."""
         return 11.0, 0.33 * count + 1.1
 
     def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:

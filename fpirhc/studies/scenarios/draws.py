@@ -152,7 +152,6 @@ class RandomScenarios(Scenarios):
         exact_ranges(self.of.moved, self.percent)
 
     def __getitem__(self, number: int) -> Scenario:
-        """Return scenario `number` of the seed."""
         plant, facts = self.of.moved, {"seed": self.seed, "use": self.use, "percent": self.percent}
         one = draw(plant, number=number, model=self.of.plant, **facts)  # type: ignore[arg-type]  # of several types
         lateness = one.lateness if self._draws_dead_times else 0
@@ -161,7 +160,6 @@ class RandomScenarios(Scenarios):
         return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, problem, self._shared)
 
     def automatic(self, controller: Controller) -> Controller:
-        """Return the controller with the automatic settings for the problem's own dead times, whatever the plant's are."""
         return resolved(self.of, controller) if self._draws_dead_times else controller
 
     @cached_property
@@ -200,7 +198,6 @@ class NamedCases(Scenarios):
     _shared_builds: dict[object, Problem] = field(default_factory=dict, init=False)
 
     def __getitem__(self, number: int) -> Scenario:
-        """Return the case at a place."""
         name = self.cases.names[number]
         key, own = self.cases.key(name), self.cases.seed(name)
         if key not in self._built:
