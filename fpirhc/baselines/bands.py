@@ -2,12 +2,7 @@
 
     half-width = max(3 (max_i v_i - min_i v_i), 1e-6 |v|, floor),        v nominal, v_i under the variants of one source, and v.
 
-The factor is three, because another draw of a normal value then leaves a band from eight seeds about once in 10 000 times (30
-times as often with five seeds). A count that is the same under all variants is exact. How a number is compared, its metric says:
-
-    exact   counts, statuses, sizes: equal or changed
-    tight   optimal costs of open-loop plans: equal to 1e-6
-    banded  results of a closed loop: inside a band, also where the variants of another class disagree
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

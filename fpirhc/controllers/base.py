@@ -1,13 +1,6 @@
 """The part of a control cycle that all controllers share; the contract itself is in `contract`.
 
-Every controller reads (time, state, realised, parameters) and ends in the same four blocks:
-
-    deform   q^Def from the pair (request, response) of the last cycle and q^Des
-    invert   the command that the model needs for q^Def
-    limit    clip it; what the clipped command means becomes the stored q^Def (anti-windup)
-    judge    one status for the cycle
-
-A command that is not finite never reaches the plant: the last command is held, and the status of the cycle is NON_FINITE.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,23 +1,6 @@
 """The gate in front of a controller: a bad sample is a skipped cycle.
 
-    sample fits, and the step is finite:  the controller's step, unchanged
-    otherwise:                            the last command again, and every memory as it was
-
-A sample fits when time, state and response - or the raw measurements that they are estimated from - are finite and inside their
-plausible range. The results of a skipped cycle are dropped. What is remembered is selected, never blended: a product with NaN would
-be NaN. A graph of calls is only given samples that fit. In a skipped cycle it is given the last good one again, so that no solver
-inside meets a number that is not finite. Scalar code has no solver inside, and needs no sample in store.
-
-An implausible sample is doubted, not refused for ever: after 20 of them in a row the plant is where it should not be, and the
-controller is given what is measured, up to 100 times the range. What is not finite is never believed.
-
-Before the first good sample nothing has begun: the command is the one before the run, and the memory is that of the start. A memory
-that is not finite is forgotten, and the controller begins anew. So is one with which no step is finite (`step_outcome`).
-
-A memory of the passing time does not stay as it was: queues, filters and observers go on, and are moved over the gap by the next
-sample (`gap`).
-
-The gate is built once, around the composed step. Loop, stepper, virtual machine and C have it alike.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

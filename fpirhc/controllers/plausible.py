@@ -1,25 +1,6 @@
 """The plausible range of a sample: what no working sensor shows.
 
-For a controlled coordinate the range follows from the values that the problem itself names, v = (reference over the run, start,
-limits of the state),
-
-    centre +- D,      D = 10 max((max v - min v) / 2, |v| / 2).
-
-Its response, the n-th derivative, is what the model has within these limits,
-
-    +- A,             A = max(10 L, 3 max |f(x, u)|),
-
-L the largest response along the reference and f over the limits of the inputs and the plausible states; and what has |q| <= D and
-|q^(n)| <= A cannot have a larger k-th derivative than
-
-    |q^(k)| <= C D^(1 - k/n) A^(k/n)                                                      (Landau and Kolmogorov),
-
-with C <= 6 for n <= 4. Where the model states no A, because an input has no limits, the whole range in half a cycle is the bound,
-D (2 / period)^k. States behind outputs have the range centre +- D of the values along the model's nominal run. Where all v are zero
-there is no scale and no range. Coordinates that are not controlled have none, because they may drift.
-
-Reference: I. J. Schoenberg, The elementary cases of Landau's problem of inequalities between derivatives, Amer. Math. Monthly 80,
-1973: the constants on the half line.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,14 +1,6 @@
 """Receding-horizon control whose nominal acceleration is deformed.
 
-Every n-th cycle, once per stage or as `Horizon(replan=...)` says, the optimiser plans inputs u_0 ... u_{N-1} with the approximate
-model. The response that the model gives to the plan's first input is the nominal one; it is re-evaluated in every cycle at the
-measured (or propagated) state, deformed, inverted, and applied. The deformation changes the command by
-
-    delta = command - planned input,
-
-so the optimiser is given input bounds shifted by -delta of the last cycle, and its plan stays feasible for the actuator.
-
-The first plan is computed before the run, for the problem's start, so that a call of the loop only has to follow the changes.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,15 +1,6 @@
 """Where a horizon starts and what is tracked between two plans: three choices.
 
-`FromMeasurement` -- every plan starts from the measured state; the model's response to the plan's first input at the measured
-state is the nominal and desired response, q^Des = f(x, u_0). There is no tracking law: feedback comes from planning anew. As
-the response error goes to zero the plant becomes the model for the optimiser, so the plan's stability carries over.
-
-`FromMeasurementTracked` -- every plan starts from the measured state; between plans the model propagates the planned motion and a
-tracking law keeps the plant on it. The law corrects errors within a stage; the tracking error is forgotten at every new plan.
-
-`FromPlan` -- the plan starts from the model's own propagated state and is independent of the measured one; a tracking law keeps
-the plant on the planned motion. Limits bind the model's motion, not the plant's. A deformation still shifts the limits of the
-planned inputs by its last change of the command, so with one the plans are not the same for every plant.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

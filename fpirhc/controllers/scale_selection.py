@@ -1,12 +1,6 @@
 """How much the desired response of a controller changes: the basis of a deformation's automatic settings.
 
-The sigmoid, for example, moves the request by at most 0.81 S per cycle (for D = 0.3). So S must cover the largest change of the
-desired response per cycle, or the loop falls behind and diverges. The desired response of a tracking law changes as its reference
-does; a plan may move between the input limits within one cycle.
-
-Around a tracking law the step must also cover the errors from which the loop is to come back. Their
-size is unknown before a run. The error of a model is assumed to be no larger than the effect of the model's own command:
-|f - d| <= |r^N - response(x^N, 0)|, along the reference.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -2,18 +2,7 @@
 
     delta_k = p delta_{k-1} + (1 - p) G(delta_{k-1-d}),
 
-where G is a map whose effective gain times the plant's gain is g. Where the true dead time is d', the deformation follows
-
-    1 - p / z = (1 - p) (z^-(d+1) - g z^-(d'+1)).
-
-It is stable for every d and d' with |d' - d| <= m if
-
-    0 < g < 2    and    4 p / (1 - p)^2 > g (2 + g) m^2.
-
-Proof. On the circle z = e^{iw} the left side is at least what the right side must stay below: |1 - p / z|^2 = (1 - p)^2
-+ 4 p sin^2(w / 2), and with n = d' - d the right side's bracket has |1 - g e^{-inw}|^2 = (1 - g)^2 + 4 g sin^2(n w / 2). Since
-|sin(n w / 2)| <= |n| |sin(w / 2)| and <= 1, both inequalities above make the left side the larger one for all w. Then, by Rouche's
-theorem, the equation has as many roots outside the circle as 1 - p / z = 0, which has none there.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

@@ -1,22 +1,6 @@
 """The model-referenced form: the iteration runs on the difference between the measured response and the model's.
 
-    undeformed = f^(x_k, u_{k-1}) - delta_{k-1}
-    delta_k    = G(undeformed + delta_{k-1}, f_k, undeformed) - undeformed
-    request_k  = desired_k + delta_k
-
-f^ is the model's response to the command that acted, f_k the measured one, G any map. So the iteration runs on f - f^, the error of
-the model:
-
-    an exact model leaves delta at zero, whatever the task, the period, or how far the plant drifts within a cycle;
-    a clipped command needs no anti-windup, because f^ is the model's response to the clipped command;
-    with the affine map it is the additive disturbance estimate w+ = w + a (f - f^ - w), delta = -w; with a = 1 it is incremental
-    dynamic inversion, u_k = u_{k-1} + (d_k - f_k) / beta^.
-
-On f = lambda r the factor per cycle is 1 - a lambda, as in the other forms. The forms differ in what drives the error: here the
-change of f - f^, in the plain form the change of f. But a change of the desired response passes with the model's wrong gain.
-
-f^ reaches the iteration the way f does: after the same dead time, through the same estimator and the lag of the actuators
-(`Mirror`). With a dead time delta is leaky and paired with its own response, as in `Increment`.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

@@ -1,14 +1,6 @@
 """The abstract-rotation fixed point transformation.
 
-Response f and desired d are augmented by a dummy component to vectors of equal norm R; the rotation that turns the
-augmented f towards the augmented d, by a fraction of the angle between them, is applied to the augmented request.
-
-With unit vectors a = f/R, b = d/R (augmented), their angle phi and the skew matrix B = b a' - a b', the rotation by
-theta is
-
-    O = I + sin(theta)/sin(phi) B + (1 - cos(theta))/sin(phi)^2 B^2,
-
-which, unlike the usual form with a unit vector along b - (a'b) a, needs no direction that is undefined at phi = 0.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

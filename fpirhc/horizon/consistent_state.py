@@ -1,24 +1,6 @@
 """The state of the model at which its outputs and their derivatives are the measured ones, y^(j) = h_j(x*, p), j < r.
 
-A wrong model computes other derivatives of its outputs at the measured state than are measured. A deformation makes y^(r) that of
-the model, so the plant moves like the model along y, y', ..., y^(r-1). A plan foresees this where it starts from the same numbers:
-then y(t) = h(x^(t)) for every input, since both obey y^(r) = L_f^r h (x*(y, y', ...), u). At the measured state it holds only where
-the response of the model does not depend on the state.
-
-The state is looked for by Newton's method, along the directions in which other inputs of the past would have moved it,
-
-    x* = x + sum_j sum_{k < r_j} c_jk ad_f^k g b_j,
-
-with the inputs b_j that move y_j^(r_j) alone, column j of (L_g L_f^(r-1) h)^-1, as many numbers as equations. <dL_f^l h_i, ad_f^k
-g b_j> is zero for k < r_i - 1 - l and (-1)^k at i = j for k = r_i - 1 - l, so the equations are triangular in k and regular
-wherever the inverse is, whatever the orders and the units. With equal orders b_j cancels.
-
-Where the steps do not contract, or would leave a physical range of the plant, the state goes a part of the way or stays,
-continuously, so that no sample decides between two plans. What is left over of the outputs is held over the horizon (see
-`shifted_reference`).
-
-References:
-    A. Isidori, Nonlinear Control Systems, 3rd ed., Springer 1995, lemmas 4.1.1 and 5.1.1.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

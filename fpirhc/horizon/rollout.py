@@ -1,12 +1,6 @@
 """Rolling the model out over a horizon, and the gradient of the cost by one backward sweep.
 
-Forward, s_{i+1} = F(s_i, u_i). Backward, with the costates lambda_N = dT/ds,
-
-    lambda_i = dl_i/ds + (dF_i/ds)' lambda_{i+1},      g_i = dl_i/du + (dF_i/du)' lambda_{i+1}.
-
-g is the reduced gradient dV/dU: the gradient of the auxiliary function with respect to the inputs once its multipliers
-make its gradient with respect to the states vanish. Both sweeps are accumulated calls of one stage Function, so the
-generated C has one copy of it for every length of the horizon.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,13 +1,6 @@
 """Anderson acceleration of a fixed-point iteration x <- T(x), safeguarded.
 
-With F = T(x) - x, type II takes the weights gamma that make |F_k - dF gamma| smallest over the last m changes dF and goes to
-
-    x+ = T(x_k) - dT gamma.
-
-Where |F| then grows beyond twice its last value, the iteration goes back to the plain T and forgets its memory. Every call does
-the same work.
-
-References: D. G. Anderson, J. ACM 12(4), 1965; H. F. Walker, P. Ni, SIAM J. Numer. Anal. 49(4), 2011.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,14 +1,6 @@
 """The contract of optimisers, and how every plan is judged.
 
-A plan's stationarity is measured by an adjoint gradient g of this package, and not by a solver's status:
-
-    stationarity = max |U - clip(U - g / (step c), lower, upper)|,
-
-the largest move of an input, in its unit, by a scaled projected gradient step. c is the curvature of the cost
-rate along each input (`OptimalControl.curvature`), so that the number does not depend on the units of the cost. It is zero
-exactly at points that satisfy the first-order conditions, bounds active or not. A multiplier of a state bound counts only where
-the state is at that bound and with the sign of that bound. Feasibility is the largest violation of a state bound by the rolled
-out plan (inputs are inside their box by construction).
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations
@@ -199,7 +191,7 @@ def _largest(value: ca.MX) -> ca.MX:
 def stationarity(
     ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.MX, upper: ca.MX, data: ca.MX | None = None
 ) -> ca.MX:
-    """Return the projected residual of a plan (see the module's docstring); live settings need the stages' data."""
+    """Return the projected residual of a plan (docs/theory-plants.md); live settings need the stages' data."""
     scale = ca.repmat(ocp.scale_in(data), 1, ocp.stages)
     return _largest(inputs - clip(inputs - scale * gradient, lower, upper))
 

@@ -2,13 +2,7 @@
 
     U+ = clip(G(U, h, 0)),     h = D g,     D = 1/(step c),
 
-with the deformation maps of the control loop: for eq. (6), U + S [zeta(A_c |h|/S + x*) - x*] h/|h|. The Jacobian of h at a strict
-minimum is D V'' > 0, so the eigenvalue condition holds without squaring. The rate is (kappa - 1)/(kappa + 1) at best, with
-kappa the condition number of D V'': tens to thousands of iterations where `FixedPoint` needs a few. It is the form that stands
-between the published method and the default.
-
-References: A. Csanadi, J. K. Tar, J. F. Bito, inverse kinematics by fixed-point transformation (2016); H. Khan, J. K. Tar,
-I. J. Rudas, Robot. Autom. Eng. J. 3(5), 2018.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

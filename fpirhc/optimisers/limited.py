@@ -1,13 +1,6 @@
 """The iteration of `FixedPoint` on horizons with limits of states, and where its plain iteration does not contract.
 
-Two settings of one Riccati sweep (`fpirhc.horizon.riccati`). The pure step is the fixed-point step with the active limits as
-equalities of the sweep, rolled out with its feedback. The interior step keeps all limits by a barrier, on a plan whose states are
-free (multiple shooting), with limits of states that give way at a price (exact L1 penalty); it runs only where pure steps do not
-contract, and ends as soon as they do. A plan is OK by its own first-order conditions once it is rolled out, never by the barrier's
-residual. Where the limits cannot be kept, the result is a plan of least violation nearby, with the status INFEASIBLE.
-
-A call ends where its plan is solved, where all first guesses have failed, or at its most iterations. In the last two cases the
-remembered plan stays in force where it is better: its cost with the price of its violations is compared.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

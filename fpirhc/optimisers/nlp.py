@@ -2,10 +2,7 @@
 
     variables    w = (s_0, u_0, s_1, ..., u_{N-1}, s_N),    constraints  s_{i+1} - F(s_i, u_i) = 0,
 
-warm-started with the shifted last plan, its rolled-out states, and its multipliers. A solver's own status is not used: the plan is
-judged by an adjoint gradient of this package, with the solver's multipliers of state bounds, and by rolling it out.
-
-References: J. A. E. Andersson et al., CasADi, Math. Program. Comput. 11, 2019.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,14 +1,6 @@
 """The reduced-gradient method, which the fixed-point optimisers replace.
 
-Lagrange's reduced gradient, found by one adjoint sweep, with projection on the input box and a line search. The step length is
-the spectral one of Barzilai and Borwein, the line search non-monotone over the last values (Birgin, Martinez and Raydan's
-spectral projected gradient): U+ = clip(U - gamma D g) if it decreases enough, else gamma is divided by four and the next
-iteration tries again from the same plan. D = 1 / (step c) scales by the curvature c along each input
-(`OptimalControl.curvature`), so that gamma is a number near 1, whatever the units of the inputs and the size of the weights.
-
-Every call does the same amount of work: one gradient per iteration.
-
-References: E. G. Birgin, J. M. Martinez, M. Raydan, SIAM J. Optim. 10(4), 2000.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,13 +1,6 @@
 """Implicit integrators with a fixed number of Newton steps, as plain expressions: for stiff plants, on horizons and in simulation.
 
-A stage of an implicit method is k_i = f(x + h sum_j a_ij k_j), solved by Newton's method from k = 0. The first Newton step is the
-linearly implicit method, exact for linear plants. The number of Newton steps is a setting, so that the work per step is fixed and
-can be compiled.
-
-    implicit midpoint   a = 1/2, b = 1                                      order 2, A-stable, keeps quadratic invariants
-    Radau IIA           a = (5/12 -1/12; 3/4 1/4), b = (3/4 1/4)            order 3, L-stable: fast modes die out in one step
-
-References: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, ch. IV.3 and IV.5.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

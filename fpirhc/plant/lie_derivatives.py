@@ -1,14 +1,6 @@
 """Outputs y = h(x, p) or h(x, u, p): quantities that are controlled or judged and are expressions of the state, or of the inputs.
 
-The derivatives of an output are Lie derivatives along the plant's motion, with the input held,
-
-    y_0 = h(x, p),    y_{k+1} = dy_k/dx x'(x, u, p, w),
-
-and its relative order r is the first k for which y_k depends on an input, decided from the symbols; it is 0 where the output itself
-does. Reference, tracking law, judging and sensors take (y, y', ..., y^(r-1)); inverse, response and horizon take the state.
-
-References:
-    A. Isidori, Nonlinear Control Systems, 3rd ed., Springer 1995, ch. 4 and 5.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,20 +1,6 @@
 """Maps x+ = f(x, u, p): plants that step, and have no differential equation.
 
-A map with steps of T moves by divided differences where a differential equation moves by derivatives,
-
-    (delta x)_k = (x_{k+1} - x_k) / T = (f(x_k, u_k, p) - x_k) / T,
-
-and the chain of an output is made of them, y_{j+1} = (y_j(f(x, u, p), p) - y_j(x, p)) / T. The relative order r is the number of
-steps until an input shows, the same in shifts and in divided differences. What is written for derivatives is written for maps, and
-for T -> 0 it is what it was.
-
-A controller sees the plant in its own cycles. Where a cycle has k steps, its map is f applied k times with the command held, T is
-the cycle, and the relative order is counted in cycles: an input that shows after three steps shows in one cycle of three steps.
-
-References:
-    R. H. Middleton, G. C. Goodwin, Improved finite word length characteristics in digital control using delta operators, IEEE
-    Transactions on Automatic Control 31(11), 1986.
-    S. Monaco, D. Normand-Cyrot, Minimum-phase nonlinear discrete-time systems and feedback stabilization, CDC 1987 (order).
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,15 +1,6 @@
 """The plant: coordinates, inputs, relative order, response, and two sets of parameters.
 
-A plant is given by its response: the highest derivative q^(r) of every coordinate as a CasADi expression of the lower
-derivatives, the inputs u and the parameters p,
-
-    q_i^(r_i) = f_i(q, q', ..., u, p).
-
-The controller computes with the approximate parameters, and the simulated plant moves with the exact ones. The state vector is
-derivative-major: all q, then the q' of the coordinates with order >= 2, and so on; its entries are named q1, q1', q1''.
-
-The plant names the unit of time. Every time and rate of a problem (its period, a tracking law's rate) is in this unit; the numbers
-themselves are not converted anywhere.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -2,17 +2,7 @@
 
     Q = Y(q, q', q'') theta + Q0(q, q', q''),     M = dQ/dq'',     C = (M' + E - E^T) / 2,  E = d(M q')/dq,
 
-where theta are parameters of the plant, or combinations of them that the user names, and Q0 is the part without them.
-C is the Coriolis matrix of Christoffel's symbols, linear in a velocity of its own, so that M' - 2 C is skew-symmetric; with it
-
-    Q = M v' + C v + (Q(q, q', 0) - C q') = Y_s(q, q', v, v') theta + Q0_s
-
-splits a second velocity v from the actual one. All of it comes from the plant's symbols. With dQ/dp = Y dtheta/dp at one or more
-fixed p, Y = [dQ/dp ...] [dtheta/dp ...]^+. The identity Q = Y theta + Q0 is then tested at random points; a false identity fails
-there with probability one.
-
-References: J. J. Craig, P. Hsu, S. S. Sastry, Int. J. Robotics Research 6(2), 1987. J.-J. E. Slotine, W. Li, Int. J. Robotics
-Research 6(3), 1987.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,17 +1,6 @@
 """The points of a review: points of the reference, and draws of the exact parameters from their box.
 
-The exact parameters are drawn from the range of a mismatch (see `fpirhc.plant.mismatch`) and from all points between this range and
-the approximate parameters,
-
-    p = (1 - s) p_range + s p_approximate,        0 <= s <= 1,
-
-with one s for all parameters: those of a plant belong together, as bristles and the friction that they carry do, and nobody
-believes in a plant with one of each kind. At every point the symbols give the input u* that the reference needs and the request r*
-for which the model computes this input:
-
-    u* = inverse(x^N, r^N; exact),        r* = response(x^N, u*; approximate),
-
-so that f(r*) = r^N: r* is the fixed point that a deformation is to find.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,19 +1,6 @@
 """The effect of adaptation on the response, predicted before a run of the plant.
 
-The model is run once as its own plant, with the controller but without its deformation: the nominal run, with states
-x_k and desired responses d_k. Where outputs follow the reference, the states at which a wrong model would have them are not
-those of the plant, so there the run is that of the plant under the controller with the exact model. Along it the deformation
-alone is iterated with the plant's response, by the library's own blocks from the deformation to the limits,
-
-    f_k = response(x_k, u_{k-1}; exact),    r_k = G(r_{k-1}, f_k, d_k),    u_k = inverse(x_k, r_k; approximate),
-    e_k = response(x_k, u_k; exact) - d_k,
-
-so nothing is integrated and e_k is known to first order in the deviation of the plant's run from the nominal one.
-What acts on that deviation over cycle k is the difference of the mean responses,
-
-    w_k = (response(x_k, u_k) + response(x_{k+1}, u_k)) / 2 - (d_k + the model's response(x_{k+1}, u^_k)) / 2,
-
-where u^_k is the model's own command. The same recursion serves without adaptation and with the model as the plant (the null run).
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,15 +1,6 @@
 """The recommended gain of a map: half of the smallest limit of its whole loop. Every command that names a gain takes it from here.
 
-Limits of the effective gain a are set by
-
-    the steepest secant     a secant times every eigenvalue of the box is below 2, less behind a delay, an estimator or a filter
-    a two-cycle             the secant at which the whole loop has a bounded two-cycle, see `fpirhc.contraction.large_errors`
-    the poles               a pole of the whole loop (tracking law or plan, delay, filter) reaches the unit circle, at a point of
-                            the reference or in a draw of the box
-    the margins             the gain margin of an input's loop falls below 1.4, or its phase margin below 25 degrees
-
-Below half of the first three the gain may double before anything happens; margins have their distance in themselves. In the plain
-form a gain that is too small is no good either: where half of the limit does not keep up with the plan, no gain is recommended.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,24 +1,6 @@
 """Margins that keep a plant inside its limits of states although the model of the plans is wrong.
 
-A plan starts from the measured state. What the model does not predict over one control cycle moves the state by
-
-    d_k = advance(x_k, u_k; exact) - advance(x_k, u^_k; believed)
-
-along the nominal run, where u_k is the command with the deformation and u^_k the model's own. From then on the closed loop of
-plant = model without deformation carries this deviation on: H_l is its response after l cycles to a deviation of the state. So i
-stages after a plan was made the plant is away from it by at most
-
-    m_i = max over k of  sum over l < i n of |H_l d_(k-l)|,        n = cycles per stage,
-
-entry by entry, to first order, whatever the signs are. The run's first moments, up to `measure_from`, do not count: adaptation has
-not found the plant yet. A plan that keeps m_i from its limits after stage i leaves room for this, and for the plans that follow it.
-These are the restricted constraints of robust MPC (L. Chisci, J. A. Rossiter, G. Zappa, Automatica 37(7), 2001), with the
-feedback of the loop itself and the deviations that adaptation leaves.
-
-The largest |d_k| are jumps of the desired response, five to seven times their root mean square. A bound that lets them return in
-every cycle is needlessly wide. One in the order of the run misses what the run with margins does differently, and what happens
-between two stages. So the margins are verified: the plants run with them, and what a limit of a state is still passed by is added,
-until no run passes one.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,17 +1,6 @@
 """The contract of derivative estimators: state and response from the measured quantities.
 
-A request r_{k-1}, the deformed response, is held from t_{k-1} to t_k, so every linear estimate of the response is
-a weighted sum of past requests,
-
-    f_k = lambda sum_j w_j r_{k-j},     sum_j w_j = 1,
-
-and is later than the ideal pair (r_{k-1}, f_k), for which w_1 = 1, by the weights' centre: sum_j (j - 1) w_j cycles. A
-deformation that compares f_k with r_{k-1} needs a smaller gain. A deformation that is given the delay, Paired(map, cycles=...),
-keeps its gain.
-
-An n-th difference of positions over T^n answers requests held over T with the weights of a B-spline, A(n, j) / n! (A:
-Eulerian numbers): 1; 1/2, 1/2; 1/6, 4/6, 1/6; ... . Every other formula for the n-th derivative is an average of such
-differences.
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

@@ -1,11 +1,6 @@
 """What cannot be observed along a motion.
 
-An error e of the believed state follows e' = A(t) e and shows as C(t) e. It never shows if it lies in a space V with
-
-    C_i V = 0   and   A_i V in V      for all instants i;
-
-the largest such space is found from the kernel of all C_i by leaving out, again and again, what some A_i moves out of it. At one
-instant it is the kernel of Kalman's observability matrix, without its powers of A, which would hide slow states among fast ones.
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

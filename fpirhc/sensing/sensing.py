@@ -2,16 +2,7 @@
 
     true plant -> sensors -> measurement dead time -> [estimator -> controller]
 
-Where sensing is not ideal, a run's `state` and `realised` are the estimates that the controller receives. The true signals are
-`plant_state` and `plant_realised`, the sensors' output is `measured`, which reaches the estimator after the dead time as `arrived`,
-and `true_error` counts in the metrics. Random series are drawn before the run, so the loop itself stays a function.
-
-An estimator and the controller behind it are one step from raw measurements to the command (`fpirhc.controllers.sensing_chain`): a
-controller on a machine is given what its sensors show.
-
-Before the run there are no samples, so the first estimates of the response are not measured ones. The deformation therefore waits
-for `warm_up_cycles`, until the estimator's window holds samples of this run alone; until then the deformed response is the desired
-one.
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

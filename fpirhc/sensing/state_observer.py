@@ -1,12 +1,6 @@
 """The contract of observers: states of the model that no sensor shows, from the own commands and from what is measured.
 
-    x-_k = F(x^_{k-1}, u_{k-1}, p)         the model over one cycle, with the command that acted
-    x^_k = x-_k corrected by what is measured
-
-An observer lives in the time of the samples: with a measurement that is late by d cycles, x^_k is the state at t_{k-d}, as every
-measured state is, and u is the command that acted then.
-
-The response is never believed. The model's response to a command is the request itself, from which a deformation learns nothing.
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

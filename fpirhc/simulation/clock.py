@@ -1,12 +1,6 @@
 """The time of a machine's steps: whether it can follow that of the step before, missed cycles, and how long steps take.
 
-    first step         any time that resolves a period, |t| <= 2^42 T
-    next step          t - before >= T / 2, and at most 100 000 periods; beyond 1.5 T cycles were missed
-    otherwise          the cycle is skipped, with the status BAD_TIME
-
-A time in nanoseconds, one that repeats or goes back, and 1e18 s are no such times. A clock that was set is believed after twenty
-times in a row that are a period apart, each from the one before. After a time that is no number, or absurd, the expected one goes
-on by a period; a repeated one is the same cycle again.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,20 +1,6 @@
 """Lyapunov's view of a run with an exponential tracking law: V = S^2 / 2, and the bound that the response error sets.
 
-With S = (d/dt + rate)^n e_int (without integral: (d/dt + rate)^(n-1) e) the law prescribes S' = -rate S. The plant answers
-with the response error h = q^(n) - q^(n),Des, so S' = -rate S - h and
-
-    V' <= -2 rate V + |h| (2 V)^(1/2),     |S(t)| <= max(|S(t0)|, sup|h| / rate) from any t0 on, ultimately sup|h| / rate.
-
-A deformation makes |h| small: it brings V near zero and keeps it there; V does not go to zero for a task that varies in time.
-Several coordinates are taken together, with Euclidean norms. The h of a cycle is its mean over the cycle, weighted as it enters S:
-
-    S_{k+1} = q S_k - (1 - q) h_k / rate,     q = exp(-rate period),
-
-so it holds what the held command and the plant's motion between two samples add, and the bound is true for every run. The view is
-in the spirit of the Lyapunov interpretations of fixed-point transformations by the group of J. K. Tar.
-
-References:
-    J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,15 +1,6 @@
 """What each measured quantity allows to know of the residual: the smallest error of any estimate, before a run.
 
-The residual w of the model drifts as a random walk of density D (response unit / s^0.5) and is measured through n - 1 integrators,
-with a noise of deviation s per sample of the period T: n = 1 is the response itself, n = 2 the derivative below it, and so on. The
-optimal filter is a Butterworth filter of order n with the bandwidth omega = (D^2 / (s^2 T))^(1 / 2n), and for omega T < 0.3
-
-    Var(w - w^) = c_n D^(2 - 1/n) (s^2 T)^(1 / 2n),      c_n = 1 / sin(pi / 2n) = 1, 1.414, 2, 2.613, ...
-
-So a measured response tells more than a derivative below it if s_f^2 T^0.5 < 2 D s_v. A deformation of the gain T omega, and
-offset-free control with a filter that measures the response, are both the case n = 1. With a plant whose gain is lambda times the
-model's the filter's polynomial is s^n + ... + lambda omega^n: stable for any lambda for n = 1 and 2, below 4 for n = 3, and below
-2.414 for n = 4.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,17 +1,6 @@
 """The contract of everything that happens in a control cycle, and how blocks become one Function.
 
-A `Block` reads named signals, writes named signals and may remember some: its `step` is written in
-CasADi expressions and has no side effects. `compose` wires blocks by signal name into one `Composite`
-whose Function maps (memory, reads) to (memory, trace). A `Delay` carries a signal to the next cycle, so that
-an early block reads what a late block (the actuator, say) wrote one cycle earlier. Signals whose name
-begins with '_' are wires between blocks and stay out of the trace.
-
-In a cycle without a sample a step does not run, and its memory stays as it is. A block whose memory is one of the passing time, a
-queue or an observer, says in `waits` what becomes of it then. `bridged` is the block in a step whose samples may be lost.
-
-Live numbers in a step (see `live`) are signals too, named 'setting.PATH'. A block reads them without declaring them, and a
-composite reads those of all its blocks. Numbers that Python computes from settings are signals 'setting.derived.NAME', declared as
-reads by the block that needs them; its `derived` computes them.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,16 +1,6 @@
 """Derivatives in two parts: the partial derivatives of the elementary operations, and what the chain rule makes of them.
 
-CasADi's Jacobian of scalar code carries one direction per variable through every operation, and divides in each direction where
-the operation divides. Here every operation's partial derivatives are computed once, beside its value, as a vector m. Products and
-sums of m alone make
-
-    the Jacobian J(m), by elimination of the intermediate results, and the pull-back J(m)' w of any weights w.
-
-Intermediate results are eliminated first where that adds no edge to the graph (this finds the Jacobians of the parts from which
-the expression was composed), and then in the order of the computation. A gradient that is wanted alone costs about as much as the
-value; a Jacobian that is wanted later repeats nothing.
-
-Reference: A. Griewank, A. Walther, Evaluating Derivatives, SIAM 2008, chapters 9 and 10 (vertex elimination).
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

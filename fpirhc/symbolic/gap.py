@@ -1,18 +1,6 @@
 """Cycles without a sample, as the blocks of a step know them.
 
-Where samples may be lost, or cycles be missed, a step reads two more numbers, which its gate writes:
-
-    gap       missing cycles between the last sample and this one; beyond the stated length it is LONG
-    settling  cycles for which what was learned is still held after a long gap
-
-A queue of samples goes on by a polynomial while samples are missing. When the next sample y arrives, the queued values q_i, which
-are i cycles old, are moved onto it. With the value q_0 that the polynomial has now, and g = gap,
-
-    q_i <- q_i + w_i (y - q_0),      w_i = max(0, g + 1 - i) / (g + 1) (g + 2 - i) / (g + 2) ... (g + n - i) / (g + n).
-
-With n = 1 and values that were repeated this is the straight line. With a polynomial of degree n - 1 through the last n samples it
-is the one of degree n through these and y: the motion of a plant of order n whose input was held. Without a gap every w_i is zero,
-and the queue stays as it is, bit by bit. For a LONG gap they are one: the values keep their differences, the derivatives.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

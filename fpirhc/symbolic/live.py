@@ -1,11 +1,6 @@
 """Numbers that stay open while a loop is built, so that a compiled loop takes other values of them.
 
-A `LiveNumber` stands in a field of a frozen value in place of a float. Steps use it as they use a float: CasADi turns it into the
-symbol of the setting, SX or MX as the block needs it, and `Block` makes that symbol one more signal that it reads. Formulas of live
-numbers are live numbers. Whatever needs the number itself while the loop is built (float, math, numpy, a branch) is refused with
-the setting's name: CasADi would make NaN of the symbol without an error.
-
-Checks that are meant for the number use `nominal`, and `LiveNumber.value` is the number of the build.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,13 +1,6 @@
 """Compilation of Functions to C, with a content-addressed cache of the compiled libraries.
 
-The key of a library is a hash of the generated C, the compiler and its version, the flags, the machine and CasADi's version, so
-a library can never be another model's. It is compiled in a folder of its own, its checksum is stored, and both are renamed into
-place atomically: any number of processes may compile the same or different Functions at once. A library whose checksum does not
-fit is compiled again, and so is one that another user may have written (see `private_folder`). The loops of optimisers are files of
-their own, whose objects are kept in the same way, so that the libraries of several controllers share them.
-
-FPIRHC_CC names the compiler ('none' turns compilation off); FPIRHC_CACHE names a folder, in which the cache has one of its own.
-A compiled Function has no derivatives: differentiate first, compile last.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

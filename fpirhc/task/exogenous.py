@@ -1,13 +1,6 @@
 """Signals from outside: quantities that act on a plant and that nobody controls, such as weather, load, demand or prices.
 
-A signal is declared in the plant, `parameters={"ambient": outside(nominal=293.0, unit="K")}`, and read as `p.ambient`. Its values
-are those of the problem, `Problem(signals={"ambient": Known(Samples(...))})`. The plant gets the real values, the model what it is
-told: the same ones, others, or the nominal value. A course of values that the model knows is previewed: every stage of a horizon
-has its own.
-
-As a disturbance, a signal is sampled once per control cycle and held. The sample is that of the middle of the cycle, so its mean
-over the cycle is right to second order, and a step at the boundary of two cycles is never off by one. A stage takes the middle of
-the stage.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -1,12 +1,6 @@
 """A foreign reality: hardware, another simulator, a physics engine. The loop is the same, its plant is an object outside.
 
-    measurements = body.reset(seed)                    at the start
-    measurements = body.step(time, command)            in every cycle: apply the command for one period, then measure
-
-`ExternalPlant(make=...)` makes the body anew for every run, with values of its parameters, which studies draw.
-
-The measurements are quantities of the model, in the order that `ExternalPlant(measures=...)` says. A bad answer - an exception,
-another shape, a number that is not finite, an answer after the deadline - is held or ends the run. Nothing before it is lost.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

@@ -2,11 +2,7 @@
 
     command -> reality x' = f(x, u, p) -> its coordinates of the model's names, with their derivatives -> sensing -> controller
 
-The derivatives that the controller is given are those of the moving plant (Lie derivatives), up to the model's relative order. What
-the model does not know - an actuator's lag, a motor behind a spring, bristles - are further coordinates of the reality.
-
-With a reality, "exact" means its parameters: studies draw them, their bounds and spreads count, and `ExactModel` takes the reality
-itself as its model. The exact values of the model's own parameters move nothing.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

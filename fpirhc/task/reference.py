@@ -1,12 +1,6 @@
 """References: the nominal motion and its derivatives, as a function of time; of a map its divided forward differences.
 
-Every reference gives one Function t -> (nominal state, nominal response): the coordinates with all derivatives that the
-plant's state has, and the highest derivative of each. Derivatives come from automatic differentiation. Whatever is decided before a
-run (scales, reviews, first plans) uses this nominal motion.
-
-A reference may depend on more than the time: on values that a run is given, and on a memory. Such a reference has a block of its
-own in the controller's step. The block reads what is given from outside, and writes the reference's own signals, from which motion
-and preview follow in every cycle. Without own signals the motion is the nominal one.
+Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations

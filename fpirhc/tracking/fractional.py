@@ -1,25 +1,6 @@
 """Power-law decay of the tracking error by a derivative of fractional order, for any relative order.
 
-With e = q^N - q, e_int its integral and S = (d/dt + rate)^n e_int the exponential law prescribes S' = -rate S. This one prescribes
-Caputo's derivative of order beta instead,
-
-    D^beta S = -rate^beta S,     so that     S(t) = S_0 E_beta(-(rate t)^beta)
-
-with the Mittag-Leffler function E_beta: faster than exponential at first and slower later (like t^-beta) for beta < 1, the
-exponential for beta = 1, a damped oscillation for beta > 1, where Caputo's derivative also needs S'(0), taken as zero. In control
-cycles it is the sum of Gruenwald and Letnikov over the last L cycles, solved for the S of the next cycle,
-
-    sum_{j=0}^{L} w_j (S - S_0)_{k+1-j} = -(rate period)^beta S_{k+1},     w_0 = 1,  w_j = w_{j-1} (1 - (beta + 1) / j),
-    q^(n),Des = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) e^(s) - (S_{k+1} - S_k) / period.
-
-The law needs L multiplications and L remembered numbers per coordinate in every cycle, L = memory / period. For beta < 1 it answers
-a change of the measured S with the gain (1 - beta) / period, many times `rate`, in the next cycle, and the first desired response
-is large. So a constant response error h leaves S = period^(1-beta) h / rate^beta, less than the h / rate of the exponential law,
-while measurement noise and dead time matter more. For beta > 1 both effects are reversed.
-
-References:
-    I. Podlubny, Fractional Differential Equations, Academic Press 1999, ch. 2 and 7 (sum, short memory).
-    D. Matignon, Stability results for fractional differential equations, CESA 1996 (stable for beta < 2).
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

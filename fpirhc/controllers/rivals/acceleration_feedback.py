@@ -1,20 +1,6 @@
 """Computed torque with feedback of the measured response: u = model(q^Des) + K (q^Des - q^(n)).
 
-K is kappa times the model's inertia: the request is r_k = d_k - kappa h_k with h_k = f_k - d_k, f_k the response to the last
-request and d_k the desired one; h may be low-passed with the pole p = exp(-period / time_constant). Where the response is
-f = J r + c with constant eigenvalues of J,
-
-    error left by a constant residual w = c - (1 - J) d:  h = w / (1 + kappa J),
-    stable for  kappa lambda_max(J) < (1 + p) / (1 - p).
-
-So without a filter the error can at most be halved; a filter lowers it further, the more the slower it is. The law is proportional
-in the response, whereas a deformation sums. It remembers only the state of the filter.
-
-It is in the spirit of the references, which design K and the filter in continuous time.
-
-References:
-    J. Studenny, P. R. Bélanger, Robot manipulator control by acceleration feedback, IEEE CDC 1984.
-    B. de Jager, Acceleration assisted tracking control, IEEE Control Systems 14(5), 1994.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,22 +1,6 @@
 """Active disturbance rejection control: a linear extended state observer of the output, and feedback of what it estimates.
 
-The output is believed to be an integrator chain of its relative order n with the model's input gain b_0 and one more state, the
-total disturbance z_{n+1}, which takes the place of the rest of the model:
-
-    z_i' = z_{i+1},  z_n' = z_{n+1} + b_0 u,  z_{n+1}' = 0,      corrected by y - z_1,      all observer poles at -w_o,
-    u = b_0^-1 (q^(n),N + k_1 (q^N - z_1) + ... + k_n (q^(n-1),N - z_n) - z_{n+1}),      all modes of the errors at -w_c.
-
-In cycles of T the chain is exact for held commands, the correction is that of the newest sample, and the poles are exp(-w_o T) in
-z. It measures the outputs alone, and is told of clipped commands. Usual is w_o = 3 to 10 w_c.
-
-As w_o goes to infinity the observer is deadbeat, and for n = 1 z_2 is the last difference of y less b_0 u: the fixed-point
-iteration of unit gain on the response by differences, command by command. A slower one is a filter of order n + 1 on positions.
-
-References:
-    J. Han, From PID to active disturbance rejection control, IEEE Trans. Industrial Electronics 56(3), 2009.
-    Z. Gao, Scaling and bandwidth-parameterization based controller tuning, American Control Conference 2003.
-    R. Miklosovic, A. Radke, Z. Gao, Discrete implementation and generalization of the extended state observer, American Control
-    Conference 2006.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,16 +1,6 @@
 """Model reference adaptive control by nested errors that decay, with a deformation that realises the highest derivative.
 
-With e = y - q, y the reference model's motion, and rates k_1 ... k_n the nested errors are
-
-    z_1 = e,    z_{i+1} = z_i' + k_i z_i + z_{i-1}   (z_0 = 0),    and    z_n' = -k_n z_n - z_{n-1}
-
-gives q^(n),Des. Then V = (z_1^2 + ... + z_n^2) / 2 has V' = -sum k_i z_i^2 - z_n h: it falls where the response error h is zero.
-The deformation keeps h small, where the textbook adapts parameters by a Lyapunov function. The fixed-point iteration in place of
-the adaptation is in the spirit of the group of J. K. Tar. (Every z is in the unit of the coordinate and time is in seconds, so
-z_{i-1} has the factor 1 1/s^2.)
-
-References:
-    M. Krstić, I. Kanellakopoulos, P. Kokotović, Nonlinear and Adaptive Control Design, Wiley 1995, ch. 2 (nested errors).
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

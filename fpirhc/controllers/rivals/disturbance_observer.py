@@ -1,18 +1,6 @@
 """A disturbance observer around the model's inverse: what the model's input differs by is taken off the next command.
 
-With the measured response f_k to the last command u_{k-1}, and the low-pass Q = g / (s + g) with its pole p = exp(-g T) in z,
-
-    d_k = p d_{k-1} + (1 - p) (f^^-1(x_k, f_k) - u_{k-1}),        u_k = f^^-1(x_k, q^Des_k) - d_k.
-
-d is the disturbance at the input that explains the response. Where the model's input gain is constant, this is the fixed-point
-iteration of the effective gain 1 - p in its model-referenced form: command by command. So its loop is stable for
-(1 - p) lambda < 2 with the plant's gain lambda times the model's. Where the gain changes with the state, the observer remembers a
-force, and the iteration a response.
-
-References:
-    K. Ohnishi, A new servo method in mechatronics, Trans. Japan Society of Electrical Engineers 107-D, 1987.
-    W.-H. Chen, J. Yang, L. Guo, S. Li, Disturbance-observer-based control and related methods: an overview, IEEE Trans. Industrial
-    Electronics 63(2), 2016.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

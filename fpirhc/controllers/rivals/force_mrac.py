@@ -1,18 +1,6 @@
 """Model reference adaptive control by fixed-point iteration: the command is deformed against a reference model.
 
-The outer loop is designed for the reference model q^(n) = f_r(x, Q), whose inverse is Q = M_r q^(n) + c_r for a mechanical plant.
-It computes the desired command, and from the measured response the recalculated one,
-
-    Q^Des = M_r q^(n),Des + c_r,       Q^Rec = M_r q^(n) + c_r,
-
-and the plant is given the deformed Q^Def+ = G(Q^Def, Q^Rec, Q^Des), where G is any deformation. Where Q^Rec = Q^Des the plant moves
-as the reference model does under Q^Des, although Q^Def is another force. The Jacobian of Q^Def -> Q^Rec is M_r M^-1, with the
-eigenvalues of M^-1 M_r, so gains and limits are those of a deformed response; scales are forces. The law is in the spirit of the
-reference.
-
-References:
-    J. K. Tar, J. F. Bitó, I. Rudas, Replacement of Lyapunov's direct method in model reference adaptive control with robust
-    fixed point transformations, IEEE INES 2010.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,19 +1,6 @@
 """Incremental nonlinear dynamic inversion: the command moves by what the model's input gain asks for.
 
-With the measured response f_k to the last command u_{k-1}, both through the same low-pass H, so that both are equally late,
-
-    u_k = H u_{k-1} + G^-1 (q^Des_k - H f_k),      G = df^/du at the state of now,
-    H = w^2 / (s^2 + 2 zeta w s + w^2), with the poles of s in z.
-
-The model gives G alone. Without the filter, for a response affine in the inputs, this is the fixed-point iteration of unit gain in
-its model-referenced form, ModelReferenced(Affine(gain=-2)): command by command. So it is stable for a plant gain below twice the
-model's, and the filter slows it.
-
-References:
-    S. Sieberling, Q. P. Chu, J. A. Mulder, Robust flight control using incremental nonlinear dynamic inversion and angular
-    acceleration prediction, J. Guidance, Control, and Dynamics 33(6), 2010.
-    E. J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon, Adaptive incremental nonlinear dynamic inversion for attitude control of micro
-    air vehicles, J. Guidance, Control, and Dynamics 39(3), 2016 (the filter of both: w = 50 rad/s, zeta = 0.55).
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -2,20 +2,7 @@
 
     F_k = d^n/dt^n of y less alpha u, by weights over the last L cycles,        u_k = (q^Des_k - F_k) / alpha.
 
-The published estimate is an integral over the window, for n = 1
-
-    F = -6 / L^3  integral of [(L - 2 s) y(s) + alpha s (L - s) u(s)] ds,
-
-the leading coefficient of the Legendre polynomial of degree n that fits y best. Here it is the least-squares polynomial over the
-samples, less what the held commands contribute to it, which is exact for a constant F. q^Des is the nominal response and the
-feedback of the errors: a proportional law makes the intelligent P (n = 1) or PD (n = 2).
-
-The shortest window, L = n cycles, makes F the last difference of y less alpha u. For n = 1 this is the fixed-point iteration of
-unit gain on the response by differences, with alpha as the model: command by command. So alpha must be more than half of the
-plant's gain. A longer window is slower and less noisy.
-
-References:
-    M. Fliess, C. Join, Model-free control, Int. J. Control 86(12), 2013.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,18 +1,6 @@
 """L1 adaptive control with the piecewise-constant law: a predictor of the highest measured derivative, and a low-pass.
 
-With v = q^(n-1) measured, the predictor v^, a_s > 0, the model's response f^ to the command that acts, and cycles of T,
-
-    v^' = f^(x, u) + sigma - a_s (v^ - v),      sigma_k = -a_s e^(-a_s T) / (1 - e^(-a_s T)) (v^_k - v_k),
-    eta = w_c / (s + w_c) sigma,                u = f^^-1(x, q^Des - eta).
-
-The response is not measured. In the cycle the predictor's error moves by the model's response less the mean one, so that one cycle
-later sigma is e^(-a_s T) times the mean response error of the model: it is the fixed-point iteration on the difference of the
-velocities, of the effective gain 1 - exp(-w_c T) as a_s goes to 0, and for a larger a_s some of a constant residual stays.
-
-References:
-    N. Hovakimyan, C. Cao, L1 Adaptive Control Theory: Guaranteed Robustness with Fast Adaptation, SIAM 2010, ch. 3.3.
-    Z. Wu, S. Cheng, K. A. Ackerman, A. Gahlawat, A. Lakshmanan, P. Zhao, N. Hovakimyan, L1 adaptive augmentation for geometric
-    tracking control of quadrotors, IEEE ICRA 2022 (the predictor above, with the model's own response).
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,27 +1,6 @@
 """Direct model reference adaptive control by Lyapunov's method: gains adapted by the rule e'PB, the classical counterpart.
 
-With the reference model's motion y (see `reference_model`), e = y - q and v the reference model's equation at the plant's
-state,
-
-    v = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) (q^N - q)^(s),     u = Theta phi,     phi = (x, v, 1).
-
-On a linear plant q^(n) = A x + B u + c with a symmetric, definite B (one coordinate, or a mechanical system near a posture)
-some Theta makes the plant the reference model; with z = (rate^(n-1) e, ..., e^(n-1)) per coordinate, A_m'P + P A_m = -I for
-rate 1, and the last row p of P
-
-    Theta' = sign(B) gamma (p z) phi' - leakage (Theta - Theta_0),
-
-gives V = sum z'P z + tr(dTheta' |B| dTheta) / gamma the derivative V' = -rate |z|^2 without leakage: e goes to zero, Theta need not
-converge. Theta_0 is the model's own inverse, linearised at the start. Where the plant is not linear in x, or under disturbances,
-Theta drifts. Leakage bounds the drift and leaves a constant error. The rule takes one step per period, and none while the command
-is clipped. For n = 2 the adaptation oscillates at about w = (gamma |B| |phi|^2 / 2)^(1/2) rad/s, rings where w is far above the
-rate, and grows from w^2 period = rate on.
-
-References:
-    K. S. Narendra, A. M. Annaswamy, Stable Adaptive Systems, Prentice Hall 1989.
-    I. D. Landau, Adaptive Control: The Model Reference Approach, Dekker 1979.
-    J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 8.
-    P. Ioannou, P. Kokotovic, Instability analysis and improvement of robustness of adaptive control, Automatica 20, 1984 (leakage).
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,17 +1,6 @@
 """PID control, without any model: one input per controlled coordinate.
 
-With e = q^N - q of a controlled coordinate and the integral of its error,
-
-    u = k_i e_int + k_p e + k_d e' + ...,
-
-the k-th input for the k-th controlled coordinate. The chain may go on to e^(n-1), the highest measured derivative for the relative
-order n; without it no PID stabilises a chain of three or more integrators. On n integrators with the gain b the error obeys
-e^(n+1) + b (... + k_d e'' + k_p e' + k_i e) = 0 (Routh: b k_d k_p > k_i for n = 2).
-
-The integral does not change while some command is clipped (conditional integration). It starts where the first command is zero.
-
-References:
-    K. J. Åström, T. Hägglund, PID Controllers: Theory, Design, and Tuning, 2nd ed., ISA 1995.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,11 +1,6 @@
 """The reference model of model reference adaptive control: a motion from the plant's start to the nominal one.
 
-For a controlled coordinate of relative order n the deviation eps = q^N - y obeys (d/dt + rate)^n eps = 0, that is
-
-    y^(n) = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) (q^N - y)^(s),     y(0) = q(0), y'(0) = q'(0), ...
-
-The deviation follows its exact solution over one period, so the model has no integration error. On a map the divided differences
-delta stand in place of d/dt, and all modes of the deviation have the pole z = 1 - rate T.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,19 +1,6 @@
 """Repetitive control: what made the response wrong one period ago is taken off the request of now.
 
-For a task of a period of N cycles, with the response error h_j = f_j - q^Des_{j-1} of the request of cycle j - 1,
-
-    delta_k = Q [delta_{k-N} - gamma h_{k-N+1}],        r_k = q^Des_k + delta_k,        u_k = f^^-1(x_k, r_k),
-
-Q the mean of a sample and its neighbours, (b, 1 - 2 b, b), centred because a period ago both neighbours are known. With the plant's
-gain lambda times the model's, an error of frequency w shrinks per period by Q(w) |1 - gamma lambda|; what repeats is learned
-whatever it is, and nothing else is. For N = 1 and b = 0 it would be the fixed-point iteration on the deformation, Increment: a
-repetition is N such iterations, each of which has its turn once per period.
-
-References:
-    S. Hara, Y. Yamamoto, T. Omata, M. Nakano, Repetitive control system: a new type servo system for periodic exogenous signals,
-    IEEE Trans. Automatic Control 33(7), 1988.
-    M. Tomizuka, T.-C. Tsao, K.-K. Chew, Analysis and synthesis of discrete-time repetitive controllers, ASME J. Dyn. Syst. 111(3),
-    1989.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,28 +1,6 @@
 """Resolved acceleration rate control: the law prescribes the rate of the response, and commands change by increments.
 
-Resolved acceleration control (Luh, Walker and Paul 1980) is computed torque: it prescribes q^(n). Here the measured
-q^(n) belongs to the error, e^(n) = q^(n),N - q^(n), and (d/dt + rate)^(n+1) e = 0 is prescribed,
-
-    q^(n+1),Des = q^(n+1),N + sum_{s=0}^{n} C(n+1, s) rate^(n+1-s) e^(s),
-
-which the model turns into the command's increment over one period: with f^ the model's response,
-
-    f^(x_k, u_k) = f^(x_k, u_{k-1}) + period (q^(n+1),Des - df^/dx x').
-
-Only the model's changes count, not its values: a constant residual leaves no error, without an integral. With a model whose gain is
-wrong by J the errors obey e^(n+1) + J sum C(n+1, s) rate^(n+1-s) e^(s) = 0, which is stable for every J > 0 for n = 1, and for
-J > 1/9 for n = 2; in control cycles also (n + 1) rate period J < 2 is needed. A dead time has the effect that it has in any loop of
-n + 1 integrators.
-
-The law is in the spirit of time-delay control (T. C. Hsia 1989; K. Youcef-Toumi, O. Ito 1990), whose increments
-u_k = u_{k-1} + M^ (q^Des - q^(n)) aim at the whole response in one cycle. Where the rest of the model is constant, time-delay
-control is ComputedTorque with Affine(gain=-2).
-
-References:
-    J. Y. S. Luh, M. W. Walker, R. P. C. Paul, Resolved-acceleration control of mechanical manipulators, IEEE Trans. Automatic
-    Control 25(3), 1980.
-    T. C. Hsia, A new technique for robust control of servo systems, IEEE Trans. Industrial Electronics 36(1), 1989.
-    K. Youcef-Toumi, O. Ito, A time delay controller for systems with unknown dynamics, ASME J. Dyn. Syst. 112(1), 1990.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,18 +1,6 @@
 """Sliding mode control with a boundary layer, on the inverse of the model: a high gain instead of an iteration.
 
-With e = q^N - q and S = (d/dt + rate)^(n-1) e the desired response
-
-    q^(n),Des = q^(n),N + sum_{s=1}^{n-1} C(n-1, s-1) rate^(n-s) e^(s) + K tanh(S / w)
-
-makes S' = -K tanh(S / w) - h with the response error h = q^(n) - q^(n),Des of the wrong model. A constant residual |h| < K leads to
-|S| = w atanh(|h| / K) and e = S / rate^(n-1). The law is proportional with the gain K / w, so a constant residual leaves an error,
-whereas a deformation sums its errors and leaves none. In control cycles S is multiplied by 1 - K period / w near zero: it chatters
-from K period / w = 2 on, and with a model whose gain is wrong by J from K period J / w = 2 on.
-
-References:
-    V. I. Utkin, Variable structure systems with sliding modes, IEEE Trans. Automatic Control 22(2), 1977.
-    J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7 (boundary layer, with a saturation instead of
-    tanh).
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,11 +1,6 @@
 """Schedules of time slots: which slot a control cycle belongs to.
 
-    FixedSchedule  spans of time, given one by one
-    Periodic       durations, repeated
-    ByError        the slot of the largest weighted error
-    ByLookAhead    the slot that brings the state closest to the reference within a dwell
-
-Times are rounded to whole control cycles.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

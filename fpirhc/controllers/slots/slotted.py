@@ -1,22 +1,6 @@
 """Time slots: one input serves several coordinates in turn.
 
-With fewer inputs than coordinates a controller cannot prescribe all coordinates at once. Instead of weighing them in one cost, time
-is divided into slots. In each slot one coordinate y follows its reference with its own relative order r,
-
-    y^(r) = alpha(x) + beta(x) u,        u = (r^Def - alpha) / beta  by the model,
-
-while the others follow the zero dynamics of y. A slot need not be stable alone, but the schedule must be (`floquet_radius`).
-
-At a switch the command is continuous. The first request of a slot is the response that the model expects of the last command,
-r_0 = alpha + beta u, and the law is joined without a step,
-
-    desired = law + offset e^(-(t - t_0) / blend),    offset = y_0 - law  at t_0,
-
-where y_0 is the realised y^(r) for a slot that adapts (its deformation then begins at a fixed point: the request r_0 was just
-realised) and r_0 for a slot that does not. So the command of the first cycle of a slot is the last command, and the change per
-cycle afterwards is at most
-
-    ( |offset| (1 - e^(-period / blend)) + |change of law and of alpha| + |step of the deformation| ) / |beta|.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

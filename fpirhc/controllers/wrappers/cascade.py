@@ -2,19 +2,7 @@
 
     target = reference + shift,        command = inner controller(target)
 
-The response of the iteration is the output itself (order 0), and the model is what the inner controller believes. It needs no
-derivative of the output, and it may be as slow as the plant is.
-
-The output measured now belongs to targets of the past. So it is paired with the target that the model says was in force
-(`ThroughModel`), and the shift is that of the model-referenced form,
-
-    shift_k = G(f^_k, y_k, f^_k - shift_{k-1}) - (f^_k - shift_{k-1}).
-
-Without pairing the iteration is r_k = G(r_{k-1}, y_k, reference): it goes on while the output is under way, and a plant that is
-slower than its cycle limit-cycles at small gains.
-
-While the command stands at a limit the shift may shrink, or move back from the limit, and nothing else, so it does not wind up. It
-moves back where its change has the other direction than what the limit took off the model's response, f(u_unclipped) - f(u).
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

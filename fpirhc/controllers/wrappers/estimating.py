@@ -2,10 +2,7 @@
 
     command = controller(state; p + parameter_change),      parameter_change = estimator(state, last command, response; p).
 
-Offset-free receding-horizon control is RecedingHorizon with DisturbanceKalman. Adaptive receding-horizon control in the
-sense of certainty equivalence is RecedingHorizon with RecursiveLeastSquares or MovingHorizon. Both are alternatives to a
-deformation, or companions of one. The change is used where the controller evaluates its model: in the inverse every cycle, in a
-receding horizon whenever it plans.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,26 +1,6 @@
 """A controller that acts on the state in which its command will act.
 
-With a dead time of the inputs the command of this cycle acts later, and with a dead time of the measurement the measured state is
-old. The wrapper integrates the measured state over both, with the commands that are on their way. The wrapped controller is given
-the resulting state and the time at which its command acts. So a receding horizon starts where its first input acts. A filtered
-set-point cannot be shifted in time: the state ahead is led along the reference of now, so that the plant follows it later by the
-dead time, and the errors of a run contain this delay.
-
-A prediction by the model alone lacks what the model lacks. Where that is a constant response w, and the prediction reaches over t,
-a law of gains kp, kd leaves the error (1 + kd t + kp t^2 / 2) w / kp in place of w / kp. Adaptation removes w / kp only: it makes
-the response the desired one, and that follows from the predicted state. `ByModel(residual_time=...)` and `ByDesired` mend it.
-
-There are two ways to predict:
-
-    ByModel    integrates the approximate model over the commands on their way, optionally with the residual: the low-passed
-               difference between the measured response and the model's.
-    ByDesired  integrates the desired responses on their way. It needs no model, because a deformation makes the realised response
-               the desired one. It is for plants in which every state is a controlled
-               quantity or a derivative of one.
-
-References:
-    O. J. M. Smith, Closer control of loops with dead time, Chemical Engineering Progress 53, 1957.
-    Z. Artstein, Linear systems with delayed controls: a reduction, IEEE Trans. Automatic Control 27(4), 1982.
+Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

@@ -1,18 +1,6 @@
 """Shrinks the gain of a map when its errors oscillate: errors oscillate before they diverge.
 
-    s <- (1 - eta) s + eta sgn(h_k' h_{k-1}),      h = f - d,
-    s < -0.9, or five errors in a row of alternating sign and growing size:      factor <- 0.7 factor,
-    otherwise                                                                    factor <- min(1, 1.001 factor),
-    r+ = r + factor (G(r, f, d) - r).
-
-The factor never exceeds one, so no bound from a model is needed. While it is one, the request is the map's own, to the last bit.
-A step of a disturbance makes one large error that dies out without alternating. Errors under white measurement noise alternate too:
-their correlation is -a lambda / 2. With a lambda = 1 the factor stays near one (mean 0.98 over 20 000 cycles), with 1.8 its mean is
-0.7. Where the gain of the map is too large the factor returns to the limit of stability again and again, and each time a small
-oscillation lowers it.
-
-References:
-    In the spirit of the precursor oscillations of J. K. Tar's group; the rule is our own.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

@@ -1,24 +1,6 @@
 """Deformation under dead time: the response measured now belongs to the request of d + 1 cycles ago.
 
-    unpaired   the map itself: r_k = G(r_{k-1}, f_k, d_k). Stable on f = lambda r only for a lambda < 2 sin(pi / (2 (2 d + 1))).
-    Paired     r_k = G(r_{k-1-d}, f_k, d_k): d + 1 interleaved iterations without delay, stable for 0 < a lambda < 2 whatever d is,
-               with the rate |1 - a lambda|^(1/(d+1)).
-    Increment  r_k = d_k + delta_k,  delta_k = p delta_{k-1} + (1 - p) [G(r_{k-1-d}, f_k, d_{k-1-d}) - d_{k-1-d}]: the same
-               iteration on the deformation r - d, so that a change of the desired response passes at once, and leaky. Use it where
-               the state is predicted over the dead time.
-
-d is in cycles and may be a fraction; the pair is then interpolated between two cycles. It may be a tuple, one dead time for every
-controlled coordinate. Until the first response to a request of this controller arrives, the request is the desired response.
-
-A dead time that is wrong by even one cycle couples the interleaved iterations: high modes grow at any gain, and the command
-chatters. There are two remedies:
-
-    Increment  leaks. With a dead time wrong by at most m cycles it is stable for every d if 4 p / (1 - p)^2 > g (2 + g) m^2, where
-               g is the effective gain times the plant's largest gain, below 2 (proof: `leaky`). The defaults are m = max(1, 10 %
-               of d) and the p of g = 1, or of the map's own effective gain where that is larger; so give the map the gain
-               1 / lambda_max.
-    Paired     with an `uncertainty` of m takes a triangular mean of the requests around the pair. Its modes decay for
-               a lambda <= 0.5 only. It has no leak, because a leak in the request would make the desired response late.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

@@ -2,13 +2,7 @@
 
     g_k = p g_{k-1} + (1 - p) (f_k - d_k),     r_{k+1} = G(r_k, d_k + g_k, d_k).
 
-The error is filtered, not the response. A filtered response would differ from an unfiltered desired one wherever the task moves,
-and the map would correct a difference that is no error. On f = lambda r with the effective gain a the loop is
-
-    z^2 - (1 + p - a lambda (1 - p)) z + p = 0,
-
-stable for 0 < a lambda < 2 (1 + p) / (1 - p). Beyond a lambda = (1 - sqrt(p))^2 / (1 - p) it is no faster than sqrt(p) per
-cycle.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

@@ -1,16 +1,6 @@
 """Watches an iteration that may leave its basin of attraction, and brings it back.
 
-A trip sets the request to the desired response, halves the step, forgets what the map remembers and pauses. Four events trip:
-
-    1  oscillation  errors alternate in sign while the step is at its limit, for 20 cycles
-    2  growth       errors alternate and their mean over 20 cycles is four times that over 200, for 20 cycles
-    3  size         the request is further from the desired response than it may be
-    4  non-finite   the response or the request is not a number
-
-The first is not watched in a model-referenced form, which is not given its last request. A disturbance step trips none of them,
-because its errors do not alternate. After 1000 clean cycles the step grows again by 5 % every 8 cycles; event 6 is its full size.
-After the third trip within about 1000 cycles the guard ends adaptation for the rest of the run (event 5, fallback). Every event is
-logged: the signal `adaptation_event` is its number in the cycle in which it happens, and `EVENTS` holds the descriptions.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

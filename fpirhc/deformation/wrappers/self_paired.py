@@ -1,14 +1,6 @@
 """An unknown dead time: estimated and logged, or estimated and used.
 
-    DelayWatched   the wrapped map as it is; the estimated dead time and its confidence are logged.
-    SelfPaired     pairs each response with the request of as many cycles ago as the estimated dead time. An estimate is adopted
-                   when it has been the same, to one cycle, in 100 confident cycles in succession; cycles without confidence in
-                   between are not counted. Until then the last adopted estimate stays. Before the first one the request is the
-                   desired response, because no adaptation is better than a wrong pair.
-
-A request that moves smoothly shows no dead time. A task with steps, noise in the measurement, or a plan that starts anew shows it.
-Signals: `dead_time_cycles` and `dead_time_confidence`; `paired_cycles` is the dead time that `SelfPaired`
-uses, -1 before the first estimate.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

@@ -1,27 +1,6 @@
 """Tunes the gain of a map on line, by stochastic approximation on the signs of successive response errors.
 
-    log c <- log c + gamma (sgn(h_k' h_{k-1}) - s*),      h = f - d,      1 <= c <= largest,
-    errors in a row that alternate in sign and grow, or eight of a two-cycle:   c <- c / 2,
-    r+ = r + c (G(r, f, d) - r).
-
-s* is the mean sign under white measurement noise at the target g* of effective gain times the plant's gain (`expected_sign`).
-So in noise the drift of c is positive below the target, negative above it and zero at it, whatever the size of the noise. A smooth
-error (all signs +1) raises the gain up to the cap, and an oscillation (-1) lowers it. At the target log c scatters by
-sqrt(gamma / (2 k)), k = -d s / d log g: 0.25 for one component and g* = 0.5.
-
-The map's own gain is the floor, because below it the drift of the task costs more than a lower gain saves in noise. Two patterns
-lower it further: errors that alternate and grow, and a two-cycle (each error equal to the error of two cycles before), in which
-growing errors end where the map saturates. Five in a row that grow by half or more lower the gain, or fifteen that grow by less:
-white noise does so at most once in 200 000 cycles where gain times plant is up to 0.9, once in 7000 where it is 1.5. Below the
-floor five of any growth do, and the drift has a target of at least 1, a deadbeat iteration's: a false alarm ends at the floor, or
-at a product of 1 where that is lower.
-The cap must come from a model of the plant: without a cap a smooth task would raise the gain until the loop oscillates.
-
-The target holds for a response that is measured at once. Behind a dead time or an estimator errors are correlated otherwise, so
-noise raises the gain to the cap.
-
-The rule uses signs and no products, because the amplitudes of a saturated two-cycle (small, large, small, large) are uncorrelated.
-The price of a larger gain is chatter, up to three times that of a slow fixed gain; a smaller target halves it.
+Theory: docs/theory-maps.md.
 """
 
 from __future__ import annotations

@@ -1,28 +1,6 @@
 """A disturbance model with a Kalman filter: the estimator of offset-free predictive control.
 
-The model's responses have unknown disturbances that drift as random walks, and some states and responses are measured,
-
-    q_i^(r_i) = f^_i(q, ..., u) + w_i + n_i,      w_i' = white noise,      y = h(x, u, w) + white noise.
-
-The state and the disturbances are estimated together. The nonlinear model predicts over one period. The stationary gain of the
-Kalman filter, for the model linearised on the reference at t = 0, corrects,
-
-    x- = F(x^, u, w^),      x^ = x- + K_x (y - h(x-, u, w^)),      w^ <- w^ + K_w (y - h(x-, u, w^)).
-
-A measured response shows its disturbance in the same cycle, states show it through their motion. Where the plant has outputs, these
-may be disturbed and measured too, y_j = h_j(q, q', ...) + w_j, and the responses are theirs. A constant disturbance is
-estimated without error, whatever the tuning, if [A - I, B; C, D] has full column rank (B, D: effect of the disturbances on the
-state and on what is measured), which needs at least as many measured quantities as disturbances. Otherwise `check` refuses the
-filter.
-
-With `frequencies` the disturbance is a constant and sines, w = w_0 + sum c_k, where (c_k, s_k) turns by the angle omega_k T in
-every cycle. A sine of that frequency then leaves no error either, however fast it is: the internal model principle. The estimate
-serves in every cycle, and over the horizon of a plan the disturbance is held.
-
-References:
-    G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal 49(2), 2003.
-    M. Morari and U. Maeder, Nonlinear offset-free model predictive control, Automatica 48(9), 2012.
-    U. Maeder and M. Morari, Offset-free reference tracking with model predictive control, Automatica 46(9), 2010 (sines).
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

@@ -2,19 +2,7 @@
 
     minimise  |z - z_a|^2_M + sum_{last W} |e_i(z)|^2      within bounds,
 
-by a fixed number of Gauss-Newton steps per cycle, from the last estimate. A component stays at its bound where the gradient points
-beyond it, and the step is solved for the other components: a clipped Newton step does not stop at the constrained optimum
-(Bertsekas 1982). A pair that leaves the window is linearised once more and joins the prior (arrival cost),
-
-    M <- lambda M + (1 - lambda) I + H'H,     z_a <- z_a + M^-1 H' (e + H (z - z_a)),     lambda = exp(-period / time),
-
-so that, with a response linear in its parameters and lambda = 1, the estimate is that of all pairs since the start.
-
-References:
-    C. V. Rao, J. B. Rawlings and D. Q. Mayne, Constrained state estimation for nonlinear discrete-time systems, IEEE Trans.
-    Automatic Control 48(2), 2003.
-    D. P. Bertsekas, Projected Newton methods for optimization problems with simple constraints, SIAM J. Control and Optimization
-    20(2), 1982.
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

@@ -2,16 +2,7 @@
 
     S = lambda I + H P H',    K = P H' S^-1,    z <- z + K e,    P <- (P - K H P) / lambda,    lambda = exp(-period / time),
 
-with e and H of the last pair at the current estimate: for a response that is not linear in its parameters this is an extended
-filter. For a linear one, z minimises
-
-    lambda^k |z|^2 + sum_i lambda^(k-i) |e_i - H_i z|^2.
-
-Without excitation, forgetting would let P grow for ever, and the first disturbance would change the estimate (wind-up). So P is
-scaled down where its trace exceeds that of the prior. Estimates are clipped to their bounds.
-
-References:
-    K. J. Astrom and B. Wittenmark, Adaptive Control, 2nd ed., Addison-Wesley 1995, ch. 2 and 11 (forgetting, wind-up).
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

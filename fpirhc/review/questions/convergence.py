@@ -1,16 +1,6 @@
 """Does the deformation converge? The verdict of a review.
 
-The linear closed loop decides: with rho the largest |pole| at a point of the reference and N the cycles of the run,
-
-    rho^N < 1/100 at every point                converges, if nothing below speaks against it
-    rho^N > 100 at every point                  diverges
-    else                                        unknown.
-
-What linear loops do not show makes a convergence unknown: the steepest secant of the map beyond its limit, on or near the
-reference (large errors may end in a bounded oscillation), a map that is too slow or whose range is too small for the
-requests, commands outside their limits, and a gain or a pairing that changes on line.
-
-The verdict is about the plant with its exact parameters; `box_converges` covers the parameters of the box.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

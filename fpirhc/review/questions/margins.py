@@ -1,13 +1,6 @@
 """How robust is the linear loop? By its poles, and the margins of gain, phase and delay of each input's loop, opened at the plant.
 
-With z+ = F z + G w and v = C z (commands that arrive) the loop of input i is opened by w_i = w_i' - v_i:
-
-    L_i(zeta) = -C_i (zeta I - F + G_i C_i)^-1 G_i,
-
-all other loops closed. The deformation, dead time and prediction are in it. A loop with plans every n cycles has no such function;
-there the command is multiplied by factors until a pole of the whole period reaches the unit circle.
-
-References: K. J. Astrom, R. M. Murray, Feedback Systems, 2008, section 9.3, for the margins.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,11 +1,6 @@
 """Is the reference free of jumps? A step by `if_else` has the derivative zero, so that no symbolic question sees it.
 
-Differences over the run are compared with the derivatives that the reference gives. Over a smooth piece of length h
-
-    v(t + h) - v(t) = h / 2 (v'(t) + v'(t + h)) + O(h^3),
-
-and at a jump the rest is the jump, however small h is. The intervals with the largest rests are therefore halved until the rest has
-vanished or is known to stay. A jump of the highest derivative is none of the reference's states, and does no harm.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

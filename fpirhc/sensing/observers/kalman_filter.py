@@ -1,17 +1,6 @@
 """States that no sensor shows, by an extended Kalman filter with its covariance in memory.
 
-    x- = F(x^, u, p),                 A = dF/dx,   B = dF/dw        the model and its Jacobians at x^
-    P- = A P A' + B W B'                                            w: white noise of the responses, deviation per cycle
-    S = C P- C' + R,   K = P- C' / S,   C = dh/dx at x-             h: the measured quantities, R: their noise
-    x^ = x- + K (y - h(x-, u, p)),    P = (I - K C) P- (I - K C)' + K R K'
-
-The last line is Joseph's form: a sum of two squares stays symmetric and positive whatever K is, which P- - K C P- does not after
-rounding. The Jacobians are symbolic; nothing is inverted but S, which is at least R. For a linear plant this is the Kalman filter,
-and its covariance goes to the solution of the Riccati equation.
-
-References:
-    A. H. Jazwinski, Stochastic Processes and Filtering Theory, Academic Press 1970, ch. 8 (extended filter).
-    R. S. Bucy and P. D. Joseph, Filtering for Stochastic Processes with Applications to Guidance, Interscience 1968.
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

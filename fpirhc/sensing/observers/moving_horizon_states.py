@@ -2,20 +2,7 @@
 
     minimise  |x_0 - a|^2_{P^-1} + sum |w_i|^2_{W^-1} + sum |y_i - h(x_i, u_i)|^2_{R^-1}     with x_{i+1} = F(x_i, u_{i+1}, w_i),
 
-and states inside their bounds. A fixed number of Gauss-Newton steps per sample starts from the last window, one sample later; see
-`Smoother`. A sample that leaves the window is linearised once more, at the estimate that later samples have improved, and joins
-the arrival cost (a, P) as in a Kalman filter. For a linear model with Gaussian noise the estimate is that of the Kalman filter,
-whatever the window. For a curved one the window keeps what a filter forgets: its samples are compared with the model around the
-newest estimate, and not around a first guess that was wrong.
-
-Bounds are kept by a logarithm of the distance, with the weight `barrier`, so an estimate comes near a bound and never to it.
-A step leaves at least a tenth of the distance. Both keep a wrong start away from a solution behind a bound.
-
-References:
-    C. V. Rao, J. B. Rawlings and D. Q. Mayne, Constrained state estimation for nonlinear discrete-time systems, IEEE Trans.
-    Automatic Control 48(2), 2003.
-    E. L. Haseltine and J. B. Rawlings, Critical evaluation of extended Kalman filtering and moving-horizon estimation, Ind. Eng.
-    Chem. Res. 44(8), 2005.
+Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

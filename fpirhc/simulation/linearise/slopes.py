@@ -1,14 +1,6 @@
 """Derivatives of one step of a closed loop at a point of its run, along as many directions as its motion reaches.
 
-A scalar graph is differentiated. One with a plan, a solver or a table in it is evaluated on both sides of the point,
-
-    J d = (step(z + h S d) - step(z - h S d)) / (2 h),        S = diag(scales),
-
-because a solver outside has no derivatives, and those of a plan's graph take longer to build than all evaluations.
-
-What a plan remembers for its next start are hundreds of entries that hardly move the loop. So directions are sought that the loop's
-own motion reaches: beginning with the plant's states and the inputs, each one is moved by a cycle, and what is new in the result is
-the next direction, until nothing is (Arnoldi's iteration).
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

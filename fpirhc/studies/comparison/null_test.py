@@ -1,16 +1,6 @@
 """The null test: with the approximate model as plant there is nothing to adapt, so adaptation must not make the error larger.
 
-It catches what adaptation takes for an error of the model without being one: a response that drifts within a long cycle, a delay
-that is not paired, the noise of a sensor. Disturbances are left out, because they are an error of the model.
-
-The plain form passes on the changes of the desired response a little late, so some error of its own is usual. It is harmful where
-it is larger than the error that the wrong model causes without adaptation, which adaptation is there to remove, and adds more
-than a thousandth of the range of the coordinate's run, as in a review.
-
-The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again; where the plant is
-no instance of the model they are composed around the model, and so where the deformation believes a lag or a dead time that the
-problem does not have: a right model has it too. A run is the original one, cut after 2000 measured cycles. A test costs two such
-runs, and pairs with the same controller without adaptation share its run.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

@@ -1,13 +1,6 @@
 """A search for better settings: every controller has the same number of trials, the same scenarios and the same cost.
 
-The cost of a trial is the mean of the relative rms error (see `score`) or of a metric over the scenarios; a run that fails costs a
-finite penalty. The scenarios are drawn for tuning alone: settings are never tuned on the scenarios on which they are compared.
-Settings are proposed by Optuna's tree-structured Parzen estimator. Its random numbers are drawn afresh for every trial from
-(seed, number of the trial), so that a study that was killed and goes on has the result of an undisturbed one.
-
-References:
-    J. Bergstra, R. Bardenet, Y. Bengio, B. Kégl, Algorithms for Hyper-Parameter Optimization, NIPS 2011.
-    T. Akiba, S. Sano, T. Yanase, T. Ohta, M. Koyama, Optuna: A Next-generation Hyperparameter Optimization Framework, KDD 2019.
+Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations
