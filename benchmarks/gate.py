@@ -21,9 +21,8 @@ import numpy as np
 import fpirhc as fp
 from fpirhc.controllers.gate import HELD, Gate
 from fpirhc.simulation.simulate import simulator
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import GAPS, Block
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.gap import GAPS
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))

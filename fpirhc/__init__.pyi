@@ -2,8 +2,7 @@
 
 from .baselines.check import accept, check_baseline
 from .controllers import rivals
-from .controllers.computed_torque import ComputedTorque
-from .controllers.feedforward_only import FeedforwardOnly
+from .controllers.computed_torque import ComputedTorque, FeedforwardOnly
 from .controllers.receding_horizon import Feedforward, HoldPlan, RecedingHorizon, StopRun
 from .controllers.replanning import FromMeasurement, FromMeasurementTracked, FromPlan
 from .controllers.rivals.pid import PID
@@ -15,7 +14,7 @@ from .controllers.wrappers.estimating import Estimating
 from .controllers.wrappers.exact_model import ExactModel
 from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
 from .deformation.affine import Affine
-from .deformation.identity import Identity
+from .deformation.base import Identity
 from .deformation.model_referenced import ModelReferenced
 from .deformation.rfpt import RFPT, RFPTVector
 from .deformation.rotation import Rotation

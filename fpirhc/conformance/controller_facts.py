@@ -17,7 +17,7 @@ from fpirhc.conformance.loops import Replay, Trial, coarse_steps, spelled_by_sta
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, tracking_law
 from fpirhc.deformation.affine import Affine
-from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.base import Identity
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.simulation.run import Run

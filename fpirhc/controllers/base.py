@@ -27,15 +27,14 @@ from fpirhc.controllers.reference_states import (
 )
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
-from fpirhc.fields.given import described
+from fpirhc.fields.kinds import described
 from fpirhc.plant.chain import measured_signals, nominal_responses
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Composite, Delay, Step, compose
+from fpirhc.symbolic.block import GAP, SETTLING, Block, Composite, Delay, Step, compose, is_long
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
 from fpirhc.symbolic.functions import numbers
-from fpirhc.symbolic.gap import GAP, SETTLING, is_long
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem

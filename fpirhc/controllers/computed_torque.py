@@ -1,17 +1,25 @@
-"""Computed torque: track the reference with the model's inverse, with or without deformation.
+"""The model's inverse along a reference: with a tracking law and a deformation, or open loop.
 
-q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the deformed q^Des.
+q^Des = q^(r),N + feedback of the tracking law,        u = inverse model of the deformed q^Des
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fpirhc.controllers.base import Controller, tracked_blocks
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, tracked_blocks
+from fpirhc.controllers.contract import Undeformed
+from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
+from fpirhc.errors import NotInvertible, NotSupported
+from fpirhc.horizon.nominal import known_on_reference, reference_state
+from fpirhc.members import Example
+from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 from fpirhc.tracking.linear_law import Exponential
@@ -33,7 +41,65 @@ class ComputedTorque(Controller):
         return tracked_blocks(problem, self.tracking, self.deformation)
 
 
+_SEEN = "_seen_status"
+
+
+@dataclass(frozen=True)
+class FeedforwardOnly(Undeformed):
+    """The model's inverse at the reference's state and response; no error is fed back."""
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the model has no inverse, or a derivative is prescribed where states have no reference.
+
+        Raises:
+            NotInvertible: inputs and controlled coordinates differ in number.
+            NotSupported: without feedback an output would drift.
+        """
+        plant = problem.plant
+        if len(plant.controlled_names) != len(plant.inputs):
+            raise NotInvertible("FeedforwardOnly needs as many controlled coordinates as inputs")
+        slow = ", ".join(name for name, order in plant.response_orders.items() if order)
+        if slow and not known_on_reference(plant):
+            raise NotSupported(
+                f"FeedforwardOnly does not cover outputs that are expressions of the state ({slow}): without feedback their "
+                "errors would add up; use a controller with a tracking law"
+            )
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        closing, delays = commanding_blocks(problem, [scalar(_SEEN)])
+        return [reference_block(problem), self._block(problem), *closing], delays
+
+    def _block(self, problem: Problem) -> Block:
+        """Block (reference, state, parameters) -> command, and the response that the model expects of it."""
+        plant, wanted = problem.plant, problem.plant.response_signal("_reference_response")
+        inverse, response = plant.equations.inverse, plant.equations.controlled_response
+        known = known_on_reference(plant)
+
+        def step(s: Signals) -> dict[str, Expression]:
+            nominal = reference_state(plant, s.reference) if known else s.state
+            command = inverse(nominal, s._reference_response, s.parameters)
+            finite = is_finite(
+                s.state
+            )  # a bad measurement changes no command here, and is a bad measurement all the same
+            return {
+                "nominal": s._reference_response,
+                "desired": s._reference_response,
+                "command_unclipped": command,
+                "_deformed_unclipped": ca.if_else(
+                    finite, response(s.state, command, s.parameters), s._reference_response
+                ),
+                _SEEN: ca.if_else(finite, int(Status.OK), int(Status.NON_FINITE)),
+            }
+
+        responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
+        reads = (like(plant.output, "reference"), wanted, plant.state, plant.parameter)
+        writes = Layout((*responses, like(plant.input, "command_unclipped"), scalar(_SEEN)))
+        return Block("feedforward", Layout(reads), writes, step, opaque=plant.equations.inverse_opaque)
+
+
 EXAMPLES = (
     ComputedTorque(Exponential(rate=8.0)),
     ComputedTorque(Exponential(rate=8.0), Sigmoid(gain=-0.5, scale=50.0)),
+    # Open loop: what is left is the dead time of the problem.
+    Example(problem="heat_exchanger", controller="static inverse", left=0.4, changes={"reality": None}),
 )

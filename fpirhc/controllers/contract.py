@@ -18,14 +18,13 @@ import numpy as np
 
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
 from fpirhc.controllers.model_inputs import NONE
-from fpirhc.controllers.scale_selection import plan_demand, reference_demand
-from fpirhc.deformation.base import Deformation, automatic, with_inner
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.reference_states import plan_demand, reference_demand
+from fpirhc.deformation.base import Deformation, Identity, automatic, with_inner
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.describe import replaced
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked, former_members, unnamed_inner
-from fpirhc.fields.given import described
+from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.lie_derivatives import without_disturbances

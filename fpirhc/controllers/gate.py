@@ -15,11 +15,11 @@ import numpy as np
 
 from fpirhc.controllers.base import clip
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Composite, Derived, Values, call
+from fpirhc.symbolic.block import GAP, GAPS, LONG, SETTLING, Block, Composite, call
+from fpirhc.symbolic.driver import every_finite, finite, kept_if_finite
 from fpirhc.symbolic.expression import FINITE, Signals, expression, kind
-from fpirhc.symbolic.finite import every_finite, finite, kept_if_finite
-from fpirhc.symbolic.gap import GAP, GAPS, LONG, SETTLING
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import Derived, Values
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
@@ -39,7 +39,7 @@ class Gap:
     """How many cycles went by without a sample, and what the next sample is told.
 
         sample missing      the count goes up, and what is a memory of the passing time goes on: queues, filters, observers
-        the next sample     estimators and queues are moved over the gap (`fpirhc.symbolic.gap`); status BRIDGED
+        the next sample     estimators and queues are moved over the gap (`fpirhc.symbolic.block`); status BRIDGED
         after a long gap    estimators begin anew with their derivatives, and what was learned is held until their windows hold
                             samples of now alone, as after a start; status SETTLING
 

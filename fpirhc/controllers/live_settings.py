@@ -19,8 +19,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller, checked, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import expects_whole_number
-from fpirhc.fields.given import described
-from fpirhc.fields.kinds import real_number
+from fpirhc.fields.kinds import described, real_number
 from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan

@@ -21,9 +21,8 @@ from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import controlled_places, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names, values_of
-from fpirhc.symbolic.block import Block, Delay, unseen
+from fpirhc.symbolic.block import GAP, Block, Delay, straightened, unseen
 from fpirhc.symbolic.expression import Signals, expression, is_finite, total
-from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.problem import Problem

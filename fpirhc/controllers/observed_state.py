@@ -29,9 +29,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import values_of
 from fpirhc.sensing.observability import members, slowest
 from fpirhc.sensing.state_observer import Evidence, Model, StateObserver
-from fpirhc.symbolic.block import Block, Delay, bridged, call
+from fpirhc.symbolic.block import GAP, Block, Delay, bridged, call
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.gap import GAP
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import Queue

@@ -25,8 +25,7 @@ from fpirhc.controllers.replanning import (
     first_memory,
     held_model,
 )
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.fields.checked import Checked
@@ -41,11 +40,11 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import STOPPED, Status
-from fpirhc.symbolic.block import Block, Delay, Derived, every
+from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.functions import nan_where, numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, live_numbers, nominal, not_live, settled
+from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, live_numbers, nominal, not_live, settled
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from fpirhc.controllers.mirror import MEASURED, measured_output, measured_state
+from fpirhc.symbolic.block import straightened
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import ceil, larger
-from fpirhc.symbolic.gap import straightened
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import Queue

@@ -24,10 +24,9 @@ from fpirhc.controllers.reference_states import with_reference
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
-from fpirhc.symbolic.block import Block, Composite, bridged
+from fpirhc.symbolic.block import GAP, Block, Composite, bridged, straightened
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.expression import Signals, Value
-from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem

@@ -18,8 +18,7 @@ import casadi as ca
 from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked, former_members, unnamed_inner
-from fpirhc.fields.given import described
-from fpirhc.fields.kinds import finite_number
+from fpirhc.fields.kinds import described, finite_number
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout
 
@@ -372,3 +371,47 @@ def returning_in_a_row(count: Expression, error: Expression, before: Expression,
     """
     back = ca.sumsqr(error - earlier) < _RETURNED**2 * ca.sumsqr(error)
     return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, back), count + 1, 0)
+
+
+@dataclass(frozen=True)
+class Identity(Deformation):
+    """r+ = d: the request is the desired response, whatever the response of the plant.
+
+    It is the only map that does not iterate: its gains are zero, and it corrects no response error.
+    """
+
+    @property
+    def adapts(self) -> bool:
+        return False
+
+    @property
+    def iteration(self) -> Iteration:
+        return Iteration(slows_desired=False)
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        del request, response, memory
+        return desired, {}
+
+    def effective_gain(self) -> float:
+        return 0.0
+
+    def secant_gain(self) -> float:
+        return 0.0
+
+    def largest_step(self) -> float:
+        return float("inf")
+
+    def with_effective_gain(self, gain: float) -> Self:
+        """Raise, because there is no gain to change.
+
+        Raises:
+            NotSupported: always.
+        """
+        raise NotSupported(
+            f"Identity() has no gain, so it cannot take {gain!r}; use Sigmoid(gain=...), the usual choice"
+        )
+
+
+EXAMPLES = (Identity(),)

@@ -25,7 +25,7 @@ import casadi as ca
 from fpirhc.by_name import find_by_name
 from fpirhc.errors import InvalidField, nearest
 from fpirhc.fields.expected import Anything, Choice, Expected, Number, accepts, expected_by
-from fpirhc.fields.given import call_of, described, shortened, signature_of
+from fpirhc.fields.kinds import call_of, described, shortened, signature_of
 from fpirhc.fields.user_code import users_place
 from fpirhc.members import FORMER_MEMBERS
 

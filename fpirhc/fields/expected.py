@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.fields.given import shortened
-from fpirhc.fields.kinds import Range, real_number
+from fpirhc.fields.kinds import Range, real_number, shortened
 from fpirhc.symbolic.live import SymbolicNumber
 
 

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidProblem, nearest
-from fpirhc.fields.given import described
+from fpirhc.fields.kinds import described
 from fpirhc.symbolic.expression import Expression, expression
 
 Result = TypeVar("Result")

@@ -30,7 +30,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import named_in_task
 from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, ProblemFileError
 from fpirhc.fields.checked import Checked, checked_call, mistakes_of
-from fpirhc.fields.given import call_of, described
+from fpirhc.fields.kinds import call_of, described
 from fpirhc.fields.user_code import explained
 from fpirhc.problem_files.settings import TuningSpans, check_tuning
 from fpirhc.problem_files.shipped import find_problem

@@ -1,7 +1,6 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .base import DerivativeEstimator
-from .measured import Measured
+from .base import DerivativeEstimator, Measured
 from .positions import PositionDifference, SavitzkyGolay, StepDifference
 from .sensing import Sensing, Sensor
 from .state_filter import StateVariableFilter

@@ -1,4 +1,4 @@
-"""The contract of derivative estimators: state and response from the measured quantities.
+"""The contract of derivative estimators, state and response from the measured quantities; and the one that needs no formula.
 
 Theory: docs/theory-estimation.md.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import casadi as ca
@@ -16,7 +17,8 @@ import numpy as np
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 Array: TypeAlias = np.ndarray
 
@@ -133,3 +135,48 @@ def backward_difference(degree: int) -> Array:
 def combine(coefficients: Array, samples: Sequence[Expression]) -> Expression:
     """Return the sum of samples (newest first) times coefficients; terms with a zero coefficient are left out."""
     return sum(c * s for c, s in zip(coefficients, samples, strict=True) if c != 0)
+
+
+@dataclass(frozen=True)
+class Measured(DerivativeEstimator):
+    """State and response as the sensors show them, without delay."""
+
+    @property
+    def measures_all(self) -> bool:
+        return True
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(plant.output.elements + response_names(plant)))
+
+    def answers(self, plant: Plant) -> tuple[str, ...]:
+        return response_names(plant)
+
+    def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
+        del period, start
+        realised = plant.response_signal("realised")
+        responses = [seen.elements.index(name) for name in response_names(plant)]
+
+        def step(s: Signals) -> dict[str, Expression]:
+            both = getattr(s, seen.name)
+            return {plant.output.name: both[: plant.output.size], "realised": both[responses]}
+
+        return Block("estimate", Layout((seen,)), Layout((plant.output, realised)), step)
+
+    @property
+    def shows_response(self) -> bool:
+        return True
+
+    def weights(self, order: int, period: float) -> Array:
+        del order, period
+        return np.ones(1)
+
+    def delay(self, order: int, period: float) -> float:
+        del order, period
+        return 0.0
+
+    def fills(self, order: int) -> int:
+        del order
+        return 1
+
+
+EXAMPLES = (Measured(),)

@@ -26,9 +26,8 @@ from fpirhc.sensing.base import (
     known_by_positions,
     spline_weights,
 )
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import GAP, Block, ahead, continued, is_long, shares
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.gap import GAP, ahead, continued, is_long, shares
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 LONGEST = 1001  # samples: the memory has a fixed size

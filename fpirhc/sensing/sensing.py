@@ -19,8 +19,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import real_number
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, quantities, response_names
-from fpirhc.sensing.measured import Measured
+from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, quantities, response_names
 from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals

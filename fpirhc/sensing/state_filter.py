@@ -21,9 +21,8 @@ from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, known_by_positions, spline_weights
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import GAP, Block, is_long
 from fpirhc.symbolic.expression import Signals, expression, total
-from fpirhc.symbolic.gap import GAP, is_long
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _STAGES, _INPUTS = "filter_stages", "filter_inputs"

@@ -18,9 +18,8 @@ import numpy as np
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import GAP, Block, is_long, straightened
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.gap import GAP, is_long, straightened
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _TAIL = 1e-9  # share of the low-pass's weights that is left out

@@ -10,8 +10,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.errors import InvalidField, InvalidValue
-from fpirhc.fields.given import described
-from fpirhc.fields.kinds import finite_number, named_entries
+from fpirhc.fields.kinds import described, finite_number, named_entries
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.symbolic.paths import opened

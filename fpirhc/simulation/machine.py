@@ -28,8 +28,8 @@ from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, compose
+from fpirhc.symbolic.driver import every_finite
 from fpirhc.symbolic.expression import FINITE, Signals, expression
-from fpirhc.symbolic.finite import every_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.limits import Interval

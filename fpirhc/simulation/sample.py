@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue
-from fpirhc.fields.given import described
-from fpirhc.fields.kinds import real_number
+from fpirhc.fields.kinds import described, real_number
 from fpirhc.simulation.run import Run
 
 

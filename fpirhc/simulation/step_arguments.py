@@ -18,8 +18,7 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.sensing_chain import given_states, raw_signal
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.fields.given import described
-from fpirhc.fields.kinds import named_entries, real_number
+from fpirhc.fields.kinds import described, named_entries, real_number
 from fpirhc.fields.user_code import called
 from fpirhc.plant.chain import measured_signals
 from fpirhc.simulation.machine import SKIPPED

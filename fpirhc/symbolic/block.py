@@ -1,4 +1,4 @@
-"""The contract of everything that happens in a control cycle, and how blocks become one Function.
+"""The contract of everything that happens in a control cycle, how blocks become one Function, and cycles without a sample.
 
 Theory: docs/theory-plants.md.
 """
@@ -15,32 +15,57 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.symbolic.expression import FINITE, Expression, Matrix, Signals, Value, expression, kind
-from fpirhc.symbolic.gap import GAPS
+from fpirhc.symbolic.expression import FINITE, Expression, Matrix, Signals, Value, expression, kind, total
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX as SETTING
+from fpirhc.symbolic.live import Derived, Values
+
+LONG = 1e15  # the gap that is not bridged; shares of it are one
+GAP, SETTLING = scalar("gap"), scalar("settling")
+GAPS = (GAP, SETTLING)
+
+
+def is_long(gap: Expression) -> Expression:
+    """Return whether the gap is longer than what is bridged."""
+    return gap > LONG / 2
+
+
+def shares(gap: Expression, count: int, degree: int = 1) -> list[Expression]:
+    """Return the shares w_1 ... w_count of the newest value in values that are 1 ... count cycles old."""
+    result = []
+    for i in range(1, count + 1):
+        share = ca.fmax(0, gap + 1 - i) / (gap + 1)
+        for j in range(2, degree + 1):
+            share *= (gap + j - i) / (gap + j)
+        result.append(share)
+    return result
+
+
+def straightened(queue: Expression, newest: Expression, gap: Expression) -> Expression:
+    """Return a queue of columns, newest first, whose newest one was repeated over the gap, on the straight line to now."""
+    size = newest.numel()
+    entries = ca.vertsplit(queue)
+    line = shares(gap, len(entries) // size)
+    return ca.vertcat(*(e + line[k // size] * (newest[k % size] - e) for k, e in enumerate(entries)))
+
+
+def ahead(count: int, degree: int) -> np.ndarray:
+    """Return the weights of values 1 ... count cycles old, newest first, in the polynomial through them at this cycle.
+
+    It is the polynomial of that degree, or of the highest one that the values determine, by least squares.
+    """
+    powers = np.vander(-np.arange(1.0, count + 1) / count, min(degree, count - 1) + 1, increasing=True)
+    return np.asarray(np.linalg.pinv(powers)[0])
+
+
+def continued(weights: np.ndarray, values: Sequence[Expression]) -> Expression:
+    """Return the value of the polynomial at this cycle; see `ahead`."""
+    return total(float(w) * v for w, v in zip(weights, values, strict=True))
+
 
 Step = Callable[[Signals], Mapping[str, Value]]
-Values = Mapping[str, float]
 _NO_SAMPLE = 10 * FINITE  # beyond the finite numbers, and no NaN, which is the mark of a live setting that was lost
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
-
-
-@dataclass(frozen=True, eq=False)
-class Derived:
-    """Numbers that follow from the settings outside the loop.
-
-    Args:
-        signals: values of signals 'setting.derived.NAME', by their names.
-        memory: function that returns values of remembered signals at the start of a run, by their names; a change during a run
-            does not need them.
-        stale: the effect of running a deployed build with the outdated value of a signal, by name, for a device without Python;
-            '' where it must not.
-    """
-
-    signals: Mapping[str, np.ndarray] = field(default_factory=dict)
-    memory: Callable[[], Mapping[str, np.ndarray]] = dict
-    stale: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +85,7 @@ class Block:
         inside: the composed step that the block runs, where it is nothing but the guard of one.
         waits: block with the same memory that stands for this one in a cycle without a sample. It reads no sample; what it writes,
             others read that wait. None: the memory stays as it is.
-        bridged: function that returns the block where samples may be lost, which may read the signals of `symbolic.gap`; None: the
+        bridged: function that returns the block where samples may be lost, which may read the signals `GAPS`; None: the
             same one.
     """
 

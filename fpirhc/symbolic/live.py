@@ -1,4 +1,4 @@
-"""Numbers that stay open while a loop is built, so that a compiled loop takes other values of them.
+"""Numbers that stay open while a loop is built, so that a compiled loop takes other values; and what Python computes from them.
 
 Theory: docs/theory-plants.md.
 """
@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 import operator
 from abc import ABC
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from types import FunctionType
 from typing import NoReturn, TypeVar, cast
 from weakref import WeakValueDictionary
@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 
 class SymbolicNumber(ABC):  # noqa: B024 -- a marker without methods
@@ -220,8 +221,8 @@ def settled(value: T, numbers: Mapping[str, float]) -> T:
 def copied(value: T, changes: Mapping[str, object]) -> T:
     """Return a frozen dataclass with other contents of some fields, without validation and without cached facts."""
     copy = object.__new__(type(value))
-    for field in fields(value):  # type: ignore[arg-type]  # mypy does not narrow type variables
-        object.__setattr__(copy, field.name, changes.get(field.name, getattr(value, field.name)))
+    for one in fields(value):  # type: ignore[arg-type]  # mypy does not narrow type variables
+        object.__setattr__(copy, one.name, changes.get(one.name, getattr(value, one.name)))
     return copy
 
 
@@ -281,3 +282,67 @@ def _combined(operation: _Operation, left: object, right: object) -> LiveNumber:
             return NotImplemented
     paths = tuple(dict.fromkeys(path for side in live for path in side.paths))
     return LiveNumber(paths, lambda kind: operation(_expressed(left, kind), _expressed(right, kind)))
+
+
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Derived:
+    """Numbers that follow from the settings outside the loop.
+
+    Args:
+        signals: values of signals 'setting.derived.NAME', by their names.
+        memory: function that returns values of remembered signals at the start of a run, by their names; a change during a run
+            does not need them.
+        stale: the effect of running a deployed build with the outdated value of a signal, by name, for a device without Python;
+            '' where it must not.
+    """
+
+    signals: Mapping[str, np.ndarray] = field(default_factory=dict)
+    memory: Callable[[], Mapping[str, np.ndarray]] = dict
+    stale: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Following:
+    """A column of numbers that follows from live settings.
+
+    Args:
+        signal: that the block reads, with the numbers of the build as its start.
+        settings: from which it follows, by path.
+        of: function of the numbers of all settings, by path, that returns the column.
+        stale: what becomes of a loop that goes on with the old column; '' where it must not, see `Derived`.
+    """
+
+    signal: Signal
+    settings: Mapping[str, LiveNumber]
+    of: Callable[[Values], np.ndarray]
+    stale: str
+
+    @property
+    def reads(self) -> Layout:
+        """The signal, and the settings themselves, for a block that does not use these by itself."""
+        own = tuple(scalar(PREFIX + path, start=number.value) for path, number in self.settings.items())
+        return Layout((self.signal, *own))
+
+    def derived(self, values: Values) -> Derived:
+        """Return the column for these numbers of the settings."""
+        return Derived({self.signal.name: self.of(values)}, stale={self.signal.name: self.stale})
+
+
+def remembered(name: str, elements: Sequence[str], values: Sequence[float]) -> Layout:
+    """Return the signal in which a block remembers numbers, to notice a change; none where no run changes them."""
+    return Layout((Signal(name, tuple(elements), start=(1.0,) * len(values)),)) if is_live(values) else Layout()
+
+
+def following(
+    name: str, settings: Mapping[str, LiveNumber], of: Callable[[Values], np.ndarray], stale: str = ""
+) -> Following | None:
+    """Return the column that `of` computes from live settings; None where there are none."""
+    if not settings:
+        return None
+    start = of({path: number.value for path, number in settings.items()})
+    elements = tuple(str(k) for k in range(start.size))
+    signal = Signal(f"{PREFIX}{DERIVED}{next(iter(settings))}.{name}", elements, start=tuple(map(float, start)))
+    return Following(signal, settings, of, stale)

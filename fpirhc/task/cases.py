@@ -18,8 +18,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked, checked_call, expects_whole_number
-from fpirhc.fields.given import described
-from fpirhc.fields.kinds import finite_number
+from fpirhc.fields.kinds import described, finite_number
 from fpirhc.fields.user_code import users_folder
 from fpirhc.plant.mismatch import Parametric
 from fpirhc.summary import line

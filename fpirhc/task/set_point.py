@@ -20,8 +20,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
-from fpirhc.fields.given import described
-from fpirhc.fields.kinds import Count, Positive, real_number
+from fpirhc.fields.kinds import Count, Positive, described, real_number
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant

@@ -1,15 +1,26 @@
-"""The contract of tracking laws."""
+"""The contract of tracking laws, and the errors and integrals that they feed back."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.motion import followed_units, sampling
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import GAP, Block, Delay, is_long
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import numbers
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.live import nominal, remembered
 
 
 @dataclass(frozen=True)
@@ -69,3 +80,192 @@ class Tracking(Checked, ABC):
     @abstractmethod
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
         """Signals that the law carries to the next cycle."""
+
+
+ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor
+
+
+@dataclass(frozen=True)
+class Useful:
+    """What the integral of an error may ask for.
+
+    Args:
+        integral: its gain g_0.
+        error: the gain g_1 of the error itself.
+        largest: response that the limits of the inputs allow, L; infinite where they are not finite.
+    """
+
+    integral: float
+    error: float
+    largest: float
+
+    def next(self, integral: Expression, error: Expression, period: float) -> Expression:
+        """The integral one cycle later.
+
+        The error counts where |g_0 e_int + g_1 e| <= 10 L; so it takes the integral back as soon as the two are of opposite signs.
+        An integral with |g_0 e_int| > 20 L, such as one that began at an absurd sample, is forgotten.
+        """
+        if math.isinf(self.largest):
+            return integral + period * error
+        most = ROOM * self.largest
+        counted = ca.if_else(ca.fabs(self.integral * integral + self.error * error) <= most, error, 0)
+        later = integral + period * counted
+        return ca.if_else(ca.fabs(self.integral * later) <= 2 * most, later, 0)
+
+
+class IntegralLaw(Tracking):
+    """A law whose memory between cycles is the integral of the error, which does not grow while the command is clipped."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def largest(self) -> Sequence[float]:
+            """Responses beyond ten times of which an error is not integrated; empty: not decided yet."""
+
+    else:  # a plain attribute, so that dataclasses may have a field of this name
+        largest: Sequence[float]
+
+    def within(self, largest: Sequence[float]) -> Self:
+        """Return the law with these largest responses, unless the user has set them."""
+        if self.largest:
+            return self
+        other = copy(self)  # not `replace`, which would check numbers that are live
+        object.__setattr__(other, "largest", tuple(largest))
+        return other
+
+    def update(self, plant: Plant, period: float) -> Block:
+        """Block that integrates the error, except while the command is clipped, and within its bounds."""
+        return integral_update(plant, period, self._useful(plant))
+
+    def delays(self, plant: Plant) -> tuple[Delay, ...]:
+        return integral_delay(plant)
+
+    @abstractmethod
+    def _useful(self, plant: Plant) -> list[Useful]:
+        """What the integrals may ask for; nothing where they are not fed back."""
+
+
+def law_signals(plant: Plant) -> tuple[Layout, Layout]:
+    """Signals that the law of an integrating tracking law reads and writes."""
+    reads = (
+        plant.output,
+        Signal("_target", plant.output.elements, plant.output.units),
+        plant.response_signal("nominal"),
+        scalar("warm_up"),
+        integral_signal(plant, "_integral_before"),
+    )
+    writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
+    return Layout(reads), Layout(writes)
+
+
+def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) -> Block:
+    """Block that integrates the error, except while the command is clipped, and where it asks for what no limits could meet.
+
+    Over a gap the error is on a line: cycle by cycle the last one is integrated again, and the next sample adds the rest.
+
+    Args:
+        plant: whose errors are integrated.
+        period: of the control cycle, s.
+        useful: what the integral of every controlled coordinate may ask for; empty: anything.
+    """
+    writes = Layout((integral_signal(plant, "integral"),))
+    increment, before = integral_signal(plant, "integral_increment"), integral_signal(plant, "_integral_before")
+    reads = (error_signal(plant), scalar("clipped"), integral_signal(plant, "_integral_used"))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        error = ca.if_else(s.clipped, 0, s._target_error)
+        if not useful:
+            return {"integral": s._integral_used + period * error}
+        columns = zip(useful, ca.vertsplit(s._integral_used), ca.vertsplit(error), strict=True)
+        return {"integral": ca.vertcat(*(one.next(i, e, period) for one, i, e in columns))}
+
+    def lossy(s: Signals) -> dict[str, Expression]:
+        integral = step(s)["integral"]
+        added = integral - s._integral_used
+        missing = ca.if_else(is_long(s.gap), 0, s.gap)
+        rest = ca.if_else(missing > 0.5, missing / 2 * (added - s.integral_increment), 0)
+        return {"integral": integral + rest, "integral_increment_next": added}
+
+    def wait(s: Signals) -> dict[str, Expression]:
+        added = ca.if_else(is_long(s.gap), 0, s.integral_increment)
+        return {"_integral_before_next": s._integral_before + added, "integral_increment_next": s.integral_increment}
+
+    waits = Block("tracking_waits", Layout((GAP,)), Layout(), wait, Layout((before, increment)))
+    bridged = Block("tracking_update", Layout((*reads, GAP)), writes, lossy, Layout((increment,)), waits=waits)
+    return Block("tracking_update", Layout(reads), writes, step, bridged=lambda: bridged)
+
+
+def integral_delay(plant: Plant) -> tuple[Delay, ...]:
+    """Delay that carries the updated integral to the next cycle."""
+    return (Delay(integral_signal(plant, "_integral_before"), "integral"),)
+
+
+def gains_before(plant: Plant, gains: Sequence[float]) -> Layout:
+    """What a law remembers of its integral gains, one per controlled coordinate: the last ones where some are live."""
+    return remembered("integral_gain", plant.controlled_names, gains)
+
+
+def bumpless(s: Signals, gains: Sequence[float]) -> tuple[Expression, dict[str, Expression]]:
+    """Return the integral of the error, and the gains to remember.
+
+    The contribution of the integral stays where a live gain changes, I+ = I g_before / g, so that the command does not jump by the
+    integral's share. Without a change the factor is exactly 1.
+
+    Args:
+        s: signals of the law, with `gains_before` in its memory.
+        gains: of the integral, one per controlled coordinate.
+    """
+    if "integral_gain" not in vars(s):
+        return s._integral_before, {}
+    now = numbers(gains)
+    factor = ca.if_else(now == 0, 1, s.integral_gain / ca.if_else(now == 0, 1, now))
+    return factor * s._integral_before, {"integral_gain_next": now}
+
+
+def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
+    """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked.
+
+    Args:
+        law: for the message.
+        plant: that it acts on.
+        gains: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.
+
+    Raises:
+        InvalidValue: a pole z on or outside the unit circle.
+    """
+    if plant.step is None or not gains:
+        return
+    cycle = sampling(plant)
+    poles = 1 + cycle * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
+    if np.abs(poles).max() >= 1:
+        worst = complex(poles[int(np.abs(poles).argmax())])
+        shown = f"{worst.real:.3g}" if abs(worst.imag) < 1e-6 * abs(worst) else f"{worst:.3g}"
+        raise InvalidValue(
+            f"{law!r}: in the map's cycles of {cycle:g} {plant.time_unit} a mode of the error has the pole z = {shown} "
+            f"and does not decay; use a rate below {2 / cycle:g} 1/{plant.time_unit} ({1 / cycle:g} is deadbeat)"
+        )
+
+
+def error_signal(plant: Plant) -> Signal:
+    """Error to the target of every controlled coordinate."""
+    every = followed_units(plant)
+    units = [every[c] for c in plant.controlled_names]
+    return vector("_target_error", plant.controlled_names, units)
+
+
+def integral_signal(plant: Plant, name: str) -> Signal:
+    """Integral of the error of every controlled coordinate, under the given name."""
+    every = followed_units(plant)
+    units = [f"{every[c]} {plant.time_unit}" for c in plant.controlled_names]
+    return vector(name, plant.controlled_names, units)
+
+
+def error_chains(plant: Plant, error: Expression) -> list[list[Expression]]:
+    """Per controlled coordinate: [e, e', ...] below its relative order; nothing for one of order 0."""
+    place = plant.output.elements.index
+    return [[error[place(name + "'" * s)] for s in range(order)] for name, order in plant.response_orders.items()]
+
+
+def own_errors(plant: Plant, error: Expression) -> list[Expression]:
+    """The error e of every controlled coordinate."""
+    return [error[plant.output.elements.index(name)] for name in plant.controlled_names]

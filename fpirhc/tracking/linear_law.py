@@ -22,8 +22,8 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression
-from fpirhc.tracking.base import Feedback
-from fpirhc.tracking.error import (
+from fpirhc.tracking.base import (
+    Feedback,
     IntegralLaw,
     Useful,
     bumpless,

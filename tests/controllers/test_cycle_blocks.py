@@ -40,7 +40,7 @@ from fpirhc.controllers.contract import (
     without_deformation,
 )
 from fpirhc.controllers.mirror import MEASURED
-from fpirhc.controllers.scale_selection import command_demand, plan_demand, reference_demand
+from fpirhc.controllers.reference_states import command_demand, plan_demand, reference_demand
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import InvalidField, InvalidValue, NotContractive, NotSupported
 from fpirhc.status import Status

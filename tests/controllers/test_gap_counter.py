@@ -15,8 +15,7 @@ from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.gate import AGAIN, Gap, across_gaps, gap_of
 from fpirhc.controllers.sensing_chain import compose_seeing
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, compose
-from fpirhc.symbolic.gap import LONG
+from fpirhc.symbolic.block import LONG, Block, compose
 from fpirhc.symbolic.layout import Layout, scalar
 
 NAMES = ("missing_cycles", "still_settling")

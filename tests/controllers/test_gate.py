@@ -16,8 +16,9 @@ import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Derived, compose
+from fpirhc.symbolic.block import Block, compose
 from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.live import Derived
 
 LIMITS = fp.Limits(inputs={"Fa": (-30.0, 30.0), "Fb": (-6.0, 40.0)})
 PROBLEM = replace(two_masses(), limits=LIMITS, input_before={"Fa": 2.5, "Fb": -1.5})

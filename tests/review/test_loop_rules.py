@@ -11,7 +11,7 @@ from chains import chain, coupled, errors_after_request, linear_loop, linear_pai
 from sampled import edge, lag, poles, resonance
 
 import fpirhc as fp
-from fpirhc.contraction.lag import bearable_lag, damped_product, resonant_limit
+from fpirhc.contraction.delayed import bearable_lag, damped_product, resonant_limit
 from fpirhc.contraction.large_errors import (
     basin_of_plain_form,
     least_product,

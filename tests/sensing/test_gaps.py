@@ -20,9 +20,8 @@ from fpirhc.sensing.base import DerivativeEstimator
 from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.clock import missed_cycles
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, bridged
+from fpirhc.symbolic.block import LONG, Block, bridged, shares
 from fpirhc.symbolic.expression import FINITE
-from fpirhc.symbolic.gap import LONG, shares
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.native import find_compiler
 

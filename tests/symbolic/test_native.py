@@ -20,10 +20,9 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.symbolic import native as module
-from fpirhc.symbolic.driver import SIGNATURE, Driver, with_driver
+from fpirhc.symbolic.driver import SIGNATURE, Driver, finite, with_driver
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import expression, graph
-from fpirhc.symbolic.finite import finite
 from fpirhc.symbolic.native import find_compiler, native
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")

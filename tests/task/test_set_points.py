@@ -15,7 +15,7 @@ from scipy.special import comb
 import fpirhc as fp
 from fpirhc.cli.verbs.run import by_kind
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.scale_selection import reference_demand
+from fpirhc.controllers.reference_states import reference_demand
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue, NotSupported
 from fpirhc.report.terminal import set_points_in_force
 from fpirhc.simulation.loop import close_loop

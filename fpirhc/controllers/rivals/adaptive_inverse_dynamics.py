@@ -15,8 +15,7 @@ from fpirhc.controllers.reference_states import own_signals
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.errors import NotSupported
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
@@ -24,11 +23,10 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.following import following
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.live import live_numbers, settled
+from fpirhc.symbolic.live import following, live_numbers, settled
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import error_chains, integral_signal
+from fpirhc.tracking.base import error_chains, integral_signal
 from fpirhc.tracking.linear_law import Exponential
 
 

@@ -24,7 +24,7 @@ from fpirhc.symbolic.expression import Signals, is_finite, total
 from fpirhc.symbolic.functions import exp, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import check_modes, error_chains, own_errors
+from fpirhc.tracking.base import check_modes, error_chains, own_errors
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, bounded, commanding_blocks, desired_blocks, like
 from fpirhc.controllers.contract import Deforms, PlantModel
-from fpirhc.controllers.scale_selection import command_demand
+from fpirhc.controllers.reference_states import command_demand
 from fpirhc.deformation.base import Deformation, Mirror, automatic
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number

@@ -26,8 +26,7 @@ from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.error import own_errors
+from fpirhc.tracking.base import Tracking, own_errors
 
 
 @dataclass(frozen=True, eq=False)

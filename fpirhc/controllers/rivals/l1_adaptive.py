@@ -19,8 +19,7 @@ from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.functions import exp, left_in_mean
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.error import error_chains
+from fpirhc.tracking.base import Tracking, error_chains
 
 
 @dataclass(frozen=True)

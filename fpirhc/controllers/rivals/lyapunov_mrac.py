@@ -24,7 +24,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import error_chains
+from fpirhc.tracking.base import error_chains
 
 
 @dataclass(frozen=True)

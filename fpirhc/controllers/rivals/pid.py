@@ -24,7 +24,7 @@ from fpirhc.symbolic.functions import quotient
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import (
+from fpirhc.tracking.base import (
     Useful,
     bumpless,
     error_chains,

@@ -14,13 +14,12 @@ import numpy as np
 from fpirhc.controllers.base import like
 from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Values
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.following import following
 from fpirhc.symbolic.functions import numbers, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import live_numbers, settled
-from fpirhc.tracking.error import error_chains
+from fpirhc.symbolic.live import Values, following, live_numbers, settled
+from fpirhc.tracking.base import error_chains
 
 
 def decay_gains(rate: float, order: int) -> tuple[float, ...]:

@@ -21,7 +21,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import error_chains
+from fpirhc.tracking.base import error_chains
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import check_modes, error_chains
+from fpirhc.tracking.base import check_modes, error_chains
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, fed, like, reference_block
 from fpirhc.controllers.rivals.learned_parameters import Learning, learning_delays
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example

@@ -25,10 +25,9 @@ from fpirhc.horizon.nominal import reference_state
 from fpirhc.plant.motion import time_signal
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import FINITE, Signals
-from fpirhc.symbolic.following import following
 from fpirhc.symbolic.functions import rounded
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import expressed, live_numbers, nominal, settled
+from fpirhc.symbolic.live import expressed, following, live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
 SlotSpans = tuple[tuple[str, float], ...]

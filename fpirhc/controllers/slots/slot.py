@@ -14,8 +14,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.deformation.base import Deformation, Mirror
-from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.base import Deformation, Identity, Mirror
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, NotSupported, nearest
 from fpirhc.fields.checked import Checked

@@ -19,8 +19,7 @@ from fpirhc.controllers.base import Controller, Response, clip, command_before, 
 from fpirhc.controllers.reference_states import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.schedules import Schedule, linear_modes
 from fpirhc.controllers.slots.slot import Channel, First, Slot, channel, delays_for_channel, for_channel
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes, NotContractive
 from fpirhc.members import Example

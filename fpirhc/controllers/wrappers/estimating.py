@@ -19,9 +19,8 @@ from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.maps import response_age
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import GAP, Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
-from fpirhc.symbolic.gap import GAP
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.dead_time import DeadTime

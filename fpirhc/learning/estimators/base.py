@@ -19,8 +19,8 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Deviation
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.following import Following
 from fpirhc.symbolic.layout import Expression, Layout
+from fpirhc.symbolic.live import Following
 from fpirhc.task.problem import Problem
 
 

@@ -21,10 +21,9 @@ from fpirhc.plant.motion import Output, controlled_places, followed_units, forci
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import quantities, response_names
 from fpirhc.symbolic.expression import expression
-from fpirhc.symbolic.following import Following, following
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
-from fpirhc.symbolic.live import live_numbers, nominal, settled
+from fpirhc.symbolic.live import Following, following, live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
 _STALE = "the filter stays stable, and keeps the bandwidth of the old deviations"

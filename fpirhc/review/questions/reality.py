@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.contraction.lag import damped_product, resonant_limit
+from fpirhc.contraction.delayed import damped_product, resonant_limit
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import pairs_lag
 from fpirhc.errors import FpirhcError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.contraction.lag import bearable_lag
+from fpirhc.contraction.delayed import bearable_lag
 from fpirhc.contraction.large_errors import least_product
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
