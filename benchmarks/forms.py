@@ -27,8 +27,8 @@ import numpy as np
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import check_gain_sign
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.gain_check import check_gain_sign
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.shipped import shipped_problems

@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.controllers.base import compose_controller
+from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic.evaluate import Evaluator

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -84,11 +84,3 @@ def _differs(one: Field[Any], content: object) -> bool:
     if one.default_factory is not MISSING:
         return repr(content) != repr(one.default_factory())
     return one.default is MISSING or repr(content) != repr(one.default)
-
-
-def replaced(value: Value, field: str, content: object) -> Value | None:
-    """Return the same frozen value with another content of a field; None where it is no dataclass or has no such field."""
-    if not is_dataclass(value) or field not in [f.name for f in fields(value)]:
-        return None
-    changed: Value = replace(value, **{field: content})  # type: ignore[type-var]  # mypy does not narrow type variables
-    return changed

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.check import checked
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along, points_of
 from fpirhc.simulation.linearise.linear_loop import LinearLoop

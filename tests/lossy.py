@@ -9,7 +9,8 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller, checked
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import Controller
 from fpirhc.sensing.base import values_of
 from fpirhc.simulation.path import true_response
 from fpirhc.status import Status

@@ -8,7 +8,7 @@ import pytest
 from mutated_problems import mutated
 
 import fpirhc as fp
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.check import checked
 from fpirhc.errors import FpirhcError, ProblemFileError
 from fpirhc.problem_files import problem_file
 

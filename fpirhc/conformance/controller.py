@@ -13,8 +13,10 @@ from fpirhc.conformance.controller_facts import FACTS
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
 from fpirhc.conformance.loops import REPLAYED, Trial, anything
 from fpirhc.conformance.loops import two_masses as two_masses
-from fpirhc.controllers.base import Controller, compose_controller
-from fpirhc.controllers.contract import checked, resolved, with_optimiser
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import resolved, with_optimiser
+from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.deformation.base import automatic, with_inner
 from fpirhc.describe import describe
 from fpirhc.simulation.harm_warning import without_warning

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from fpirhc.conformance.laws import hold, within
 from fpirhc.conformance.loops import Replay, Trial, coarse_steps, spelled_by_states
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, tracking_law
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Identity
 from fpirhc.errors import FpirhcError

@@ -11,8 +11,9 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.controllers.base import Controller, compose_controller
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.motion import Output

@@ -17,10 +17,9 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed_state import believed_integrator, moving
 from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.plant.motion import with_exact_parameters
-from fpirhc.sensing.base import Measured, values_of
+from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, values_of
 from fpirhc.sensing.observability import unobservable
 from fpirhc.sensing.sensing import Sensing, Sensor
-from fpirhc.sensing.state_observer import Evidence, Model, StateObserver
 from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements

@@ -9,8 +9,8 @@ from scipy.optimize import lsq_linear
 
 from fpirhc.conformance.horizons import BOUND, CORRIDOR, STAGES, STEP, Trial, TrialHorizon, TrialPlan
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
-from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import replaced
 from fpirhc.optimisers.base import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser
 from fpirhc.status import Status
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction.spectrum import Array
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidShape, InvalidValue
 
@@ -102,7 +101,7 @@ def step_for_basin(largest_error: float, poles: int, rate: float, period: float,
     return spare * least_product(poles, rate, period) * largest_error / eigenvalue
 
 
-def two_cycle_limit(low: Array, high: Array, gains: Sequence[float]) -> float:
+def two_cycle_limit(low: np.ndarray, high: np.ndarray, gains: Sequence[float]) -> float:
     """Return the gain from which on a two-cycle exists; infinite where no gain leads to one.
 
     A secant gain beyond it, at any size of the error, leads to a bounded two-cycle. Below it there is no two-cycle.

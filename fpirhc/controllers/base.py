@@ -14,25 +14,14 @@ import casadi as ca
 
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
-from fpirhc.controllers.contract import checked
-from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measured_state
-from fpirhc.controllers.model_inputs import ACTED, NOW, KnownSignals
-from fpirhc.controllers.reference_states import (
-    given_signals,
-    largest_response,
-    motion_of,
-    own_signals,
-    own_values,
-    with_reference,
-)
+from fpirhc.controllers.mirror import mirror_blocks
+from fpirhc.controllers.reference_states import largest_response, motion_of, own_signals, own_values
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import InvalidProblem
-from fpirhc.fields.kinds import described
-from fpirhc.plant.chain import measured_signals, nominal_responses
+from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
-from fpirhc.symbolic.block import GAP, SETTLING, Block, Composite, Delay, Step, compose, is_long
+from fpirhc.symbolic.block import GAP, SETTLING, Block, Delay, Step, is_long
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
@@ -41,115 +30,6 @@ from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
 _ABSURD = 1e4  # times the largest response that limits allow; a loop that diverges stays far below
-
-
-def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
-    plant, response = problem.plant, controller.response(problem)
-    realised = response.signal if response else plant.response_signal("realised")
-    parameters = controller.plant_model(problem).plant.parameter
-    return Layout((time_signal(plant), *measured_signals(plant), realised, parameters, *given_signals(problem)))
-
-
-def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
-    """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command).
-
-    Args:
-        problem: that the controller is composed for.
-        controller: checked here against the problem.
-        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, its
-            time, and the signals of the last cycle, where a block needs them.
-    """
-    ready = checked(problem, controller)
-    blocks, delays = _blocks_of(problem, ready)
-    blocks = with_reference(problem, blocks)
-    reads = controller_reads(problem, ready)
-    if ahead:
-        reads = reads + Layout(measured_reads(problem.plant, blocks))
-    else:
-        blocks = with_measured_state(problem.plant, blocks)
-    return compose_informed(problem, ready, reads, blocks, delays, ahead=ahead)
-
-
-def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], list[Delay]]:
-    """The blocks of a controller and what they remember.
-
-    Raises:
-        InvalidProblem: it gives something else.
-    """
-    given: object = controller.blocks(problem)
-    pair = given if isinstance(given, tuple) and len(given) == 2 else None
-    kinds = (Block, Delay)
-    if pair is None or not all(
-        isinstance(part, list | tuple) and all(isinstance(one, kind) for one in part)
-        for part, kind in zip(pair, kinds, strict=True)
-    ):
-        raise InvalidProblem(
-            f"{type(controller).__name__}.blocks(problem) must return two lists (blocks, delays), got {described(given)}"
-        )
-    return list(pair[0]), list(pair[1])
-
-
-def compose_informed(
-    problem: Problem, ready: Controller, reads: Layout, blocks: list[Block], delays: list[Delay], *, ahead: bool = False
-) -> Composite:
-    """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
-
-    Args:
-        problem: that the controller is composed for.
-        ready: the controller, checked.
-        reads: what the step reads.
-        blocks: of the step.
-        delays: what the step remembers of its signals.
-        ahead: whether the time is the one at which the command will act.
-    """
-    model = ready.plant_model(problem)
-    known = KnownSignals(model.plant, model.signals, problem.period)
-    compares = any(ACTED in block.reads for block in blocks)
-    first = known.block(remembers=compares and not ahead)
-    if first is None:
-        return compose("controller", reads, blocks, delays, outputs=("command",))
-    needed = reads + Layout(known.reads if compares else ())
-    inner = compose("informed", needed, blocks, delays, outputs=("command",))
-    block = embedded("informed", inner, {"parameters": like(known.plant.parameter, NOW)})
-    return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
-
-
-def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
-    """Return a composed step as one block.
-
-    Args:
-        name: of the block.
-        composite: the step.
-        feeds: name of a signal that the step reads -> the signal that it is given instead.
-    """
-    reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
-
-    def step(s: Signals) -> dict[str, Expression]:
-        memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
-        next_memory, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
-        remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
-        return {**composite.trace.split(trace), **remembered}
-
-    lossy = composite.bridged_if_any
-    return Block(
-        name,
-        Layout(reads),
-        composite.trace,
-        step,
-        composite.memory,
-        opaque=composite.opaque,
-        derived=composite.derived_if_any,
-        waits=None if composite.waits is None else fed_by(composite.waits, feeds),
-        bridged=None if lossy is None else lambda: embedded(name, lossy(), feeds),
-    )
-
-
-def fed_by(block: Block, feeds: Mapping[str, Signal]) -> Block:
-    """Return the block with other signals in place of those that `feeds` names."""
-    for name, source in feeds.items():
-        block = fed(block, name, source)
-    return block
 
 
 def fed(block: Block, name: str, source: Signal) -> Block:

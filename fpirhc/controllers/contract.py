@@ -16,24 +16,18 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
-from fpirhc.controllers.model_inputs import NONE
 from fpirhc.controllers.reference_states import plan_demand, reference_demand
 from fpirhc.deformation.base import Deformation, Identity, automatic, with_inner
-from fpirhc.deformation.model_referenced import form_inside
-from fpirhc.describe import replaced
 from fpirhc.errors import NotSupported
-from fpirhc.fields.checked import Checked, former_members, unnamed_inner
+from fpirhc.fields.checked import Checked, former_members, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.live import nominal
-from fpirhc.symbolic.queue import every
 from fpirhc.task.exogenous import Exogenous
 from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
 from fpirhc.tracking.base import Tracking
@@ -357,53 +351,6 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     return controller.with_defaults(problem)
 
 
-_CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same controllers again and again
-
-
-def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
-    """Return the resolved controller, checked against the problem.
-
-    A controller with live numbers is checked with the numbers of the build, and returned as it is.
-
-    Args:
-        problem: the problem.
-        controller: the controller.
-        numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.
-
-    Raises:
-        FpirhcError: the controller's own check fails.
-        NotContractive: the gain of the deformation has the wrong sign, or is too large behind estimator and filter.
-        NotSupported: a form of the deformation that cannot be used here; a
-            response of the controller's own behind sensors or dead time.
-    """
-    task, build = nominal(problem), nominal(controller)
-    ready = _CHECKED.of((task, build), (numbers_only,), lambda: _checked(task, build, numbers_only))
-    return ready if build is controller else controller
-
-
-def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
-    check_outputs(problem, controller)
-    ready = resolved(problem, controller)
-    if numbers_only and ready.inner is None and ready.planner is not None:
-        ready.planner.check_weights(problem)
-    else:
-        ready.check(problem)
-    check_form(problem, ready)
-    if ready.deforms == "target":
-        return ready  # its own check judges a gain that acts on targets
-    if ready.response(problem) is None:
-        check_gain_sign(problem, ready.deformation)
-        check_gain_size(problem, ready.deformation)
-        return ready
-    late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-    if late or problem.reality or not problem.sensing.ideal:
-        what = "dead time" if late else "the reality" if problem.reality else "sensing"
-        raise NotSupported(
-            f"{type(ready).__name__} reads responses of its own, without delay and noise; leave {what} out of the problem"
-        )
-    return ready
-
-
 def tracking_law(controller: Controller) -> Tracking | None:
     """Return the law with which a controller tracks the reference: the field `tracking` of the innermost one; None without."""
     return getattr(innermost(controller), "tracking", None)
@@ -469,76 +416,6 @@ def without_deformation(controller: Controller) -> Controller:
         NotSupported: it has a deformation that cannot be left out.
     """
     return controller.with_deformation(Identity()) if controller.deformation.adapts else controller
-
-
-def check_outputs(problem: Problem, controller: Controller) -> None:
-    """Raise if the problem's plant has outputs that the deformation does not cover, or of order 0 behind an estimator.
-
-    Raises:
-        NotSupported: with the reason.
-    """
-    _refuse(_of_outputs(problem, controller))
-
-
-def check_form(problem: Problem, controller: Controller) -> None:
-    """Raise if the controller's deformation has a form that cannot be used.
-
-    Raises:
-        NotSupported: the number of dead times or lags differs from the plant's number of channels; a wrapper changes what a
-            model-referenced form inside it compares.
-    """
-    _refuse(_of_form(problem, nominal(controller.deformation)))
-
-
-def _refuse(reasons: Iterator[str]) -> None:
-    for reason in reasons:
-        raise NotSupported(reason)
-
-
-def _of_outputs(problem: Problem, controller: Controller) -> Iterator[str]:
-    """Reasons against outputs; those of order 0 have a response that is measured."""
-    plant, mirror = problem.plant, nominal(controller.deformation).mirror
-    instant = [name for name, order in plant.response_orders.items() if not order]
-    if instant and not problem.sensing.estimator.measures_all:
-        yield (
-            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
-            "need none; leave the estimator out: Sensing(sensors=...)"
-        )
-    late = 0.0 if mirror is None else mirror.measurement
-    if plant.outputs and (late % 1 > NONE or (plant.step and late)):
-        yield (
-            f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
-            f"({', '.join(plant.chains)}): its twin moves from the state that is given with the samples, and these are late by "
-            f"{late:g} cycles; believe in whole cycles, and for a map in none"
-        )
-
-
-def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
-    """Reasons against the form, the first one first."""
-    plant, channels, mirror = problem.plant, deformation.iteration.channels, deformation.mirror
-    if channels not in (None, len(plant.controlled_names)):
-        yield (
-            f"{type(deformation).__name__}: {channels} dead times are given, but the plant has {len(plant.controlled_names)} "
-            f"controlled coordinates ({', '.join(plant.controlled_names)}); give one for each, or one number for all"
-        )
-    if (outer := form_inside(deformation)) is not None:
-        name = type(outer).__name__
-        yield (
-            f"{name} around a model-referenced form changes what the form compares, the model's response with the measured one; "
-            f"put it inside: ModelReferenced({name}(map, ...))"
-        )
-    if mirror is None:
-        return
-    for setting, values in (("cycles", every(mirror.cycles)), ("lag", every(mirror.lag))):
-        if len(values) not in (1, len(plant.inputs)):
-            own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"
-            yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
-    parts = any(c % 1 for c in (*every(mirror.cycles), mirror.measurement))
-    if plant.step is not None and (any(every(mirror.lag)) or parts):
-        yield (
-            f"{type(deformation).__name__}: a map has no lag, and no dead time of parts of a cycle; write an actuator as a state "
-            "of the map, and dead times in whole cycles"
-        )
 
 
 def check_chains(problem: Problem, law: str) -> None:

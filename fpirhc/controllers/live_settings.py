@@ -16,7 +16,8 @@ from typing import cast
 
 import numpy as np
 
-from fpirhc.controllers.contract import Controller, checked, resolved
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.kinds import described, real_number

@@ -26,9 +26,8 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.maps import growth_of
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import values_of
+from fpirhc.sensing.base import Evidence, Model, StateObserver, values_of
 from fpirhc.sensing.observability import members, slowest
-from fpirhc.sensing.state_observer import Evidence, Model, StateObserver
 from fpirhc.symbolic.block import GAP, Block, Delay, bridged, call
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal

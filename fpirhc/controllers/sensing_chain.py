@@ -1,30 +1,31 @@
-"""Sensing and controller as ONE step: from the raw measurements to the command.
+"""A controller, and sensing with it, as ONE step: from the raw measurements to the command.
 
     raw measurements -> [estimator -> controller] -> command
 
-A sensor shows what it measures; velocities, filters and queues of samples are the controller's business. So the estimator is the
-first block of the composed step. A machine gives the step what its sensors show, and a skipped cycle leaves the estimator's memory
-as it was, like every other memory. Where state and response are both measured, there is nothing to estimate, and the step reads
-them.
+A machine gives the step what its sensors show; a skipped cycle leaves the estimator's memory as it was, like every other one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
-from fpirhc.controllers.contract import checked
-from fpirhc.controllers.mirror import with_measured_state
+from fpirhc.controllers.base import Controller, fed, like
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.mirror import measured_reads, with_measured_state
+from fpirhc.controllers.model_inputs import ACTED, NOW, KnownSignals
 from fpirhc.controllers.observed_state import Believing, check_believed
-from fpirhc.controllers.reference_states import with_reference
+from fpirhc.controllers.reference_states import given_signals, with_reference
+from fpirhc.errors import InvalidProblem
+from fpirhc.fields.kinds import described
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
-from fpirhc.symbolic.block import GAP, Block, Composite, bridged, straightened
+from fpirhc.symbolic.block import GAP, Block, Composite, Delay, bridged, compose, straightened
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.latest import Latest
@@ -218,3 +219,112 @@ def _ahead_block(plant: Plant, measured: Signal, *, lost: bool = False) -> Block
 
     waits = Block("steps_wait", Layout(), Layout(), wait, memory)
     return Block("steps_ahead", reads + Layout((GAP,)), writes, step, memory, waits=waits)
+
+
+def controller_reads(problem: Problem, controller: Controller) -> Layout:
+    """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
+    plant, response = problem.plant, controller.response(problem)
+    realised = response.signal if response else plant.response_signal("realised")
+    parameters = controller.plant_model(problem).plant.parameter
+    return Layout((time_signal(plant), *measured_signals(plant), realised, parameters, *given_signals(problem)))
+
+
+def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
+    """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command).
+
+    Args:
+        problem: that the controller is composed for.
+        controller: checked here against the problem.
+        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, its
+            time, and the signals of the last cycle, where a block needs them.
+    """
+    ready = checked(problem, controller)
+    blocks, delays = _blocks_of(problem, ready)
+    blocks = with_reference(problem, blocks)
+    reads = controller_reads(problem, ready)
+    if ahead:
+        reads = reads + Layout(measured_reads(problem.plant, blocks))
+    else:
+        blocks = with_measured_state(problem.plant, blocks)
+    return compose_informed(problem, ready, reads, blocks, delays, ahead=ahead)
+
+
+def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], list[Delay]]:
+    """The blocks of a controller and what they remember.
+
+    Raises:
+        InvalidProblem: it gives something else.
+    """
+    given: object = controller.blocks(problem)
+    pair = given if isinstance(given, tuple) and len(given) == 2 else None
+    kinds = (Block, Delay)
+    if pair is None or not all(
+        isinstance(part, list | tuple) and all(isinstance(one, kind) for one in part)
+        for part, kind in zip(pair, kinds, strict=True)
+    ):
+        raise InvalidProblem(
+            f"{type(controller).__name__}.blocks(problem) must return two lists (blocks, delays), got {described(given)}"
+        )
+    return list(pair[0]), list(pair[1])
+
+
+def compose_informed(
+    problem: Problem, ready: Controller, reads: Layout, blocks: list[Block], delays: list[Delay], *, ahead: bool = False
+) -> Composite:
+    """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
+
+    Args:
+        problem: that the controller is composed for.
+        ready: the controller, checked.
+        reads: what the step reads.
+        blocks: of the step.
+        delays: what the step remembers of its signals.
+        ahead: whether the time is the one at which the command will act.
+    """
+    model = ready.plant_model(problem)
+    known = KnownSignals(model.plant, model.signals, problem.period)
+    compares = any(ACTED in block.reads for block in blocks)
+    first = known.block(remembers=compares and not ahead)
+    if first is None:
+        return compose("controller", reads, blocks, delays, outputs=("command",))
+    needed = reads + Layout(known.reads if compares else ())
+    inner = compose("informed", needed, blocks, delays, outputs=("command",))
+    block = embedded("informed", inner, {"parameters": like(known.plant.parameter, NOW)})
+    return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
+
+
+def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
+    """Return a composed step as one block.
+
+    Args:
+        name: of the block.
+        composite: the step.
+        feeds: name of a signal that the step reads -> the signal that it is given instead.
+    """
+    reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
+        next_memory, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
+        remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
+        return {**composite.trace.split(trace), **remembered}
+
+    lossy = composite.bridged_if_any
+    return Block(
+        name,
+        Layout(reads),
+        composite.trace,
+        step,
+        composite.memory,
+        opaque=composite.opaque,
+        derived=composite.derived_if_any,
+        waits=None if composite.waits is None else fed_by(composite.waits, feeds),
+        bridged=None if lossy is None else lambda: embedded(name, lossy(), feeds),
+    )
+
+
+def fed_by(block: Block, feeds: Mapping[str, Signal]) -> Block:
+    """Return the block with other signals in place of those that `feeds` names."""
+    for name, source in feeds.items():
+        block = fed(block, name, source)
+    return block

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 import casadi as ca
 
-from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.fields.checked import Checked, former_members, unnamed_inner
+from fpirhc.fields.checked import Checked, former_members, replaced, unnamed_inner
 from fpirhc.fields.kinds import described, finite_number
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout

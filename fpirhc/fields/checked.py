@@ -148,6 +148,7 @@ def _read(annotation: object, owner: type) -> Expected:
 
 P = ParamSpec("P")
 R = TypeVar("R")
+Value = TypeVar("Value")
 
 
 def checked_call(function: Callable[P, R]) -> Callable[P, R]:
@@ -364,3 +365,11 @@ def _declared_in(package: ModuleType, part: str) -> list[str]:
 
 def _plain(name: str) -> str:
     return "".join(c for c in name.lower() if c.isalnum())
+
+
+def replaced(value: Value, field: str, content: object) -> Value | None:
+    """Return the same frozen value with another content of a field; None where it is no dataclass or has no such field."""
+    if not is_dataclass(value) or field not in [f.name for f in fields(value)]:
+        return None
+    changed: Value = replace(value, **{field: content})  # type: ignore[type-var]  # mypy does not narrow type variables
+    return changed

@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.controllers.gain_check import any_gain
 from fpirhc.deformation.base import Deformation, Iteration
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.simulation.run import Run

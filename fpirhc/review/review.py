@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from fpirhc.broken import attempted
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, resolved, with_lateness
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import resolved, with_lateness
 from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed

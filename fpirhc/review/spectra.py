@@ -13,7 +13,7 @@ import numpy as np
 
 from fpirhc.contraction.delayed import leaking_limit
 from fpirhc.contraction.spectrum import Spectrum, response_jacobian
-from fpirhc.controllers.gain_check import product_limit
+from fpirhc.controllers.check import product_limit
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each

@@ -19,8 +19,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import real_number
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, quantities, response_names
-from fpirhc.sensing.state_observer import StateObserver
+from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, quantities, response_names
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import ceil, stays
@@ -131,7 +130,7 @@ class Sensing(Checked):
             PositionDifference, SavitzkyGolay, StateVariableFilter.
         measured: names of the quantities that sensors show; None: all that the estimator needs.
         observer: how the states that no sensor shows are known: ModelStates, KalmanFilter, MovingHorizonStates. See
-            `fpirhc.sensing.state_observer`.
+            `fpirhc.sensing.base`.
     """
 
     sensors: Mapping[str, Sensor] = field(default_factory=dict)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.check import checked
 from fpirhc.controllers.gate import BRIDGED, INNER, Gate, across_gaps, gap_of
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.plausible import plausible_range, response_jumps

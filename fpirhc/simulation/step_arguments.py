@@ -29,10 +29,11 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
+from fpirhc.task.checks import check_values
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
-from fpirhc.task.reference import Steps
-from fpirhc.task.set_point import check_values, in_force, pairs
+from fpirhc.task.reference import Steps, pairs
+from fpirhc.task.set_point import in_force
 
 Setpoints = Mapping[
     str, Steps | Callable[[float], float]

@@ -12,7 +12,8 @@ import numpy as np
 
 from fpirhc.by_name import ByName
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, name_in_task
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import BRIDGED, HELD
 from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range

@@ -1,4 +1,4 @@
-"""Whether the parts of a problem fit together: the steps of maps, what the plant that moves must have, what a cost and limits read.
+"""Whether the parts of a problem fit together: steps of maps, what the plant that moves must have, cost, limits and set-points.
 
 A map has its own steps in place of an integrator, in the run and along a horizon. A response of a map is a difference of outputs,
 which no sensor shows, so it is taken from the outputs of the last cycles (`StepDifference`); that of an output of order 0 is the
@@ -7,7 +7,8 @@ output itself, and measured. What is believed, nobody measures; a reality need n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -28,6 +29,7 @@ from fpirhc.symbolic.live import nominal
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
+from fpirhc.task.reference import Steps, pairs
 
 
 def settled_maps(
@@ -171,3 +173,40 @@ def _view_of_symbols(plant: Plant) -> View:
         Named(elements, ca.SX.sym("y", len(elements)), what),
         outside_of(plant, p),
     )
+
+
+def check_steps(plant: Plant, limits: Limits, set_points: Mapping[str, Steps]) -> None:
+    """Raise if some set-points are no steps, or can never be reached.
+
+    Raises:
+        InvalidValue: see `pairs` and `check_values`.
+    """
+    known = {name: steps for name, steps in set_points.items() if name in plant.chains}
+    check_values(plant, limits, {name: [v for _, v in pairs(name, steps)] for name, steps in known.items()})
+
+
+def check_values(plant: Plant, limits: Limits, values: Mapping[str, Sequence[float]]) -> None:
+    """Raise if a set-point is not finite, or can never be reached.
+
+    Raises:
+        InvalidValue: all such set-points together, each with the range that it leaves.
+    """
+    mistakes = []
+    for name, numbers in values.items():
+        for value in dict.fromkeys(numbers):
+            if not math.isfinite(value):
+                mistakes.append(f"'{name}' is {value}, expected a finite number")
+                continue
+            for what, (low, high) in _ranges(plant, limits, name).items():
+                if not low <= value <= high:
+                    mistakes.append(f"'{name}' is {value:g}, outside its {what} of {low:g} to {high:g}")
+    if mistakes:
+        raise InvalidValue(f"set-points: {'; '.join(mistakes)}")
+
+
+def _ranges(plant: Plant, limits: Limits, name: str) -> dict[str, tuple[float, float]]:
+    """What a set-point of the coordinate must not leave: its physical range, and a limit that has no price."""
+    ranges = {"physical range": plant.ranges[name]} if name in plant.ranges else {}
+    if name in limits.states and name not in {*limits.soft, *limits.prices}:
+        ranges["limits"] = limits.states[name]
+    return ranges

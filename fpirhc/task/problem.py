@@ -27,7 +27,7 @@ from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.live import nominal
-from fpirhc.task.checks import check_maps, check_stage, needed_measurements, needed_names, settled_maps
+from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
 from fpirhc.task.exogenous import Exogenous, check_signals, not_held, real_values, rows_of, signals_of
@@ -35,7 +35,6 @@ from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
-from fpirhc.task.set_point import check_steps
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _TRIED = 8  # states near the start, at which an input may have an effect that it lacks there

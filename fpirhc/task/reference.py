@@ -5,15 +5,18 @@ Theory: docs/theory-plants.md.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.maps import differentiated, time_derivatives
 from fpirhc.plant.motion import followed, followed_units
@@ -203,3 +206,27 @@ def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:
         elif motion[c].numel() != 1:
             mistakes.add(f"{what} '{c}' must be one scalar, got shape {motion[c].shape}")
     mistakes.raise_if_any()
+
+
+def pairs(name: str, steps: Steps) -> list[tuple[float, float]]:
+    """Return the steps of one coordinate as pairs (time, set-point).
+
+    Raises:
+        InvalidValue: no number and no pairs of numbers; times that do not begin at 0 and increase.
+    """
+    entries = [(0.0, steps)] if not isinstance(steps, Sequence | np.ndarray) else list(steps)
+    text = f"set-points of '{name}'"
+    if not entries or any(not isinstance(e, Sequence | np.ndarray) or len(e) != 2 for e in entries):
+        raise InvalidValue(f"{text}: expected a number, or pairs (time, set-point), got {steps!r}")
+    numbers: list[tuple[float, float]] = []
+    for entry in entries:
+        time, value = map(real_number, entry)
+        if time is None or value is None or not (math.isfinite(time) and math.isfinite(value)):
+            raise InvalidValue(
+                f"{text}: expected finite numbers, got {described(entry if len(entries) > 1 else steps)}"
+            )
+        numbers.append((time, value))
+    times = [time for time, _ in numbers]
+    if times[0] != 0 or any(later <= time for time, later in pairwise(times)):
+        raise InvalidValue(f"{text}: the times must begin at 0 and increase, got {times}")
+    return numbers

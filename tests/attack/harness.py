@@ -9,7 +9,8 @@ import numpy as np
 
 import fpirhc as fp
 from attack.faults import FIRST, Cycle, Fault
-from fpirhc.controllers.contract import Controller, checked
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.path import true_response

@@ -24,7 +24,7 @@ from raw_errors import raw_error
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.check import checked
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidField
 from fpirhc.fields.checked import Checked, expects_whole_number

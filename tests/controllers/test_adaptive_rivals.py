@@ -12,7 +12,7 @@ import pytest
 from plants import chain, pendulum
 
 import fpirhc as fp
-from fpirhc.controllers.base import compose_controller
+from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Evidence
 from fpirhc.plant.regressor import Combination, Regressor

@@ -17,22 +17,18 @@ from fpirhc.controllers.base import (
     Controller,
     clip,
     commanding_blocks,
-    compose_controller,
-    controller_reads,
     deform_block,
-    embedded,
     fed,
     invert_block,
     reference_block,
     with_held_deformation,
 )
+from fpirhc.controllers.check import check_form, checked
 from fpirhc.controllers.contract import (
     FORMER,
     Planner,
     PlantModel,
     Response,
-    check_form,
-    checked,
     resolved,
     tracking_law,
     with_lateness,
@@ -41,6 +37,7 @@ from fpirhc.controllers.contract import (
 )
 from fpirhc.controllers.mirror import MEASURED
 from fpirhc.controllers.reference_states import command_demand, plan_demand, reference_demand
+from fpirhc.controllers.sensing_chain import compose_controller, controller_reads, embedded
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import InvalidField, InvalidValue, NotContractive, NotSupported
 from fpirhc.status import Status

@@ -417,7 +417,7 @@ GENERIC_FILES: tuple[str, ...] = (
     "controllers/base.py",
     "controllers/contract.py",
     "controllers/demands.py",
-    "controllers/gain_check.py",
+    "controllers/check.py",
 )
 GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/base.py", "tracking/base.py")
 # Values that generic code builds for itself; it asks nobody whether he is one.

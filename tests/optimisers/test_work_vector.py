@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.controllers.base import compose_controller
+from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.symbolic import driver
 from fpirhc.symbolic.driver import compiled_plans, with_less_work
 from fpirhc.symbolic.native import find_compiler, generate

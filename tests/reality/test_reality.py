@@ -12,7 +12,7 @@ from plants import linear, pendulum
 from scipy.linalg import expm
 
 import fpirhc as fp
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.check import checked
 from fpirhc.describe import describe
 from fpirhc.errors import InvalidProblem, NotContractive, NotSupported
 from fpirhc.sensing.base import response_names

@@ -12,8 +12,8 @@ import pytest
 import fpirhc.conformance.observer as laws
 from fpirhc.conformance import check_observer
 from fpirhc.members import examples
+from fpirhc.sensing.base import Correct, Model, Predict
 from fpirhc.sensing.observers.model_states import ModelStates
-from fpirhc.sensing.state_observer import Correct, Model, Predict
 
 BELIEFS = examples("observers")
 

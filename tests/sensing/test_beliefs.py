@@ -18,8 +18,8 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed_state import free_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
+from fpirhc.sensing.base import StateObserver
 from fpirhc.sensing.observability import unobservable
-from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
 

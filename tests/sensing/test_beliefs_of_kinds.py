@@ -13,7 +13,7 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.conformance.live import check_live
 from fpirhc.errors import NotSupported
-from fpirhc.sensing.state_observer import StateObserver
+from fpirhc.sensing.base import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=0.2))

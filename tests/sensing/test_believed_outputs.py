@@ -20,7 +20,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed_state import free_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
-from fpirhc.sensing.state_observer import StateObserver
+from fpirhc.sensing.base import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
 from fpirhc.studies.comparison.timing import measure_cycle

@@ -16,8 +16,7 @@ from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller
 from fpirhc.learning.estimators.base import Uncertain
 from fpirhc.members import examples
-from fpirhc.sensing.base import DerivativeEstimator
-from fpirhc.sensing.state_observer import StateObserver
+from fpirhc.sensing.base import DerivativeEstimator, StateObserver
 from fpirhc.simulation.clock import missed_cycles
 from fpirhc.status import Status
 from fpirhc.symbolic.block import LONG, Block, bridged, shares

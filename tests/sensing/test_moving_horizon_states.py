@@ -19,7 +19,7 @@ from plants import linear, pendulum
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
-from fpirhc.sensing.state_observer import StateObserver
+from fpirhc.sensing.base import StateObserver
 from fpirhc.simulation.sample import raw_measurements
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=4.0))

@@ -13,7 +13,8 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.contract import Controller, checked
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.plausible import JUMPS, response_jumps
 from fpirhc.simulation.path import true_response
 from fpirhc.simulation.sample import raw_measurements

@@ -10,7 +10,7 @@ import pytest
 from plants import chain
 
 import fpirhc as fp
-from fpirhc.controllers.base import compose_controller
+from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.errors import InvalidValue
 
 

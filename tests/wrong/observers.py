@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.sensing.base import values_of
+from fpirhc.sensing.base import StateObserver, values_of
 from fpirhc.sensing.observability import unobservable
-from fpirhc.sensing.state_observer import StateObserver
 from fpirhc.symbolic.layout import Layout, Signal
 
 

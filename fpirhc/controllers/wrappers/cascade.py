@@ -14,8 +14,9 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, compose_controller, embedded, like, reference_block
+from fpirhc.controllers.base import Controller, like, reference_block
 from fpirhc.controllers.contract import Deforms, without_deformation
+from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import Deformation, Demand, automatic
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.fields.checked import Checked

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, command_before, compose_controller, embedded, like
+from fpirhc.controllers.base import Controller, command_before, like
 from fpirhc.controllers.contract import ControllerWrapper, Planner, with_setting
 from fpirhc.controllers.response_pairs import ResponsePairs
+from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman

@@ -14,10 +14,11 @@ from typing import cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, compose_controller, embedded, like
+from fpirhc.controllers.base import Controller, like
 from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.reference_states import own_signals
+from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import with_inner
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked

@@ -13,9 +13,7 @@ import numpy as np
 
 from fpirhc.fields.kinds import Deviation
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import values_of
-from fpirhc.sensing.observability import unobservable
-from fpirhc.sensing.state_observer import (
+from fpirhc.sensing.base import (
     Correct,
     Evidence,
     Model,
@@ -26,7 +24,9 @@ from fpirhc.sensing.state_observer import (
     first_covariance,
     name_mistakes,
     require_named,
+    values_of,
 )
+from fpirhc.sensing.observability import unobservable
 from fpirhc.symbolic.functions import overlaid
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.state_observer import Correct, Evidence, Model, Predict, Remembered, StateObserver
+from fpirhc.sensing.base import Correct, Evidence, Model, Predict, Remembered, StateObserver
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 

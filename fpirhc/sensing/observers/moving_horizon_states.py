@@ -19,9 +19,7 @@ from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import values_of
-from fpirhc.sensing.observability import unobservable
-from fpirhc.sensing.state_observer import (
+from fpirhc.sensing.base import (
     Correct,
     Evidence,
     Model,
@@ -32,7 +30,9 @@ from fpirhc.sensing.state_observer import (
     first_covariance,
     name_mistakes,
     require_named,
+    values_of,
 )
+from fpirhc.sensing.observability import unobservable
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _STAYS = 0.1  # share of its distance from a bound that a step leaves at least

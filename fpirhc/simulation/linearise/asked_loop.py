@@ -16,8 +16,8 @@ from functools import cached_property
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.gain_check import any_gain
 from fpirhc.errors import NotSupported
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 from fpirhc.simulation.linearise.linear_map import GAIN

@@ -12,7 +12,8 @@ from typing import cast
 from fpirhc.broken import attempted
 from fpirhc.contraction.gains import assess_gain
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, resolved, without_deformation
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.deformation.base import automatic, innermost
 from fpirhc.describe import describe, identity
 from fpirhc.errors import FpirhcError, Mistakes, NotContractive, NotSupported

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked
+from fpirhc.controllers.check import checked
 from fpirhc.controllers.reference_states import own_signals
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.consistent_state import consistent_state

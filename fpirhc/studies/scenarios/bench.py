@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.controllers.contract import Controller, checked
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import Controller
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import Checked

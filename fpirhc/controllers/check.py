@@ -1,9 +1,7 @@
-"""Refuses, before a run, a deformation that cannot converge.
+"""Checks a controller against its problem before a run, and refuses a deformation that cannot converge.
 
-Where the eigenvalues of the response Jacobian at the start have real parts of both signs, no gain converges. Where they have one
-sign, gains of the other sign enlarge every error. Where the response is estimated or the error is filtered, the delay lowers the
-largest gain that converges. A gain beyond the limit, of the plant alone or behind these, is refused; `BeyondLimit`
-asks for it.
+Where eigenvalues of the response Jacobian at the start have real parts of both signs, no gain converges. Where they have one sign,
+gains of the other sign enlarge every error, and a delay of the response lowers the largest one that converges; see `BeyondLimit`.
 """
 
 from __future__ import annotations
@@ -21,9 +19,15 @@ from fpirhc.contraction.delayed import delayed_limit, leaking_limit
 from fpirhc.contraction.gains import assess_gain, linear_limit
 from fpirhc.contraction.measured import sampled_jacobians
 from fpirhc.contraction.spectrum import Spectrum, spectrum_over_run
+from fpirhc.controllers.contract import Controller, resolved
+from fpirhc.controllers.model_inputs import NONE
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import InvalidValue, NotContractive
+from fpirhc.deformation.model_referenced import form_inside
+from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.queue import every
 from fpirhc.task.problem import Problem
 
 _SOUGHT = 20.0  # effective gain times eigenvalue up to which limits are sought
@@ -215,3 +219,120 @@ def _spectrum(plant: Plant, start: tuple[float, ...], before: tuple[float, ...])
         return spectrum_over_run(plant, state, response.full().T)
     except InvalidValue:
         return None
+
+
+_CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same controllers again and again
+
+
+def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
+    """Return the resolved controller, checked against the problem.
+
+    A controller with live numbers is checked with the numbers of the build, and returned as it is.
+
+    Args:
+        problem: the problem.
+        controller: the controller.
+        numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.
+
+    Raises:
+        FpirhcError: the controller's own check fails.
+        NotContractive: the gain of the deformation has the wrong sign, or is too large behind estimator and filter.
+        NotSupported: a form of the deformation that cannot be used here; a
+            response of the controller's own behind sensors or dead time.
+    """
+    task, build = nominal(problem), nominal(controller)
+    ready = _CHECKED.of((task, build), (numbers_only,), lambda: _checked(task, build, numbers_only))
+    return ready if build is controller else controller
+
+
+def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
+    check_outputs(problem, controller)
+    ready = resolved(problem, controller)
+    if numbers_only and ready.inner is None and ready.planner is not None:
+        ready.planner.check_weights(problem)
+    else:
+        ready.check(problem)
+    check_form(problem, ready)
+    if ready.deforms == "target":
+        return ready  # its own check judges a gain that acts on targets
+    if ready.response(problem) is None:
+        check_gain_sign(problem, ready.deformation)
+        check_gain_size(problem, ready.deformation)
+        return ready
+    late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
+    if late or problem.reality or not problem.sensing.ideal:
+        what = "dead time" if late else "the reality" if problem.reality else "sensing"
+        raise NotSupported(
+            f"{type(ready).__name__} reads responses of its own, without delay and noise; leave {what} out of the problem"
+        )
+    return ready
+
+
+def check_outputs(problem: Problem, controller: Controller) -> None:
+    """Raise if the problem's plant has outputs that the deformation does not cover, or of order 0 behind an estimator.
+
+    Raises:
+        NotSupported: with the reason.
+    """
+    _refuse(_of_outputs(problem, controller))
+
+
+def check_form(problem: Problem, controller: Controller) -> None:
+    """Raise if the controller's deformation has a form that cannot be used.
+
+    Raises:
+        NotSupported: the number of dead times or lags differs from the plant's number of channels; a wrapper changes what a
+            model-referenced form inside it compares.
+    """
+    _refuse(_of_form(problem, nominal(controller.deformation)))
+
+
+def _refuse(reasons: Iterator[str]) -> None:
+    for reason in reasons:
+        raise NotSupported(reason)
+
+
+def _of_outputs(problem: Problem, controller: Controller) -> Iterator[str]:
+    """Reasons against outputs; those of order 0 have a response that is measured."""
+    plant, mirror = problem.plant, nominal(controller.deformation).mirror
+    instant = [name for name, order in plant.response_orders.items() if not order]
+    if instant and not problem.sensing.estimator.measures_all:
+        yield (
+            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
+            "need none; leave the estimator out: Sensing(sensors=...)"
+        )
+    late = 0.0 if mirror is None else mirror.measurement
+    if plant.outputs and (late % 1 > NONE or (plant.step and late)):
+        yield (
+            f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
+            f"({', '.join(plant.chains)}): its twin moves from the state that is given with the samples, and these are late by "
+            f"{late:g} cycles; believe in whole cycles, and for a map in none"
+        )
+
+
+def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
+    """Reasons against the form, the first one first."""
+    plant, channels, mirror = problem.plant, deformation.iteration.channels, deformation.mirror
+    if channels not in (None, len(plant.controlled_names)):
+        yield (
+            f"{type(deformation).__name__}: {channels} dead times are given, but the plant has {len(plant.controlled_names)} "
+            f"controlled coordinates ({', '.join(plant.controlled_names)}); give one for each, or one number for all"
+        )
+    if (outer := form_inside(deformation)) is not None:
+        name = type(outer).__name__
+        yield (
+            f"{name} around a model-referenced form changes what the form compares, the model's response with the measured one; "
+            f"put it inside: ModelReferenced({name}(map, ...))"
+        )
+    if mirror is None:
+        return
+    for setting, values in (("cycles", every(mirror.cycles)), ("lag", every(mirror.lag))):
+        if len(values) not in (1, len(plant.inputs)):
+            own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"
+            yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
+    parts = any(c % 1 for c in (*every(mirror.cycles), mirror.measurement))
+    if plant.step is not None and (any(every(mirror.lag)) or parts):
+        yield (
+            f"{type(deformation).__name__}: a map has no lag, and no dead time of parts of a cycle; write an actuator as a state "
+            "of the map, and dead times in whole cycles"
+        )
