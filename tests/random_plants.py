@@ -11,7 +11,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.contraction.spectrum import response_jacobian
-from fpirhc.controllers import contract
+from fpirhc.controllers import check
 
 PERIOD = 5e-3  # s
 DURATION = 8.0  # s; the reference rests from about 2.5 s on
@@ -145,8 +145,8 @@ def _deformation(random: np.random.Generator, largest: float, cycles: float):
 def dies_out(case: Case) -> bool:
     """Whether the simulated response error dies out; a gain of the wrong sign, refused otherwise, is run too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contract, "check_gain_sign", lambda *_: None)
-        patch.setattr(contract, "check_gain_size", lambda *_: None)
+        patch.setattr(check, "check_gain_sign", lambda *_: None)
+        patch.setattr(check, "check_gain_size", lambda *_: None)
         run = fp.simulate(case.problem, case.controller, seed=0, compiled=False)
     if run.stop is not None:
         return False

@@ -15,7 +15,7 @@ from reviewed import PERIOD, about, answer, answers, mass, torque
 
 import fpirhc as fp
 from fpirhc.cli.main import main
-from fpirhc.controllers import contract
+from fpirhc.controllers import check
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.grid import review_grid
@@ -32,7 +32,7 @@ def predicted(seeds: range) -> tuple[int, int, int]:
     for seed in seeds:
         case = random_case(seed)
         with pytest.MonkeyPatch.context() as patch:  # a gain beyond its limit, refused otherwise, has a verdict too
-            patch.setattr(contract, "check_gain_size", lambda *_: None)
+            patch.setattr(check, "check_gain_size", lambda *_: None)
             verdict = predict(case.problem, case.controller).verdict
         if verdict == "unknown":
             counts["unknown"] += 1
@@ -87,16 +87,16 @@ def _is_worse(run: fp.Run, bare: fp.Run) -> bool:
 
 def test_null_answers_on_random_closed_loops(monkeypatch):
     """A yes of the null test is never wrong; gains of the wrong sign, refused otherwise, are asked and run too."""
-    monkeypatch.setattr(contract, "check_gain_sign", lambda *_: None)
-    monkeypatch.setattr(contract, "check_gain_size", lambda *_: None)
+    monkeypatch.setattr(check, "check_gain_sign", lambda *_: None)
+    monkeypatch.setattr(check, "check_gain_size", lambda *_: None)
     assert wrong_null_answers(range(3)) == []
 
 
 @pytest.mark.slow
 def test_null_answers_on_three_hundred_closed_loops(monkeypatch):
     """The same on all."""
-    monkeypatch.setattr(contract, "check_gain_sign", lambda *_: None)
-    monkeypatch.setattr(contract, "check_gain_size", lambda *_: None)
+    monkeypatch.setattr(check, "check_gain_sign", lambda *_: None)
+    monkeypatch.setattr(check, "check_gain_size", lambda *_: None)
     assert wrong_null_answers(range(300)) == []
 
 

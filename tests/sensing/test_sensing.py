@@ -13,7 +13,7 @@ from plants import chain, linear
 
 import fpirhc as fp
 from fpirhc.contraction.delayed import delayed_limit
-from fpirhc.controllers import contract
+from fpirhc.controllers import check
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive
 from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.layout import Signal
@@ -298,7 +298,7 @@ def test_filtered_error(pole, share):
 @pytest.mark.parametrize("paired", [False, True])
 def test_limit_is_that_of_the_loop(estimator, paired, monkeypatch):
     """3 % below the computed limit no mode of the real closed loop grows, 3 % above one does."""
-    monkeypatch.setattr(contract, "check_gain_size", lambda *_: None)
+    monkeypatch.setattr(check, "check_gain_size", lambda *_: None)
     problem = resting(linear(1.0, 0.8), period=1e-3, duration=1e-2, sensing=fp.Sensing(estimator=estimator))
     cycles = problem.response_delay if paired else 0.0
     weights = estimator.weights(2, problem.period)
