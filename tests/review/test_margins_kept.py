@@ -82,7 +82,9 @@ def test_a_smaller_command_is_tried_no_farther_than_a_larger_one_and_the_margin_
         up, (down, _) = _first(partial(scaled, poles, 1), _DECADES), searched(poles, np.inf)
         shorter, farthest = searched(poles, up)
         assert min(up, down) == min(up, shorter)
-        assert margins(one, 0)[0] == pytest.approx(np.exp(min(up, down)), rel=1e-15)  # two libraries' exp differ by a bit
+        assert margins(one, 0)[0] == pytest.approx(
+            np.exp(min(up, down)), rel=1e-15
+        )  # two libraries' exp differ by a bit
         assert farthest <= min(up, _DECADES) + _DECADES / _STEPS
         ways.add(up < down)
     assert ways == {True, False}
