@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from typing import Any, TypeVar
@@ -75,9 +76,16 @@ def _is_setting(one: Field[Any], content: object) -> bool:
 
 
 def as_written(value: Any) -> str:
-    """Return a dataclass as a user would write it: 'Class(field=...)' with those fields that differ from their defaults."""
+    """Return a dataclass as a user would write it: 'Class(field=...)' with those fields that differ from their defaults.
+
+    Numbers that were computed have six digits.
+    """
     told = [(f.name, getattr(value, f.name)) for f in fields(value) if f.init and _differs(f, getattr(value, f.name))]
-    return f"{type(value).__name__}({', '.join(f'{name}={content!r}' for name, content in told)})"
+    text = f"{type(value).__name__}({', '.join(f'{name}={content!r}' for name, content in told)})"
+    return _COMPUTED.sub(lambda number: f"{float(number[0]):.6g}", text)
+
+
+_COMPUTED = re.compile(r"\d+\.\d{7,}(e[+-]?\d+)?")  # more digits than a user writes
 
 
 def _differs(one: Field[Any], content: object) -> bool:

@@ -20,6 +20,7 @@ from fpirhc.plant.motion import followed_units
 from fpirhc.review.grid import each
 from fpirhc.review.prediction import NominalRun, exactly, nominal_of, nominal_run
 from fpirhc.simulation.error_pair import ErrorPair
+from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.model_as_plant import shortened, with_believed_way
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.trials import Trials, loop_of
@@ -109,12 +110,13 @@ def null_runs(problem: Problem, controller: Controller, runs: NominalRuns | None
     model = null_problem(problem, controller)
     believes_more = model.reality is not None or model.dead_time is not problem.dead_time
     bare = without_deformation(resolved(model, controller))
-    run = _run(problem, model, bare) if believes_more or runs is None else runs.bare(controller)
-    without, ranges = _errors_along(model, run["plant_state"]), _ranges(model, run["plant_state"])
+    plain = _run(problem, model, bare) if believes_more or runs is None else runs.bare(controller)
+    without, ranges = _errors_along(model, plain["plant_state"]), _ranges(model, plain["plant_state"])
     run = _run(problem, model, controller)
     lost = dict.fromkeys(without, float("inf"))
     adapted = lost if run.stop is not None else _errors_along(model, run["plant_state"])
-    return ErrorPair(without, adapted, ranges, followed_units(model.plant))
+    stuck = min(at_limit(model, plain), at_limit(model, run))
+    return ErrorPair(without, adapted, ranges, followed_units(model.plant), stuck)
 
 
 def _run(problem: Problem, model: Problem, controller: Controller) -> Run:

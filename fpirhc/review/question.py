@@ -35,6 +35,9 @@ GROUP = "fpirhc.questions"  # of entry points
 Kind = TypeVar("Kind", "ProblemQuestion", "ControllerQuestion")
 
 
+SEE_CONVERGENCE = "See the convergence of the deformation."
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """What is known when a question about a controller is asked; what takes time is computed once, when it is first read.
@@ -77,6 +80,11 @@ class Case:
     def loops(self) -> Loops:
         """Its linear loops along the reference."""
         return loops_along(self.grid, self.controller)
+
+    @property
+    def diverges(self) -> bool:
+        """Whether no linear loop along the reference converges with the deformation as it is, for as long as nothing is learned."""
+        return bool(self.loops.loops) and float(self.loops.radii.min()) >= 1 and not self.loops.learns
 
     @cached_property
     def by_gain(self) -> LoopsByGain | None:

@@ -123,6 +123,29 @@ def limit_of_loop(deformation: Deformation, loops: LoopsByGain) -> tuple[float, 
     return (sign * limit, sets) if limit <= FAR * size else (math.inf, "")
 
 
+def least_gain(loops: LoopsByGain, limit: float) -> float | None:
+    """Return the smallest effective gain with which the loop converges along the reference, where that of the map is too small.
+
+    None where the loop converges with the map's gain, or with none between it and the limit.
+
+    Args:
+        loops: of the map.
+        limit: effective gain up to which one is sought.
+    """
+    own, along = loops.gains[1], loops.along(_ALONG)
+    if loops.all_stable(own, along) or not abs(own) < abs(limit):
+        return None
+    gains = math.copysign(1.0, own) * np.geomspace(abs(own), abs(limit), _STEPS)
+    first = next((k for k, gain in enumerate(gains) if loops.all_stable(float(gain), along)), None)
+    if first is None:
+        return None
+    low, high = float(gains[first - 1]), float(gains[first])
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if loops.all_stable(middle, along) else (middle, high)
+    return high
+
+
 def _limits_of_loop(deformation: Deformation, loops: LoopsByGain, most: float, sign: float) -> Mapping[str, float]:
     limits = {}
     secant = secant_limit(loops)

@@ -18,6 +18,7 @@ from fpirhc.task.problem import Problem
 
 WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
 _ROUNDING = 1e-9  # share of the coordinate's range
+MOSTLY = 0.5  # share of the cycles at a limit, from which a run shows nothing
 SLIGHT, CLEAR = 1e-3, 1e-2  # added error as a share of the coordinate's range
 
 
@@ -30,12 +31,14 @@ class ErrorPair:
         adapted: the same with the deformation; infinite where the run ended early.
         ranges: range of the reference, or the largest error without adaptation where that is larger, by coordinate.
         units: of the coordinates.
+        at_limit: share of the cycles in which a command stands at a limit, of the run where it is smaller.
     """
 
     without: Mapping[str, float]
     adapted: Mapping[str, float]
     ranges: Mapping[str, float]
     units: Mapping[str, str]
+    at_limit: float = 0.0
 
     def unit(self, name: str) -> str:
         """The unit of a coordinate as it stands behind a number."""
@@ -72,6 +75,14 @@ class ErrorPair:
         before, after = self.without[self.worst], self.adapted[self.worst]
         rest = f"{after:.3g}{unit} with it" if math.isfinite(after) else "a run that ends early with it"
         return f"the rms error of {self.worst} is {before:.3g}{unit} without adaptation, {rest}"
+
+    @property
+    def stuck(self) -> str:
+        """Why the pair shows nothing: commands stand at a limit in both runs; empty where it shows something."""
+        if self.at_limit < MOSTLY:
+            return ""
+        share = f"{100 * self.at_limit:.3g} %"
+        return f"not informative: the command stands at a limit in {share} of the cycles, where no adaptation can act"
 
     @property
     def passes(self) -> bool:

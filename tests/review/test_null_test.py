@@ -135,3 +135,15 @@ def test_targets_that_cure_more_than_they_spoil_do_no_harm():
     assert found.verdict == Verdict.UNKNOWN
     assert found.evidence.endswith("+4.1 % of its range, less than what the wrong model costs without it")
     assert found.change == "Change the gain, or leave the deformation out."
+
+
+def test_a_null_test_of_commands_at_a_limit_shows_nothing():
+    """Speed limits that always stand at the largest leave the same error with any adaptation: no yes for that."""
+    task = fp.load_problem("problems/gallery/freeway.py")
+    one = answer(task.problem, task.controllers["static map+FPI"], "right model alone")
+    assert one.verdict == "unknown"
+    assert one.evidence == (
+        "run on its own model, rms error of emission 278 kg/h without adaptation and with it; not informative: the command "
+        "stands at a limit in 100 % of the cycles, where no adaptation can act"
+    )
+    assert one.change == "Run it where the commands are free."

@@ -160,10 +160,7 @@ def test_the_fault_of_an_outer_loop_is_not_the_gains(grid, ideal, change):
 
 @pytest.mark.parametrize(
     ("deformation", "change"),
-    [
-        (fp.Affine(-0.5), "Pair the deformation through the dead time, and see the question about the gain."),
-        (fp.Paired(fp.Affine(-0.5), cycles=3), OWN),
-    ],
+    [(fp.Affine(-0.5), "Pair the deformation through the dead time."), (fp.Paired(fp.Affine(-0.5), cycles=3), OWN)],
 )
 def test_only_the_plain_form_behind_a_dead_time_is_told_to_pair(deformation, change):
     """One that is paired has other cures: a leak, the model-referenced form, another gain."""

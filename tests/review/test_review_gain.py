@@ -51,6 +51,31 @@ def test_smallest_gain_of_a_plan_is_where_its_loop_is_stable():
         assert (predict(DAILY.problem, one).numbers["radius"] < 1) == stable
 
 
+def test_a_gain_inside_its_limits_with_which_the_loop_diverges_is_too_small():
+    """No, with the smallest gain that does: with a fifth less the error is twenty times as large as with a fifth more."""
+    own = answer(DAILY.problem, DAILY.controllers[PLANNED], "gain admissible")
+    least = own.numbers["least"]
+    assert own.verdict == "no"
+    assert least == pytest.approx(-0.731, rel=0.01)
+    assert own.evidence.endswith(f"; it is too small, the loop converges from {least:.3g} on")
+    assert own.change == f"Use gain beyond {least:.3g}, or another form."
+    errors = []
+    for gain in (0.8 * least, 1.2 * least):
+        one = fp.Sigmoid(gain=gain, shift=0.3, scale=1.0)
+        run = fp.simulate(DAILY.problem, DAILY.controllers[PLANNED].with_deformation(one), seed=0, compiled=False)
+        errors.append(fp.measure(DAILY.problem, run).rms_error["size"])
+    assert errors[0] > 20 * errors[1]
+
+
+def test_a_loop_that_diverges_with_every_gain_says_where_to_look():
+    """A dead time that nobody told: neither the gain in use nor half of its limit converges."""
+    motor = fp.load_problem("problems/noisy_motor.py")
+    own = answer(motor.problem, motor.controllers["RHC+FPI, delay not told"], "gain admissible")
+    assert own.verdict == "no"
+    assert own.evidence.endswith("the loop does not converge; with -0.25 it does not converge either")
+    assert own.change == "See the convergence of the deformation."
+
+
 @pytest.mark.parametrize(("share", "verdict"), [(0.95, "yes"), (0.99, "unknown")])
 def test_a_secant_below_the_bound_of_the_map_may_be_beyond_that_of_the_loop(share, verdict):
     """The tracking law adds 3/2 rate x period, 3 %: at 0.99 of 2 / lambda the loop has a two-cycle, which a run ends in."""

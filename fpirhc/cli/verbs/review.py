@@ -81,7 +81,7 @@ def _show_answers(answers: Iterable[Answer]) -> None:
     from fpirhc.report.terminal import say
 
     for one in answers:
-        say(f"  {one.verdict:7s} ", _COLOURS[one.verdict], one.question)
+        say(f"  {one.verdict:7s} ", _COLOURS[one.verdict], one.question, wrap=False)
         say(f"          {one.evidence}", wrap=False)
         if one.change:
             say(f"          -> {one.change}", wrap=False)

@@ -117,7 +117,7 @@ def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
         return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
     iteration = controller.deformation.iteration
     if is_late(grid.problem) and iteration.slows_desired and iteration.pairing is None:
-        return "Pair the deformation through the dead time, and see the question about the gain."
+        return "Pair the deformation through the dead time."
     return "See the questions about the gain, the form and the tracking law."
 
 

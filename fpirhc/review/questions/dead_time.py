@@ -14,7 +14,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.late import is_late, scaled
 from fpirhc.review.nominal_runs import CYCLES
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
 from fpirhc.review.questions.margins import margins
 from fpirhc.simulation.error_pair import ErrorPair, errors_of
 from fpirhc.simulation.model_as_plant import shortened
@@ -156,6 +156,7 @@ def pays_when_late(case: Case) -> Answer | None:
         return Answer(PAYS_LATE, Verdict.YES, text, "", numbers)
     harmful = any(one.fails for one in errors.values()) and not case.controller.learns
     change = "Lower the gain or the rate of the loop, or measure the dead time better than to a tenth."
+    change = SEE_CONVERGENCE if case.diverges else change
     return Answer(PAYS_LATE, Verdict.NO if harmful else Verdict.UNKNOWN, text, change, numbers)
 
 

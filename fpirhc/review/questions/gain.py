@@ -11,13 +11,23 @@ from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation, innermost
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
 from fpirhc.review.questions.right_model import RIGHT_MODEL
 from fpirhc.review.questions.speed import gain_times
-from fpirhc.review.recommended_gain import FAR, MARGIN, OUTSIDE, Recommended, gain_advice, limit_of_loop, secant_limit
+from fpirhc.review.recommended_gain import (
+    FAR,
+    MARGIN,
+    OUTSIDE,
+    Recommended,
+    gain_advice,
+    least_gain,
+    limit_of_loop,
+    secant_limit,
+)
 from fpirhc.review.spectra import largest_product
 
 GAIN = "Is the map's gain admissible?"
+NO_GAIN = "Use another form, or leave the deformation out."
 
 
 def gain_admissible(
@@ -43,9 +53,7 @@ def gain_admissible(
     numbers = {"gain": value, "recommended": advice.value, "factor": near.predicted}
     numbers |= {"limit": advice.limit, "linear_limit": linear}
     text = f"{name} = {value:.4g}; {advice.text}"
-    change = (
-        f"Use {name} = {advice.value:.3g}." if not advice.why_not else "Use another form, or leave the deformation out."
-    )
+    change = f"Use {name} = {advice.value:.3g}." if not advice.why_not else NO_GAIN
     if not _within(near, near.linear_limit, share):
         return Answer(GAIN, Verdict.NO, text, change, numbers)
     inside = 0 < value / advice.limit < 1 and _within(wide, wide.sector_limit, share)
@@ -171,10 +179,32 @@ def _gain(case: Case) -> Answer | None:
     deformation = case.controller.deformation
     limit = largest_product(case.problem, deformation, own.eigenvalues)
     advice = gain_advice(case, boxed, case.answer(RIGHT_MODEL))
-    answer = gain_admissible(deformation, own, boxed, limit, advice)
+    answer = _converging(case, gain_admissible(deformation, own, boxed, limit, advice), advice)
     if answer.verdict == Verdict.UNKNOWN and advice.why_not == OUTSIDE:
         return replace(answer, change="fpirhc probe measures them and recommends a gain.")
     return answer
+
+
+def _converging(case: Case, answer: Answer, advice: Recommended) -> Answer:
+    """The answer, or no where the loop diverges with the gain all along the reference: too large, too small, or with any gain."""
+    loops = case.by_gain
+    if answer.verdict == Verdict.NO or loops is None or not case.diverges:
+        return answer
+    numbers = dict(answer.numbers)
+    value = numbers["gain"]
+    if abs(value) >= abs(advice.limit):
+        return replace(answer, verdict=Verdict.NO)
+    own = value / loops.gains[1]
+    least = least_gain(loops, advice.limit / own) if math.isfinite(advice.limit) else None
+    if least is None:
+        text = f"{answer.evidence}; with {value:.4g} it does not converge either"
+        return replace(answer, verdict=Verdict.NO, evidence=text, change=SEE_CONVERGENCE)
+    numbers["least"] = least * own
+    text = f"{answer.evidence}; it is too small, the loop converges from {numbers['least']:.3g} on"
+    enough = not advice.why_not and abs(advice.value) >= abs(numbers["least"])
+    advised = f"= {advice.value:.3g}." if enough else f"beyond {numbers['least']:.3g}, or another form."
+    name = case.controller.deformation.gain_name
+    return Answer(GAIN, Verdict.NO, text, f"Use {name} {advised}", numbers)
 
 
 QUESTIONS = (

@@ -18,7 +18,7 @@ from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.nominal_runs import TRIED, null_runs
 from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, response_errors
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
 from fpirhc.review.questions.form import form_of, forms_of
 from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
 from fpirhc.simulation.model_as_plant import with_believed_way
@@ -41,7 +41,7 @@ def pays(case: Case) -> Answer:
     sizes = [_with_unit(case, e, nominal_size(nominal)) for e in (without, adapted, null)]
     text = f"predicted rms response error: {sizes[0]} without adaptation, {sizes[1]} with it, {sizes[2]} with a right model"
     numbers = {"without": without, "with": adapted, "null": null}
-    if case.loops.loops and case.loops.radii.min() >= 1 and not case.loops.learns:
+    if case.diverges:
         change = "The prediction leaves the outer loop out, and this one does not converge: see the convergence."
         return Answer(PAYS, Verdict.NO, f"{text}, but errors grow in every cycle", change, numbers)
     if max(without, adapted) <= ROUNDING * nominal_size(nominal) and not case.grid.elsewhere:
@@ -66,9 +66,8 @@ def _by_runs(case: Case, reason: str) -> Answer:
     if pair.lower:
         return Answer(PAYS, Verdict.YES, text, "", numbers)
     if pair.fails and not case.controller.learns:
-        return Answer(
-            PAYS, Verdict.NO, text, "Lower the gain, use another form, or leave the deformation out.", numbers
-        )
+        change = "Lower the gain, use another form, or leave the deformation out."
+        return Answer(PAYS, Verdict.NO, text, SEE_CONVERGENCE if case.diverges else change, numbers)
     return Answer(PAYS, Verdict.UNKNOWN, text, "Run it for longer and compare.", numbers)
 
 
@@ -135,6 +134,10 @@ def leaves_right_model_alone(case: Case) -> Answer:
     worst = runs.worst
     numbers |= {"without": runs.without[worst], "with": runs.adapted[worst], "added": runs.added(worst)}
     text += runs.text
+    if runs.stuck:
+        return Answer(
+            NULL_TEST, Verdict.UNKNOWN, f"{text}; {runs.stuck}", "Run it where the commands are free.", numbers
+        )
     if runs.passes:
         return Answer(NULL_TEST, Verdict.YES, text, "", numbers)
     harmful = runs.fails and not case.controller.learns and not _cures_more(case, runs, nominal, predicted)

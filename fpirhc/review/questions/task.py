@@ -77,8 +77,9 @@ def relative_orders(grid: ReviewGrid) -> Answer:
     text = ", ".join(f"{c} {r}" for c, r in structural.items())
     inside = plant.state.size - sum(declared.values())
     alone = "moves by itself" if inside == 1 else "move by themselves"
+    which = "the only state" if plant.state.size == 1 else f"{inside} of {plant.state.size} states"
     whole = "; the controlled coordinates and their derivatives make up the whole state"
-    text += f"; {inside} of {plant.state.size} states {alone}" if inside else whole
+    text += f"; {which} {alone}" if inside else whole
     numbers = {**{f"order_{c}": float(r or 0) for c, r in structural.items()}, "internal_states": float(inside)}
     if structural != declared:
         return Answer(ORDERS, Verdict.NO, text, "Write the response as the derivative that the input acts on.", numbers)
@@ -126,7 +127,8 @@ def stay_nominal(grid: ReviewGrid) -> Answer | None:
         place = plant.parameter.elements.index(name)
         low, high, nominal = rows[:, place].min(), rows[:, place].max(), plant.parameters[name].exact
         moves |= max(abs(low - nominal), abs(high - nominal)) > _SAME * (1 + abs(nominal))
-        facts.append(f"{name} is {nominal:.6g} {plant.parameters[name].unit} here, {low:.6g} to {high:.6g} in the run")
+        values = f"{low:.6g}" if f"{low:.6g}" == f"{high:.6g}" else f"{low:.6g} to {high:.6g}"
+        facts.append(f"{name} is {nominal:.6g} {plant.parameters[name].unit} here, {values} in the run")
     change = "Review other values too: outside(nominal=...)." if moves else ""
     return Answer(OUTSIDE, Verdict.UNKNOWN if moves else Verdict.YES, "; ".join(facts), change)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.by_name import FoundByName
 from fpirhc.plant.motion import followed_units, with_space
-from fpirhc.simulation.error_pair import SLIGHT
+from fpirhc.simulation.error_pair import MOSTLY, SLIGHT
 from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.metrics.base import by_name
 from fpirhc.simulation.metrics.entries.commands import at_limit
@@ -26,7 +26,6 @@ from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import in_percent, numbers_written_out
 from fpirhc.task.problem import Problem
 
-_MOSTLY = 0.5  # share of the cycles at a limit from which nothing is shown
 _LARGER = (Outcome.WORSE, Outcome.MIXED)
 
 
@@ -89,7 +88,7 @@ def null_test(
     before, after = (_errors(run, null) for run in runs)
     slight = {name: SLIGHT * size for name, size in _ranges(runs[0], null).items()}
     stuck = {n: at_limit(null, run) for n, run in zip(names, runs, strict=True)}
-    if stuck[names[0]] >= _MOSTLY:
+    if stuck[names[0]] >= MOSTLY:
         text = _not_informative(stuck)
         return NullTest(
             names, before, after, Outcome.NOT_COMPARABLE, False, text, null.cycles, time.perf_counter() - begin
