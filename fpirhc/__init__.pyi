@@ -78,7 +78,9 @@ from .sensing.observers.moving_horizon_states import MovingHorizonStates
 from .simulation.lyapunov_view import lyapunov_view
 from .simulation.machine import RunMonitor
 from .simulation.metrics import Metric, figures, measure
+from .simulation.pictures.band import Band
 from .simulation.pictures.base import Quantity
+from .simulation.pictures.grid import Grid
 from .simulation.pictures.heat_map import HeatMap
 from .simulation.pictures.over_time import OverTime
 from .simulation.pictures.portrait import Portrait
@@ -113,6 +115,7 @@ __all__ = [
     "Algebraic",
     "Anderson",
     "Answer",
+    "Band",
     "Believed",
     "BeyondLimit",
     "ByDesired",
@@ -151,6 +154,7 @@ __all__ = [
     "FullSpaceFixedPoint",
     "GaussNewton",
     "GradientFixedPoint",
+    "Grid",
     "Guarded",
     "HarmfulAdaptation",
     "HeatMap",

@@ -10,7 +10,7 @@ import hashlib
 import json
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -23,6 +23,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.report.figures import contraction_figure, limits_figure, lyapunov_figure, mismatch_figure, pair_figures
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
 from fpirhc.simulation.log import shown_motion
+from fpirhc.simulation.pictures.base import readable
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import Column, Table
 from fpirhc.whole_file import write_whole
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
 
-    from fpirhc.simulation.pictures.base import Picture
+    from fpirhc.simulation.picture import Drawing
+    from fpirhc.simulation.pictures.base import Kept, Picture
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.comparison.entry import Entry
@@ -153,14 +155,19 @@ def own_pictures(comparison: Comparison) -> list[Image]:
 
 def _own(wanted: Picture, runs: Mapping[str, Run]) -> Image | None:
     shown = {name: run for name, run in runs.items() if not wanted.controllers or name in wanted.controllers}
-    if not shown:
+    return _drawn(wanted, list(shown), lambda figure: wanted.draw(figure, shown))
+
+
+def _drawn(wanted: Picture, names: Sequence[str], draw: Callable[[Drawing], None]) -> Image | None:
+    """A picture of the problem, or why it is not drawn; None without a controller to show."""
+    if not names:
         return None
-    figure = new_figure(*wanted.size(len(shown)))
+    figure = new_figure(*wanted.size(len(names)))
     try:
-        wanted.draw(figure, shown)
+        draw(figure)
     except FpirhcError as error:
         return Image("", "", f"{wanted.title} is not drawn: {error}")
-    return Image(figure.address, f"{wanted.title}: {', '.join(shown)}", f"{wanted.title}. {wanted.caption}".strip())
+    return Image(figure.address, f"{wanted.title}: {', '.join(names)}", f"{wanted.title}. {wanted.caption}".strip())
 
 
 def _in_force(comparison: Comparison) -> Table:
@@ -194,7 +201,16 @@ def render_scenarios(comparison: ScenarioComparison) -> str:
     """Return the page's text."""
     figure = mismatch_figure(comparison) if comparison.summaries else None
     chart = Image(figure.address, "Error against mismatch", _MISMATCH) if figure else None
-    return render_page("scenarios.html", comparison.view, chart=chart)
+    kept = {name: [one.get("pictures", {}) for one in some] for name, some in comparison.records.items()}
+    own = [image for wanted in comparison.pictures if (image := _of_cases(wanted, kept))]
+    return render_page("scenarios.html", comparison.view, chart=chart, own=own)
+
+
+def _of_cases(wanted: Picture, kept: Mapping[str, Sequence[Mapping[str, Kept]]]) -> Image | None:
+    """The picture of what was kept of the cases; None where it keeps nothing, or none of its controllers ran."""
+    every = {name: [one[wanted.title] for one in some if wanted.title in one] for name, some in kept.items()}
+    shown = {name: cases for name, cases in every.items() if cases}
+    return _drawn(wanted, list(shown), lambda figure: wanted.draw_cases(figure, readable(shown)))
 
 
 def write_limits(found: OperatingLimits, path: Path) -> None:

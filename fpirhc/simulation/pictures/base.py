@@ -7,13 +7,14 @@ module imports no plotting library.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import Checked
 from fpirhc.simulation import drawing
 from fpirhc.simulation.run import Run
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+Kept: TypeAlias = Mapping[str, float | str | list[float]]
+
+NOT_DRAWN = "not drawn"  # what is kept where a picture does not fit the run, with the reason
 INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 
 
@@ -62,6 +66,13 @@ class Picture(Checked, ABC):
             InvalidName: a run does not have a signal; the message names the nearest one.
         """
 
+    def kept(self, run: Run) -> Kept:  # noqa: ARG002
+        """Return what the picture needs of the run of a case to show many of them; nothing where it shows single runs."""
+        return {}
+
+    def draw_cases(self, figure: Figure, kept: Mapping[str, Sequence[Kept]]) -> None:
+        """Draw what was kept of all cases, by name of their controller, into an empty figure; called where something is."""
+
 
 def numbers(run: Run, what: str | Quantity) -> np.ndarray:
     """Return the values of a signal or a quantity, shape (cycles,).
@@ -70,6 +81,17 @@ def numbers(run: Run, what: str | Quantity) -> np.ndarray:
         InvalidName: the run does not have the signal.
     """
     return run[what] if isinstance(what, str) else np.asarray(what.values(run), dtype=float)
+
+
+def readable(kept: Mapping[str, Sequence[Kept]]) -> Mapping[str, Sequence[Kept]]:
+    """Return what was kept.
+
+    Raises:
+        FpirhcError: the picture did not fit a run; with its reason.
+    """
+    for one in (one for cases in kept.values() for one in cases if NOT_DRAWN in one):
+        raise FpirhcError(str(one[NOT_DRAWN]))
+    return kept
 
 
 def label(run: Run, what: str | Quantity) -> str:

@@ -79,9 +79,9 @@ class HeatMap(Picture):
         return next(iter(units))
 
 
-def averaged(values: np.ndarray) -> np.ndarray:
+def averaged(values: np.ndarray, columns: int = _COLUMNS) -> np.ndarray:
     """Return means of equal intervals where there are more values than columns; a shorter series as it is."""
-    if values.size <= _COLUMNS:
+    if values.size <= columns:
         return values
-    edges = np.linspace(0, values.size, _COLUMNS + 1).astype(int)
+    edges = np.linspace(0, values.size, columns + 1).astype(int)
     return np.asarray(np.add.reduceat(values, edges[:-1]) / np.diff(edges))

@@ -22,12 +22,13 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.metrics import Metrics, measure
+from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
 from fpirhc.task.problem import Problem
 
-FORMAT = 4  # of records
+FORMAT = 5  # of records
 
 
 @dataclass(frozen=True)
@@ -129,9 +130,16 @@ class Bench:
             "outcome": outcome(run, size),
             "error": _finite(size),
             "metrics": _finite(metrics.values),
+            "pictures": _finite(self._kept(name, run)),
             "lasted": run.cycles / scenario.problem.cycles,
             "stop": run.stop,
         }
+
+    def _kept(self, name: str, run: Run) -> dict[str, Kept]:
+        """What the pictures of many runs need of this one, by title."""
+        shown = [one for one in self._task.pictures if not one.controllers or name in one.controllers]
+        kept = {one.title: _kept_of(one, run) for one in shown if run.cycles > 1}
+        return {title: facts for title, facts in kept.items() if facts}
 
     def _scenario(self, number: int) -> Scenario:
         """The scenario; the last one is kept, because controllers take turns on it."""
@@ -227,9 +235,20 @@ def scenario_numbers(
     return range(count)
 
 
+def _kept_of(picture: Picture, run: Run) -> Kept:
+    try:
+        return picture.kept(run)
+    except FpirhcError as error:  # a mistake in a picture costs no run
+        return {NOT_DRAWN: str(error)}
+
+
 def _finite(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    if isinstance(value, str):
+        return value
     return value if abs(value) < float("inf") else None
 
 

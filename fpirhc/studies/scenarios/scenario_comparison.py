@@ -11,6 +11,7 @@ from typing import Any
 from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.simulation.metrics.measuring import Column as Number
+from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.scenarios.paired import Record, Summary, noun
 from fpirhc.studies.tuning.objective import Objective
 from fpirhc.studies.view import View, status_shares
@@ -51,6 +52,7 @@ class ScenarioComparison(FoundByName):
         command: the command line.
         elapsed: wall time of the study, s.
         time_unit: unit of time of the problem.
+        pictures: those of the problem file; they are drawn where they keep something of every run.
     """
 
     problem: str
@@ -74,6 +76,7 @@ class ScenarioComparison(FoundByName):
     named: bool = False
     figure: Objective = field(default_factory=Objective)
     groups: Mapping[str, tuple[Summary, ...]] = field(default_factory=dict)
+    pictures: tuple[Picture, ...] = ()
 
     def __repr__(self) -> str:
         counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"

@@ -115,6 +115,7 @@ def compare_scenarios(
         versions=versions(),
         command=command,
         elapsed=time.perf_counter() - begin,
+        pictures=task.pictures,
     )
 
 
