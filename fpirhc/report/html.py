@@ -221,7 +221,7 @@ def write_limits(found: OperatingLimits, path: Path) -> None:
     """
     figure = limits_figure(found) if found.limits else None
     chart = Image(figure.address, "Error against what grows", _LIMITS) if figure else None
-    write_whole(render_page("scenarios.html", found.view, chart=chart), path, "report")
+    write_whole(render_page("scenarios.html", found.view, chart=chart, own=()), path, "report")
 
 
 def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:
