@@ -7,7 +7,12 @@ krisztiankosi/Control (MIT licence),
 
 The cubic term is Duffing's, the velocity term van der Pol's: it feeds energy in for |q| < 1 and takes it out beyond. The
 published file prints the last term without its argument; q^5 is our reading. The limits and the start are chosen here so
-that the first second needs more force than the limits allow.
+that the first second needs more force than the limits allow. Errors count from 3 s on:
+
+    rms error, seed 0     q [m]
+    RHC                  0.0068
+    RHC+FPI             3.4e-05
+    RHC exact model     2.2e-05
 """
 
 import casadi as ca
