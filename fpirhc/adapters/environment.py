@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.errors import NotSupported, package
+from fpirhc.errors import package
 from fpirhc.simulation.held_input import HELD_INPUT, HeldInput
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
@@ -40,8 +40,7 @@ def as_env(problem: Problem, *, reward: Reward | None = None, setpoints: Setpoin
         NotSupported: Gymnasium is not installed, or the plant is an object outside.
     """
     gymnasium = package("gymnasium", "outside")
-    if problem.foreign is not None:
-        raise NotSupported("as_env: the plant is an object outside; make the environment from that object itself")
+    problem.require_equations("as_env: the plant is an object outside; make the environment from that object itself")
     play = _Play(problem, reward or _squared_error, setpoints)
     low, high = (np.array(ends, dtype=float) for ends in problem.limits.input_ends(problem.plant))
 

@@ -218,10 +218,7 @@ class Variant:
             exact = np.array([one.exact for one in problem.moved.parameters.values()])
             return elsewhere.with_exact(exact * (1 + self.nudge)) if exact.size else elsewhere
         if self.finer > 1:
-            finer = problem.real_integrator.finer(self.finer) or problem.real_integrator
-            moved = problem.symbolic_reality
-            changes = {"integrator": finer} if moved is None else {"reality": replace(moved, integrator=finer)}
-            return replace(problem, **changes)
+            return problem.finer(self.finer) or problem
         return problem
 
 
@@ -241,7 +238,7 @@ def variants(problem: Problem, *, seed: int, seeds: int, compiled: bool) -> list
     all_variants.append(
         Variant(ROUNDING, f"start and exact parameters moved by {_NUDGE:g}", seed, compiled, nudge=_NUDGE)
     )
-    if not problem.foreign and problem.real_integrator.finer(2):
+    if problem.finer(2):
         all_variants.append(Variant(INTEGRATOR, "twice the integrator steps", seed, compiled, finer=2))
     return all_variants
 

@@ -11,20 +11,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from fpirhc.contraction.delayed import delayed_limit, leaking_limit
 from fpirhc.contraction.gains import assess_gain, linear_limit
-from fpirhc.contraction.measured import sampled_jacobians
-from fpirhc.contraction.spectrum import Spectrum, spectrum_over_run
+from fpirhc.contraction.measured import jacobians_along
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.controllers.model_inputs import NONE
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import form_inside
-from fpirhc.errors import InvalidValue, NotContractive, NotSupported
-from fpirhc.plant.plant import Plant
+from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import every
@@ -197,30 +195,21 @@ def _at_start(problem: Problem) -> Spectrum | None:
 
     With a reality they are those of the response at the end of a cycle; None where the command has not reached it by then.
     """
-    if problem.symbolic_reality is None:
-        before = tuple(map(float, problem.inputs_before))
-        return _spectrum(problem.plant, tuple(map(float, problem.start_state)), before)
-    plant, state = problem.plant, problem.start_state[None, :]
+    return _SPECTRA.of((problem,), (), lambda: _spectrum(problem.of_equations))
+
+
+def _spectrum(problem: Problem) -> Spectrum | None:
+    plant, exact = problem.plant, problem.real_plant.exact[None, :]
+    real, state = problem.real_start[None, :], problem.start_state[None, :]
     response = plant.equations.controlled_response(problem.start_state, problem.inputs_before, plant.approximate)
-    try:
-        real = problem.real_start[None, :]
-        [jacobian] = sampled_jacobians(problem, real, state, response.full().T, plant.approximate)
-    except InvalidValue:
+    [jacobian] = jacobians_along(problem, real, state, response.full().T, plant.approximate, exact)
+    if not np.isfinite(jacobian).all():
         return None
-    spectrum = Spectrum(np.linalg.eigvals(jacobian)) if np.isfinite(jacobian).all() else None
-    return spectrum if spectrum is not None and np.abs(spectrum.eigenvalues).max() > _NOTHING else None
+    spectrum = Spectrum(np.linalg.eigvals(jacobian))
+    return spectrum if np.abs(spectrum.eigenvalues).max() > _NOTHING else None
 
 
-@lru_cache(maxsize=8)  # a search checks many gains at the same start
-def _spectrum(plant: Plant, start: tuple[float, ...], before: tuple[float, ...]) -> Spectrum | None:
-    state = np.array(start)[None, :]
-    response = plant.equations.controlled_response(state[0], before, plant.approximate)
-    try:
-        return spectrum_over_run(plant, state, response.full().T)
-    except InvalidValue:
-        return None
-
-
+_SPECTRA: Latest[Spectrum | None] = Latest(8)  # a search checks many gains at the same start
 _CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same controllers again and again
 
 

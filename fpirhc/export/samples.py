@@ -7,7 +7,6 @@ A cycle holds what the step is given, the number of the entry of the memory that
 from __future__ import annotations
 
 import struct
-from dataclasses import replace
 
 import numpy as np
 
@@ -80,7 +79,7 @@ def digest(values: np.ndarray) -> int:
 def _samples(device: Device) -> np.ndarray:
     """What the step is given in a run, with times that go on where it is repeated."""
     problem = device.problem
-    run = simulate(problem if problem.foreign is None else replace(problem, reality=None), device.controller, seed=0)
+    run = simulate(problem.of_equations, device.controller, seed=0)
     parts = (run.time if name == "time" else run[name] for name in device.inputs.names)
     rows = np.hstack([np.asarray(part, dtype=float).reshape(len(run.time), -1) for part in parts])
     rows = np.vstack([rows] * -(-device.cycles // len(rows)))[: device.cycles]

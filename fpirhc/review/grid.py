@@ -117,7 +117,8 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    elsewhere, real = problem.reality is not None, problem if problem.symbolic_reality else None
+    elsewhere, known = problem.reality is not None, problem.of_equations
+    real = known if known.reality else None
     problem = problem.of_model
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _POINTS)

@@ -172,7 +172,7 @@ class Points:
         self, place: int, state: np.ndarray, command: np.ndarray, exact: np.ndarray, gain: float | None = None
     ) -> np.ndarray:
         grid, asked, plant = self.grid, self.asked, self.grid.problem.plant
-        reality = asked.problem.symbolic_reality
+        reality, known = asked.problem.reality, asked.problem.truth.shared(plant)
         start = asked.start(
             time=float(grid.times[place]),
             state=dict(zip(plant.state.elements, map(float, state), strict=True)),
@@ -182,12 +182,11 @@ class Points:
         )
         times = grid.times[place] + grid.problem.period * np.arange(1, self._cycles + 1)
         led = grid.states_at(times) + (state - grid.states[place])
-        if reality is not None:  # what the model lacks moves by itself
-            known = reality.shared(plant)
-            whole = np.full((self._cycles, asked.problem.real_plant.state.size), np.nan)
-            whole[:, list(known.values())] = led[:, list(known)]
-            led = whole
-        return asked.quietest(asked.run(start, self._cycles, led, self._fixed_point(state, command)))
+        whole = np.full(
+            (self._cycles, asked.problem.real_plant.state.size), np.nan
+        )  # what the model lacks moves by itself
+        whole[:, list(known.values())] = led[:, list(known)]
+        return asked.quietest(asked.run(start, self._cycles, whole, self._fixed_point(state, command)))
 
     @cached_property
     def _cycles(self) -> int:

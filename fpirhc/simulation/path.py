@@ -47,13 +47,7 @@ def sensing_blocks(problem: Problem, other: Response | None, *, predicts: bool) 
         sense = [moving(problem).sense(measured_signals(plant), response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
     true, shown = _true_blocks(problem, response)
-    body = problem.foreign
-    if (
-        predicts
-        and body is not None
-        and not moving(problem).shows_truth
-        and {*problem.judged_names} <= {*body.measures}
-    ):
+    if predicts and not moving(problem).shows_truth and all(map(problem.moves.shows, problem.judged_names)):
         true = [*true, _truth_block(problem, shown[0][-1])]  # the reference of the controller is that of a later time
     if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
         return true  # with coordinates measured in place of others

@@ -143,7 +143,21 @@ class ExternalPlant(Checked):
         Raises:
             NotSupported: always.
         """
-        raise NotSupported("a foreign reality has no equations that could be the exact model; leave ExactModel out")
+        self.require_equations("a foreign reality has no equations that could be the exact model; leave ExactModel out")
+
+    def require_equations(self, refusal: str) -> NoReturn:
+        """Raise: it is an object outside.
+
+        Args:
+            refusal: who needs equations, and what to do.
+
+        Raises:
+            NotSupported: always, with the refusal.
+        """
+        raise NotSupported(refusal)
+
+    def finer(self, integrator: Integrator, factor: int) -> None:
+        """Nothing: it has no steps of an integrator."""
 
     @property
     def drawn(self) -> ExternalPlant:

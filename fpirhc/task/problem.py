@@ -189,11 +189,6 @@ class Problem(Checked):
         return MEASUREMENT not in self.dead_time.queued and self.sensing.ideal and not self.truth.seen
 
     @property
-    def symbolic_reality(self) -> Reality | None:
-        """The reality where it is a plant."""
-        return self.reality.symbolic if self.reality is not None else None
-
-    @property
     def foreign(self) -> ExternalPlant | None:
         """The reality where it is an object outside."""
         return self.reality.foreign if self.reality is not None else None
@@ -206,7 +201,7 @@ class Problem(Checked):
     @cached_property
     def truth(self) -> Reality:
         """What a run moves, where its equations are known; else the model itself."""
-        return self.symbolic_reality or Reality(self.plant)
+        return (self.reality and self.reality.symbolic) or Reality(self.plant)
 
     @property
     def real_plant(self) -> Plant:
@@ -261,6 +256,34 @@ class Problem(Checked):
         disturbances = {keys[place]: one for place, one in there.items() if place in keys}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)
+
+    @cached_property
+    def of_equations(self) -> Problem:
+        """The problem as far as equations tell it: where an object outside moves, the model moves in its place."""
+        known = self.reality and self.reality.symbolic
+        return self if known is self.reality else replace(self, reality=known)
+
+    def finer(self, factor: int) -> Problem | None:
+        """Return the problem with so many times the integrator steps of what moves; None where that has no finer integrator."""
+        finer = self.moves.finer(self.real_integrator, factor)
+        if finer is None:
+            return None
+        return (
+            replace(self, reality=finer)
+            if self.reality
+            else replace(self, integrator=finer.integrator or self.integrator)
+        )
+
+    def require_equations(self, refusal: str) -> None:
+        """Raise where what moves is an object outside, which has no equations and is not run to answer a question.
+
+        Args:
+            refusal: the message: who needs equations, and what to do.
+
+        Raises:
+            NotSupported: with the refusal.
+        """
+        self.moves.require_equations(refusal)
 
     @property
     def real_integrator(self) -> Integrator:

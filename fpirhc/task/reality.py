@@ -85,6 +85,14 @@ class Reality(Checked):
         """What tables call it."""
         return "; ".join(plant_facts(self.plant))
 
+    def require_equations(self, refusal: str) -> None:
+        """Nothing: its equations are known."""
+
+    def finer(self, integrator: Integrator, factor: int) -> Reality | None:
+        """Return it with so many times the steps of the integrator with which it moves; None where that has no finer one."""
+        finer = integrator.finer(factor)
+        return replace(self, integrator=finer) if finer else None
+
     def disturbable(self, model: Plant) -> tuple[str, ...]:
         """Return the names beside the inputs that disturbances may have: its coordinates, and outputs of the model."""
         return (*self.plant.coordinates, *model.outputs)

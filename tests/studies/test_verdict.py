@@ -127,7 +127,8 @@ def test_a_plant_outside_is_not_run_for_a_sentence():
     row: Any = SimpleNamespace(name="adaptive", adaptive=True, pair=None)
     found, missing = partners(outside, [row], {}, seed=0, compiled=False)
     assert not found
-    assert missing == {"adaptive": "its pair without adaptation is not among the controllers, and the plant is outside"}
+    why = "it cannot run without adaptation (its pair is not among the controllers, and the plant is outside)"
+    assert missing == {"adaptive": why}
 
 
 class _Still:

@@ -85,6 +85,10 @@ class LabLoop:
         changed, controller, values = self.ready.live.changed(numbers)
         return start_memory(self.ready.loop, replace(changed, plant=problem.plant), controller, values)
 
+    def opens(self, path: str) -> bool:
+        """Whether a slider moves this setting, or one end of it."""
+        return any(one in (path, f"{path}.0", f"{path}.1") for one in self.ready.live.paths)
+
     @cached_property
     def shown(self) -> list[str]:
         """Columns that the page draws."""
@@ -178,14 +182,15 @@ def make_lab(
         NotSupported: a plant outside, zig is not installed, or a controller that needs a solver's own library.
         InvalidName: a setting that no controller has.
     """
-    if problem.foreign is not None:
-        raise NotSupported("a lab runs the plant's equations in the page; a plant outside Python's equations has none")
+    problem.require_equations(
+        "a lab runs the plant's equations in the page; a plant outside Python's equations has none"
+    )
     package("ziglang", "compiler", "a lab")
     loops, without = [], dict[str, str]()
     for name, controller in controllers.items():
         wanted = list(live) or _usual(problem, controller)
         loops.append(LabLoop(name, _with_live(problem, controller, wanted, without)))
-    lost = [path for path in live if not any(_is_live(loop, path) for loop in loops)]
+    lost = [path for path in live if not any(loop.opens(path) for loop in loops)]
     if lost:
         raise NotSupported(
             f"no controller of the lab can have '{lost[0]}' live: {without.get(lost[0], 'it is not there')}"
@@ -214,10 +219,6 @@ def _with_live(problem: Problem, controller: Controller, wanted: list[str], with
         except FpirhcError as error:
             without[path] = str(error)  # of the last controller, which adapts where only one does
     return ready
-
-
-def _is_live(loop: LabLoop, path: str) -> bool:
-    return any(one in (path, f"{path}.0", f"{path}.1") for one in loop.ready.live.paths)
 
 
 def _parameters(problem: Problem, loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:

@@ -141,9 +141,9 @@ _PERCENT = 10.0
 
 
 def pays_when_late(case: Case) -> Answer | None:
-    """Return the errors with the dead time 10 % longer and shorter, by whole cycles; None without one, or for a plant outside."""
+    """Return the errors with the dead time 10 % longer and shorter, by whole cycles; None without one."""
     problem = case.grid.real or case.problem
-    if not is_late(problem) or problem.foreign is not None:
+    if not is_late(problem):
         return None
     short = shortened(problem, CYCLES)
     try:

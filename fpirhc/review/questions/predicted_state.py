@@ -22,10 +22,10 @@ _LESS = 0.5  # of the error, below which another prediction is named
 
 
 def prediction_knows(case: Case) -> Answer | None:
-    """Return the errors with the model's prediction and with others; None where another one is in use, or the plant is outside."""
+    """Return the errors with the model's prediction and with others; None where another one is in use."""
     problem = case.grid.real or case.problem
     others = other_predictions(case.controller)
-    if not others or problem.foreign is not None:
+    if not others:
         return None
     short, names = shortened(problem, CYCLES), {}
     try:

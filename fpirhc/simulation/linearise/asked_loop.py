@@ -63,8 +63,7 @@ class AskedLoop:
             NotSupported: a reality whose equations are not known.
             FpirhcError: every error that the controller raises about the problem.
         """
-        if problem.foreign is not None:
-            raise NotSupported("the step of a loop with a foreign reality cannot be evaluated twice at one point")
+        problem.require_equations("the step of a loop with a foreign reality cannot be evaluated twice at one point")
         self.problem, self.controller = _calm(problem), resolved(problem, controller)
         with any_gain(), compiled_plans():  # one that a run refuses has poles too
             self.loop: Composite = close_loop(self.problem, self.controller)

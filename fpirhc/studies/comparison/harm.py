@@ -101,10 +101,8 @@ def partners(
     found: dict[str, tuple[Entry, Simulator]] = {}
     missing: dict[str, str] = {}
     for name in (e.name for e in entries if e.adaptive and e.pair is None):
-        if problem.foreign is not None:
-            missing[name] = "its pair without adaptation is not among the controllers, and the plant is outside"
-            continue
         try:
+            problem.require_equations("its pair is not among the controllers, and the plant is outside")
             loop = simulator(problem, without_deformation(controllers[name]), compiled=compiled)
             found[name] = _entry(problem, f"{name} without adaptation", loop, seed, metrics), loop
         except FpirhcError as error:

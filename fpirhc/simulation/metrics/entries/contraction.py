@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from fpirhc.contraction.gains import predicted_factor
-from fpirhc.contraction.measured import identified_factor, sampled_jacobians
-from fpirhc.contraction.spectrum import Spectrum, spectrum_over_run
+from fpirhc.contraction.measured import identified_factor, jacobians_along
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.simulation.metrics.base import Metric, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
@@ -62,10 +62,11 @@ def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
     first = max(1, int(np.argmax(measured_cycles(problem, run))))
     rows = np.unique(np.linspace(first, run.cycles - 1, _SAMPLES).astype(int))
     approximate, states, deformed = np.array(run.settings["parameters"]), run["state"][rows], run["deformed"][rows]
-    if problem.symbolic_reality is None:
-        return spectrum_over_run(problem.plant, states, deformed, approximate=approximate)
-    modelled = replace(problem, plant=problem.real_plant) if run.settings["model is reality"] else problem
-    jacobians = sampled_jacobians(modelled, run["reality_state"][rows], states, deformed, approximate)
+    task = problem.of_equations
+    modelled = replace(task, plant=task.real_plant) if run.settings.get("model is reality") else task
+    real = run["reality_state"][rows] if "reality_state" in run.layout else states
+    exact = np.tile(task.real_plant.exact, (len(rows), 1))
+    jacobians = jacobians_along(modelled, real, states, deformed, approximate, exact)
     return Spectrum(np.linalg.eigvals(jacobians[np.isfinite(jacobians).all(axis=(1, 2))]))
 
 
