@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.studies.comparison.caveats import error_left_alone
+from fpirhc.studies.comparison.caveats import error_left_alone, yardstick_of
 from fpirhc.studies.comparison.changes import ranges
+from fpirhc.studies.scenarios.bench import reaches
 
 
 def tank(**changes: Any) -> fp.Problem:
@@ -52,3 +53,32 @@ def test_ranges_are_those_of_references_that_move():
     """The start counts; a set-point that is held where it starts has none."""
     assert ranges(tank(duration=10.0))["y"] == pytest.approx(0.6, rel=1e-3)
     assert ranges(tank(reference=fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}))) == {}
+
+
+def held(size: float) -> fp.Problem:
+    """The set-point 1 from 0.99, and a disturbance that leaves the tank alone with an error of about its size."""
+    disturbed = {"y": fp.Sine(amplitude=size, frequency=0.5)}
+    return tank(
+        reference=fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}),
+        start={"y": 0.99},
+        input_before={"u": 2.0},
+        duration=10.0,
+        disturbances=disturbed,
+    )
+
+
+def test_a_reference_that_moves_from_the_start_alone_is_measured_against_the_plant_left_alone():
+    """A disturbance of 8 makes errors of 1 there, beside which 0.01 from the start says nothing; without one the start counts."""
+    calm, rough = (yardstick_of(held(size), seed=0) for size in (0.0, 8.0))
+    assert calm.ranges["y"] == pytest.approx(0.01)
+    assert rough.ranges["y"] == rough.alone["y"] > 1.0
+    alone = yardstick_of(tank(duration=10.0), seed=0)
+    assert alone.ranges["y"] == pytest.approx(0.6, rel=1e-3)
+
+
+def test_a_run_diverges_beyond_a_held_reference_and_not_beyond_the_start():
+    """The set-point 1 is the size of its motion; a reference that moves has its range, and one at zero what is off at the start."""
+    assert reaches(held(8.0)) == {"y": 1.0}
+    assert reaches(tank(duration=10.0))["y"] == pytest.approx(0.5)
+    assert reaches(tank(reference=fp.Trajectory(lambda t: {"y": 0 * t}))) == {"y": 1.0}
+    assert reaches(tank(reference=fp.Trajectory(lambda t: {"y": 0 * t}), start={"y": 0.3})) == {"y": pytest.approx(0.3)}

@@ -29,7 +29,8 @@ class Yardstick:
 
     Args:
         scales: by which errors are judged, see `fpirhc.studies.comparison.changes`; 1 where not named.
-        ranges: of the references that move, the start included.
+        ranges: of the references that move, the start included; of one that moves from the start alone at least what the plant
+            left alone has for an error, because disturbances and not the reference move it.
         turns: a quarter turn for angles whose references do not move.
         alone: rms error of the plant left alone; empty where it is not known.
     """
@@ -43,15 +44,25 @@ class Yardstick:
         """What the rms error of a coordinate exceeds, in words: the range of its reference, or a quarter turn; else nothing."""
         error = entry.metrics.rms_error[name]
         if error > self.ranges.get(name, math.inf):
-            return f"more than the range of its reference, {self.ranges[name]:.3g}{_unit(entry, name)}"
+            return f"more than {self._range(name)}, {self.ranges[name]:.3g}{_unit(entry, name)}"
         if error > self.turns.get(name, math.inf):
             return f"more than a quarter turn, {self.turns[name]:.3g}{_unit(entry, name)}"
         return ""
 
+    def _range(self, name: str) -> str:
+        alone = self.alone.get(name) == self.ranges[name]
+        return "the plant left alone" if alone else "the range of its reference"
+
 
 def yardstick_of(problem: Problem, *, seed: int) -> Yardstick:
     """Return what errors of a problem are measured against; the seed is that of disturbances and noise of the plant left alone."""
-    return Yardstick(scales(problem), ranges(problem), quarter_turns(problem), error_left_alone(problem, seed=seed))
+    moving, alone = ranges(problem), error_left_alone(problem, seed=seed)
+    held = {
+        name: max(size, alone.get(name, 0.0))
+        for name, size in moving.items()
+        if name not in ranges(problem, start=False)
+    }
+    return Yardstick(scales(problem), {**moving, **held}, quarter_turns(problem), alone)
 
 
 def error_left_alone(problem: Problem, *, seed: int) -> Mapping[str, float]:

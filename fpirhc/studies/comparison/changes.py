@@ -97,13 +97,13 @@ def scales(problem: Problem) -> dict[str, float]:
     return {name: moving.get(name) or _tolerance(problem, name) for name in problem.judged_names}
 
 
-def ranges(problem: Problem) -> dict[str, float]:
-    """Return the range of every reference that moves, the start included."""
+def ranges(problem: Problem, *, start: bool = True) -> dict[str, float]:
+    """Return the range of every reference that moves, the start included or not."""
     plant = problem.plant
     function = problem.reference.function(plant)
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     states = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full())
-    wanted = np.column_stack([problem.start_output, states])
+    wanted = np.column_stack([problem.start_output, states]) if start else states
     moving = {}
     for name in problem.judged_names:
         row = wanted[plant.output.elements.index(name)]

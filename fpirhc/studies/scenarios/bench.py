@@ -102,7 +102,7 @@ class Bench:
         self._live = live or {}
         self._task, self._conditions = task, conditions
         self._scenarios = scenarios(task, conditions)
-        self._ranges = ranges(task.problem)
+        self._ranges, self._reaches = ranges(task.problem), reaches(task.problem)
         self._simulators: dict[tuple[str, object], Simulator | FpirhcError] = {}
         self._shared: dict[tuple[str, object], Simulator | None] = {}
         self._last: tuple[int, Scenario] | None = None
@@ -127,7 +127,7 @@ class Bench:
             "group": scenario.group,
             "controller": name,
             "mismatch": scenario.mismatch,
-            "outcome": outcome(run, size),
+            "outcome": outcome(run, relative_error(metrics, self._reaches)),
             "error": _finite(size),
             "metrics": _finite(metrics.values),
             "pictures": _finite(self._kept(name, run)),
@@ -254,6 +254,7 @@ def _finite(value: Any) -> Any:
 
 DIVERGED = 1.0  # relative error above which a run that lasted to its end has diverged: as large as the motion itself
 _SAMPLES = 2000
+_ROUNDING = 1e-9
 
 
 def ranges(problem: Problem) -> dict[str, float]:
@@ -261,12 +262,33 @@ def ranges(problem: Problem) -> dict[str, float]:
 
     The error at the start stands for it where that is larger, and 1 where both are zero.
     """
-    plant = problem.plant
-    places = [plant.output.elements.index(c) for c in problem.judged_names]
-    function = problem.reference.function(plant)
+    return _by_name(problem, _sizes(problem, _wanted(problem)))
+
+
+def reaches(problem: Problem) -> dict[str, float]:
+    """Return the error from which a run has diverged, of every judged coordinate: the range of the reference.
+
+    Of a reference that does not move it is its own size where that is larger: there disturbances move the plant.
+    """
+    rows = _wanted(problem)
+    sizes, largest = _sizes(problem, rows), np.abs(rows).max(axis=1)
+    held = np.ptp(rows, axis=1) <= _ROUNDING * largest
+    return _by_name(problem, np.where(held, np.maximum(sizes, largest), sizes))
+
+
+def _wanted(problem: Problem) -> np.ndarray:
+    """The reference of the judged coordinates over the run, by rows."""
+    places = [problem.plant.output.elements.index(c) for c in problem.judged_names]
     times = np.linspace(0.0, problem.duration, _SAMPLES)
-    states = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full())[places]
-    sizes = np.maximum(np.ptp(states, axis=1), np.abs(states[:, 0] - problem.start_output[places]))
+    return np.asarray(problem.reference.function(problem.plant).map(_SAMPLES)(times[None, :])[0].full())[places]
+
+
+def _sizes(problem: Problem, rows: np.ndarray) -> np.ndarray:
+    places = [problem.plant.output.elements.index(c) for c in problem.judged_names]
+    return np.maximum(np.ptp(rows, axis=1), np.abs(rows[:, 0] - problem.start_output[places]))
+
+
+def _by_name(problem: Problem, sizes: np.ndarray) -> dict[str, float]:
     return {c: float(s) if s > 0 else 1.0 for c, s in zip(problem.judged_names, sizes, strict=True)}
 
 
