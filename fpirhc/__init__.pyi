@@ -57,6 +57,7 @@ from .problem_files.problem_file import load_problem
 from .problem_files.settings import LogSpan, Span, with_settings
 from .report.html import write_report
 from .review.answer import Answer
+from .review.limits_certificate import certify_limits
 from .review.response_prediction import predict_response
 from .review.review import review
 from .review.suggest import suggest
@@ -241,6 +242,7 @@ __all__ = [
     "VelocityDifference",
     "accept",
     "certify",
+    "certify_limits",
     "check_baseline",
     "compare",
     "compare_information",

@@ -108,6 +108,7 @@ class Planner:
             is corrected.
         adapts: whether a deformation corrects the response.
         follows_model: whether a change of the model's parameters changes the command in every cycle, also between plans.
+        independent: whether a plan depends on the plans before it alone, whatever the plant does.
     """
 
     optimiser: Optimiser
@@ -118,6 +119,7 @@ class Planner:
     consistent: bool | None = False
     adapts: bool = False
     follows_model: bool = False
+    independent: bool = False
 
     def corrects(self, plant: Plant) -> bool:
         """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""

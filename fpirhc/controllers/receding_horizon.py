@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.base import Controller, closing_blocks, command_before, like, reference_block
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.reference_states import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import (
@@ -27,7 +27,7 @@ from fpirhc.controllers.replanning import (
 )
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.errors import InvalidProblem, NotSupported
+from fpirhc.errors import InvalidName, InvalidProblem, NotSupported, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.nominal import feedforward, known_on_reference
@@ -152,7 +152,8 @@ class RecedingHorizon(Controller):
         ways = self.replanning
         adapts = self.deformation.adapts
         consistent, follows = ways.consistent, self.follows_model
-        return Planner(self.optimiser, self.cost, ways.restarts, ways.law, self.margins, consistent, adapts, follows)
+        facts = (self.margins, consistent, adapts, follows, ways.room is not None)
+        return Planner(self.optimiser, self.cost, ways.restarts, ways.law, *facts)
 
     def check(self, problem: Problem) -> None:
         """Raise if the problem has no horizon or cost, or the optimiser does not support it.
@@ -166,6 +167,7 @@ class RecedingHorizon(Controller):
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
+        _room(problem, self.replanning)
         self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
@@ -174,7 +176,8 @@ class RecedingHorizon(Controller):
         plant = problem.plant
         cycles = cycles_per_plan(problem.horizon, problem.period)
         before, after, late, remembered = self.replanning.parts(problem)
-        plan = every(_plan_block(problem, self.optimiser, self.on_failure), cycles)
+        room = _room(problem, self.replanning)
+        plan = every(_plan_block(problem, self.optimiser, self.on_failure, room), cycles)
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
         if self.planner.starts_consistent(plant):
             before, after = (at_consistent_start(plant, some) for some in (before, after))
@@ -187,6 +190,8 @@ class RecedingHorizon(Controller):
         delays = [*delays, *remembered]
         blocks.append(_command_shift_block(problem, self.deformation))
         delays.append(Delay(like(plant.input, "_command_shift_last"), "command_shift"))
+        if room is not None:
+            delays.append(Delay(replace(command_before(problem), name=_PLANNED_BEFORE), "planned"))
         return blocks, delays
 
 
@@ -231,7 +236,34 @@ def _due_block(cycles: int) -> Block:
     return Block("due", Layout(), Layout((scalar("_due"),)), step, Layout((count,)))
 
 
-def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -> Block:
+_PLANNED_BEFORE = "_planned_before"
+
+
+def _room(problem: Problem, replanning: Replanning) -> np.ndarray | None:
+    """What plans leave of the range of every input, shape (nu,); None: they have the range less the deformation of the last cycle.
+
+    Raises:
+        InvalidName: an input that the plant does not have.
+        InvalidProblem: a room that leaves nothing between two limits.
+    """
+    if replanning.room is None:
+        return None
+    names = list(problem.plant.inputs)
+    for name in replanning.room:
+        if name not in names:
+            raise InvalidName(f"{type(replanning).__name__}: room of input '{name}' is unknown.{nearest(name, names)}")
+    room = np.array([float(replanning.room.get(name, 0.0)) for name in names])
+    lower, upper = problem.limits.input_bounds(problem.plant)
+    for name, low, high, own in zip(names, lower, upper, room, strict=True):
+        if low + own >= high - own:
+            raise InvalidProblem(
+                f"{type(replanning).__name__}: a room of {own:g} leaves nothing of input '{name}' between {low:g} and {high:g}; "
+                f"less than {0.5 * (high - low):g} leaves something"
+            )
+    return room
+
+
+def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure, room: np.ndarray | None = None) -> Block:
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
@@ -259,9 +291,14 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
             data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters)
         if horizon.measured:
             data = offset_limits(plant, horizon, ocp.data)(data, s._plan_state, s.state)
-        # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
-        first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
-        lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
+        if room is None:
+            # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
+            first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
+            lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
+        else:
+            own_room, planned_before = ca.DM(room), getattr(s, _PLANNED_BEFORE)
+            first = ocp.start(s._plan_state, planned_before)
+            lower, upper = (_minus(ends, expression(shift)) for ends, shift in ((low, -own_room), (high, own_room)))
         before = graph(memory.join({m: getattr(s, m) for m in memory.names}))
         remembered = expression(ca.if_else(graph(s.plan_begun) > 0.5, optimiser.shifted(ocp, before), before))
         inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)
@@ -291,7 +328,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
 
     own = memory + Layout((scalar("plan_begun"),))
     live = derived if ocp.settings or ocp.live_bounds else None
-    return Block("plan", _plan_reads(problem, ocp), Layout(writes), step, own, opaque=True, derived=live)
+    return Block("plan", _plan_reads(problem, ocp, room), Layout(writes), step, own, opaque=True, derived=live)
 
 
 def _check_reference(problem: Problem) -> None:
@@ -315,10 +352,11 @@ def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.F
     return stage_data(*arguments, previewed=previewed)
 
 
-def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
-    """Time, start of the plan, parameters, last command and its shift, derived numbers, outputs, own signals."""
+def _plan_reads(problem: Problem, ocp: OptimalControl, room: np.ndarray | None) -> Layout:
+    """Time, start of the plan, parameters, last command and its shift or last plan, derived numbers, outputs, own signals."""
     plant = problem.plant
-    last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
+    names = ("_command_shift_last", "_command_before") if room is None else (_PLANNED_BEFORE,)
+    last = tuple(like(plant.input, name) for name in names)
     assert problem.horizon is not None
     own, outputs = own_signals(problem), measured_signals(plant)[1:]
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs

@@ -97,7 +97,7 @@ def nominal_of(problem: Problem, controller: Controller, run: Callable[[], Run])
     Raises:
         NotSupported, FpirhcError: see `nominal_run`.
     """
-    _check(problem, controller)
+    check_prediction(problem, controller)
     ready = resolved(problem, controller)
     ready.check(problem)
     made = run()
@@ -217,7 +217,12 @@ def exactly(plant: Plant, values: np.ndarray) -> Plant:
 _EXACT: Latest[Plant] = Latest(8)
 
 
-def _check(problem: Problem, controller: Controller) -> None:
+def check_prediction(problem: Problem, controller: Controller) -> None:
+    """Raise where the response does not belong to the last request of one model and one map.
+
+    Raises:
+        NotSupported: see `nominal_run`.
+    """
     follows = tracking_law(controller) is not None or controller.planner is not None
     if controller.learns or controller.feeds or controller.deforms != "response" or not follows:
         raise NotSupported(

@@ -1,0 +1,285 @@
+"""Guaranteed bounds of a CasADi Function over a box of its arguments, by affine arithmetic.
+
+Interval arithmetic treats every occurrence of an argument as another argument: a determinant whose entries move together gets
+intervals that contain zero. An affine form keeps what moves together,
+
+    y = c + sum_i a_i s_i + e s_0,        |s_i| <= 1,        s_i of the i-th argument, s_0 of the form itself,
+
+and every operation of the expanded Function maps forms to a form that contains all its values: sums are exact, products add
+the product of the radii to e, and a curved function is its tangent plus the bound of its second derivative. Every operation also
+adds the bound of its rounding. The excess of the bounds is quadratic in the width of the box.
+
+Source: L. H. de Figueiredo, J. Stolfi, Affine arithmetic: concepts and applications, Numerical Algorithms 37, 2004.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import NotSupported
+
+_ROUNDING = 16 * float(
+    np.finfo(float).eps
+)  # of an operation with its coefficients, or of a function of the standard library
+_TINY = float(np.finfo(float).tiny)
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """Intervals, entry by entry.
+
+    Args:
+        lower: least values.
+        upper: largest values, of the same shape.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def within(self, other: Box) -> bool:
+        """Return whether every entry is inside the other's; False where an end is not a number."""
+        return bool((self.lower >= other.lower).all() and (self.upper <= other.upper).all())
+
+    def distance(self, point: np.ndarray) -> np.ndarray:
+        """Return the largest |y - point| of every entry."""
+        return np.maximum(self.upper - point, point - self.lower)
+
+    def scaled(self, factor: float) -> Box:
+        """Return the intervals times a number of at least 0."""
+        return Box(factor * self.lower, factor * self.upper)
+
+    @property
+    def size(self) -> np.ndarray:
+        """Largest |y| of every entry."""
+        return np.maximum(np.abs(self.lower), np.abs(self.upper))
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """Affine forms, one per lane.
+
+    Args:
+        centre: c, shape (lanes,).
+        slopes: a, shape (arguments, lanes).
+        spread: e of at least 0, shape (lanes,).
+    """
+
+    centre: np.ndarray
+    slopes: np.ndarray
+    spread: np.ndarray
+
+    @property
+    def radius(self) -> np.ndarray:
+        """Largest |y - c|."""
+        return np.abs(self.slopes).sum(axis=0) + self.spread
+
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest value."""
+        radius = self.radius
+        radius = radius + _ROUNDING * (np.abs(self.centre) + radius) + _TINY
+        return self.centre - radius, self.centre + radius
+
+
+def _form(centre: np.ndarray, slopes: np.ndarray, spread: np.ndarray) -> Form:
+    """The form with the rounding of the operation that made it."""
+    rounding = _ROUNDING * (np.abs(centre) + np.abs(slopes).sum(axis=0) + spread) + _TINY
+    return Form(centre, slopes, spread + rounding)
+
+
+def _add(a: Form, b: Form) -> Form:
+    return _form(a.centre + b.centre, a.slopes + b.slopes, a.spread + b.spread)
+
+
+def _negative(a: Form) -> Form:
+    return Form(-a.centre, -a.slopes, a.spread)
+
+
+def _product(a: Form, b: Form) -> Form:
+    slopes = a.centre * b.slopes + b.centre * a.slopes
+    spread = np.abs(a.centre) * b.spread + np.abs(b.centre) * a.spread + a.radius * b.radius
+    return _form(a.centre * b.centre, slopes, spread)
+
+
+def _square(a: Form) -> Form:
+    """A square lies between its tangent and the tangent plus the radius squared."""
+    half = 0.5 * a.radius**2
+    return _form(a.centre**2 + half, 2 * a.centre * a.slopes, 2 * np.abs(a.centre) * a.spread + half)
+
+
+Scalar: TypeAlias = Callable[[np.ndarray], np.ndarray]
+Range: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def _curved(value: Scalar, slope: Scalar, bend: Range) -> Callable[[Form], Form]:
+    """The rule of a function by its value, derivative, and (least, largest) second derivative between two numbers."""
+
+    def rule(a: Form) -> Form:
+        steep, (low, high) = slope(a.centre), bend(*a.ends)
+        least, largest = (0.5 * a.radius**2 * end for end in (np.minimum(low, 0), np.maximum(high, 0)))
+        centre = value(a.centre) + 0.5 * (least + largest)
+        return _form(centre, steep * a.slopes, np.abs(steep) * a.spread + 0.5 * (largest - least))
+
+    return rule
+
+
+def _of_ends(second: Scalar) -> Range:
+    """The range of a monotone second derivative."""
+    return lambda low, high: (np.minimum(second(low), second(high)), np.maximum(second(low), second(high)))
+
+
+def _of_size(largest: float) -> Range:
+    """The range of a second derivative of at most this size."""
+    return lambda low, _: (np.full_like(low, -largest), np.full_like(low, largest))
+
+
+def _away_from_zero(second: Scalar) -> Range:
+    """The range of a second derivative that is monotone on either side of its pole at zero."""
+
+    def bend(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ends = _of_ends(second)(low, high)
+        return tuple(np.where(low * high > 0, end, np.nan) for end in ends)  # type: ignore[return-value]
+
+    return bend
+
+
+def _positive(second: Scalar) -> Range:
+    """The range of a monotone second derivative that exists for positive arguments only."""
+
+    def bend(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ends = _of_ends(second)(np.maximum(low, _TINY), np.maximum(high, _TINY))
+        return tuple(np.where(low > 0, end, np.nan) for end in ends)  # type: ignore[return-value]
+
+    return bend
+
+
+_reciprocal = _curved(lambda c: 1 / c, lambda c: -1 / c**2, _away_from_zero(lambda c: 2 / c**3))
+_sine = _curved(np.sin, np.cos, _of_size(1.0))
+_cosine = _curved(np.cos, lambda c: -np.sin(c), _of_size(1.0))
+_exponential = _curved(np.exp, np.exp, _of_ends(np.exp))
+_logarithm = _curved(np.log, lambda c: 1 / c, _positive(lambda c: -1 / c**2))
+
+
+def _between(low: np.ndarray, high: np.ndarray, like: Form) -> Form:
+    centre = 0.5 * (low + high)
+    return _form(centre, np.zeros_like(like.slopes), 0.5 * (high - low))
+
+
+def _larger(a: Form, b: Form) -> Form:
+    """The larger one where the ranges are apart, else what contains both."""
+    (low_a, high_a), (low_b, high_b) = a.ends, b.ends
+    either = _between(np.maximum(low_a, low_b), np.maximum(high_a, high_b), a)
+    parts = ((x, np.where(low_a >= high_b, y, np.where(low_b >= high_a, z, x))) for x, y, z in _entries(either, a, b))
+    return Form(*(chosen for _, chosen in parts))
+
+
+def _entries(*forms: Form) -> list[tuple[np.ndarray, ...]]:
+    return list(zip(*((f.centre, f.slopes, f.spread) for f in forms), strict=True))
+
+
+def _smaller(a: Form, b: Form) -> Form:
+    return _negative(_larger(_negative(a), _negative(b)))
+
+
+def _sign(a: Form) -> Form:
+    low, high = a.ends
+    return _between(np.sign(low), np.sign(high), a)
+
+
+def _power(a: Form, b: Form) -> Form:
+    exponent = float(b.centre.flat[0])
+    if b.radius.any() or (b.centre != exponent).any():
+        return _exponential(_product(b, _logarithm(a)))
+    if exponent == int(exponent) and 1 <= abs(exponent) <= 16:
+        power = a
+        for _ in range(int(abs(exponent)) - 1):
+            power = _square(a) if power is a else _product(power, a)
+        return power if exponent > 0 else _reciprocal(power)
+    second = exponent * (exponent - 1)
+    curve = _positive(lambda c: second * c ** (exponent - 2))
+    return _curved(lambda c: c**exponent, lambda c: exponent * c ** (exponent - 1), curve)(a)
+
+
+_RULES: dict[int, Callable[..., Form]] = {
+    ca.OP_ASSIGN: lambda a: a,
+    ca.OP_ADD: _add,
+    ca.OP_SUB: lambda a, b: _add(a, _negative(b)),
+    ca.OP_MUL: _product,
+    ca.OP_DIV: lambda a, b: _product(a, _reciprocal(b)),
+    ca.OP_NEG: _negative,
+    ca.OP_INV: _reciprocal,
+    ca.OP_TWICE: lambda a: _add(a, a),
+    ca.OP_SQ: _square,
+    ca.OP_SQRT: _curved(np.sqrt, lambda c: 0.5 / np.sqrt(c), _positive(lambda c: -0.25 * c**-1.5)),
+    ca.OP_EXP: _exponential,
+    ca.OP_LOG: _logarithm,
+    ca.OP_SIN: _sine,
+    ca.OP_COS: _cosine,
+    ca.OP_TAN: lambda a: _product(_sine(a), _reciprocal(_cosine(a))),
+    ca.OP_TANH: _curved(np.tanh, lambda c: 1 - np.tanh(c) ** 2, _of_size(0.77)),
+    ca.OP_ATAN: _curved(np.arctan, lambda c: 1 / (1 + c * c), _of_size(0.65)),
+    ca.OP_FABS: lambda a: _larger(a, _negative(a)),
+    ca.OP_SIGN: _sign,
+    ca.OP_FMIN: _smaller,
+    ca.OP_FMAX: _larger,
+    ca.OP_POW: _power,
+    ca.OP_CONSTPOW: _power,
+}
+
+
+class Enclosure:
+    """Bounds of the entries of an expression, column by column, over boxes of a column of symbols."""
+
+    def __init__(self, value: ca.SX, argument: ca.SX) -> None:
+        """Expand the expression.
+
+        Args:
+            value: any shape.
+            argument: a column of symbols.
+
+        Raises:
+            NotSupported: an operation without a rule.
+        """
+        self.function = ca.Function("fpirhc_enclosed", [argument], [ca.densify(ca.vec(value))])
+        own = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_RULES}
+        for k in range(self.function.n_instructions()):
+            if self.function.instruction_id(k) not in own:
+                raise NotSupported(
+                    f"no bounds: the model has an operation without a rule (CasADi operation {self.function.instruction_id(k)}); "
+                    "write it with +, -, *, /, powers, sqrt, exp, log, sin, cos, tan, tanh, atan, fabs, fmin and fmax"
+                )
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Return the values at points (entries, lanes), shape (results, lanes)."""
+        return np.asarray(self.function.map(points.shape[1])(points).full())
+
+    def over(self, box: Box) -> Box:
+        """Return bounds of the values over boxes (entries, lanes), shape (results, lanes); infinite where there are none."""
+        (entries, lanes), function = box.lower.shape, self.function
+        forms: dict[int, Form] = {}
+        results: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        still, centres = np.zeros((entries, lanes)), 0.5 * (box.lower + box.upper)
+        radii = box.distance(centres)
+        with np.errstate(all="ignore"):
+            for k in range(function.n_instructions()):
+                operation = function.instruction_id(k)
+                reads, writes = function.instruction_input(k), function.instruction_output(k)
+                if operation == ca.OP_OUTPUT:
+                    results[writes[1]] = forms[reads[0]].ends
+                elif operation == ca.OP_INPUT:
+                    slopes = still.copy()
+                    slopes[reads[1]] = radii[reads[1]]
+                    forms[writes[0]] = _form(centres[reads[1]], slopes, np.zeros(lanes))
+                elif operation == ca.OP_CONST:
+                    number = np.full(lanes, function.instruction_constant(k))
+                    forms[writes[0]] = Form(number, still, np.zeros(lanes))
+                else:
+                    forms[writes[0]] = _RULES[operation](*(forms[r] for r in reads))
+        lower, upper = (np.array([results[k][side] for k in range(len(results))]) for side in (0, 1))
+        known = np.isfinite(lower) & np.isfinite(upper)
+        return Box(np.where(known, lower, -np.inf), np.where(known, upper, np.inf))
