@@ -4,6 +4,8 @@ What a reference gives for them is an invention. A review linearises on the moti
 reference, with the inputs that this needs,
 
     z' = f(x^N, z, inverse(x^N, z, r^N; p); p),        z(0) = the problem's start.
+
+Where this motion runs away and the reference is held, it is the rest there: a plant behind lags is held by no inverse.
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ _STEPS = 100_000
 _DECAYS = 20.0  # times in a run, by which the error of outputs at the start decays
 _FASTEST = 0.1  # of the cycle, the rate of this decay
 _SHORTEST = 2000  # steps of a run at least
+_NEWTON = 50  # steps to a rest
+_AWAY = 1e9  # of the start, from which a motion runs away
+_ROUNDING = 1e-9
 _WHOLE = 1e-6  # share of a cycle by which a time may be rounded
 
 
@@ -54,8 +59,17 @@ def inner_motion(
         times: increasing times from 0 on, shape (m,).
 
     Returns:
-        For every draw the states, shape (m, len(places)); None where they do not stay finite.
+        For every draw the states, shape (m, len(places)); None where they do not stay finite, and there is no rest.
     """
+    moved = _moved(problem, places, draws, times)
+    away = [one is None or bool(np.abs(one).max() > _AWAY * max(1.0, np.abs(one[0]).max())) for one in moved]
+    if not problem.plant.outputs or not any(away) or not _held(problem, times):
+        return moved
+    every = zip(moved, away, draws, strict=True)
+    return [_at_rest(problem, places, row, len(times)) if gone else one for one, gone, row in every]
+
+
+def _moved(problem: Problem, places: Sequence[int], draws: np.ndarray, times: np.ndarray) -> list[np.ndarray | None]:
     start = problem.start_state[list(places)]
     if problem.plant.step is not None:
         step = _cycle(problem, list(places))
@@ -83,6 +97,46 @@ def _motion(steps: ca.Function, start: np.ndarray, parameters: np.ndarray) -> np
         require_unsolved(error)
         return None
     return np.vstack([start, rows]) if np.isfinite(rows).all() else None
+
+
+def _held(problem: Problem, times: np.ndarray) -> bool:
+    """Whether the reference does not move."""
+    outputs = np.asarray(problem.reference.function(problem.plant).map(len(times))(times[None, :])[0].full())
+    return bool((np.ptp(outputs, axis=1) <= _ROUNDING * np.abs(outputs).max(axis=1)).all())
+
+
+def _at_rest(problem: Problem, places: Sequence[int], parameters: np.ndarray, count: int) -> np.ndarray | None:
+    rest = _rest(problem, parameters)
+    return None if rest is None else np.tile(rest[list(places)], (count, 1))
+
+
+def _rest(problem: Problem, parameters: np.ndarray) -> np.ndarray | None:
+    """The state in which the controlled outputs are on the reference and nothing moves, shape (nx,); None where none is found.
+
+    Newton's steps begin at the start of the problem.
+    """
+    plant = problem.plant
+    x, u, p = plant.symbols()
+    calm = np.zeros(len(plant.names))
+    drift = (
+        plant.equations.forced_rate(x, u, p, calm) if plant.step is None else plant.equations.next(x, u, p, calm) - x
+    )
+    wanted = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
+    places = [plant.output.elements.index(name) for name in plant.controlled_names]
+    off = plant.equations.output(x, u, p, calm)[places] - wanted[places]
+    both = ca.vertcat(x, u)
+    residual = ca.densify(ca.vertcat(drift, off))
+    newton = ca.Function("fpirhc_rest", [both, p], [residual, ca.densify(ca.jacobian(residual, both))])
+    at = np.concatenate([problem.start_state, problem.inputs_before])
+    for _ in range(_NEWTON):
+        value, slope = (np.asarray(m.full()) for m in newton(at, parameters))
+        if not (np.isfinite(value).all() and np.isfinite(slope).all()):
+            return None
+        step = np.linalg.lstsq(slope, -value.ravel(), rcond=None)[0]
+        at = at + step
+        if (np.abs(step) <= _ROUNDING * np.maximum(1.0, np.abs(at))).all():
+            return at[: plant.state.size]
+    return None
 
 
 def _cycle(problem: Problem, places: list[int]) -> ca.Function:

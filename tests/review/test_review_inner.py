@@ -239,3 +239,30 @@ def test_a_filter_is_refused_for_a_state_that_is_judged_or_grows(rate, settings)
     every = fp.review(companion(rate, **settings), {"free": free}, mismatch=0.0, seed=0).answers
     [refused] = [a for a in every if "fit the problem" in a.question]
     assert refused.verdict == "no"
+
+
+def unstable_inverse(target: Any) -> fp.Problem:
+    """Y = x1 - x2 of two lags with 1 and 3 1/s: the zero is at +1 1/s, so no input holds y that stays finite."""
+    plant = fp.Plant.of_states(
+        states={"x1": "m", "x2": "m"},
+        inputs={"u": "m"},
+        rates=lambda x, u, p: {"x1": p.k * u.u - x.x1, "x2": 2 * 3 * p.k * u.u - 3 * x.x2},
+        outputs={"y": fp.Output("m", lambda x, p: x.x2 - x.x1 * 3)},
+        parameters={"k": fp.Parameter(1.1, 1.0, "1/s")},
+    )
+    return fp.Problem(
+        plant=plant, reference=fp.Trajectory(target), start={"x1": 0.1, "x2": 0.0}, period=0.02, duration=200.0
+    )
+
+
+def test_a_held_reference_has_a_rest_where_its_inverse_runs_away():
+    """At rest x1 = k u, x2 = 2 k u and y = -k u; the draws have their own inputs, and a moving reference has no rest."""
+    times = np.linspace(0.0, 200.0, 5)
+    held = unstable_inverse(lambda t: {"y": 2.0 + 0 * t})
+    for gain, states in zip((1.0, 0.5), inner_motion(held, (0, 1), np.array([[1.0], [0.5]]), times), strict=True):
+        assert states is not None, gain
+        np.testing.assert_allclose(states, np.tile([-2.0, -4.0], (5, 1)), rtol=1e-9)
+    moving = unstable_inverse(lambda t: {"y": 2.0 + ca.sin(t)})
+    [one] = inner_motion(moving, (0, 1), np.array([[1.0]]), times)
+    assert one is None or np.abs(one).max() > 1e9
+    assert "x1, x2 are where the plant rests on the reference" in answer(held, PLAN, "well posed").evidence

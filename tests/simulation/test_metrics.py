@@ -213,6 +213,12 @@ def overshoot(task, run):
 OVERSHOOT = fp.Metric("overshoot", overshoot, by="coordinate", unit="m", headline=True, order=15)
 
 
+def test_the_metrics_of_another_file_are_taken_over():
+    """A file that shares another's metrics lists the shipped ones too; they are there once."""
+    of_another = with_own_metrics([OVERSHOOT])
+    assert with_own_metrics(of_another) == of_another
+
+
 def test_a_metric_is_one_value():
     """Measured, with its unit, in the order of its column, and as it writes itself."""
     metrics = fp.measure(problem(), run(np.linspace(1.0, -0.25, CYCLES)), with_own_metrics([OVERSHOOT]))

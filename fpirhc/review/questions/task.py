@@ -62,6 +62,8 @@ def _simulated(grid: ReviewGrid) -> str:
         return ""
     has, are = ("has", "is") if len(names) == 1 else ("have", "are")
     if grid.problem.plant.outputs:
+        if grid.inner and (np.ptp(grid.states, axis=0) == 0).all():
+            return f"; {', '.join(names)} {are} where the plant rests on the reference"
         return f"; {', '.join(names)} {are} simulated, while the outputs follow their reference"
     return f"; {', '.join(names)} {has} no task and {are} simulated"
 

@@ -42,10 +42,13 @@ def known_metrics() -> tuple[Metric, ...]:
 def with_own_metrics(own: Iterable[Metric]) -> tuple[Metric, ...]:
     """Return the known metrics and the own ones of a problem file, in the order of their columns.
 
+    Those of another problem file are its own and the known ones, which are not there twice.
+
     Raises:
         InvalidName: another metric or another fact of a run has the name.
     """
-    return _ordered([*known_metrics(), *own])
+    known = known_metrics()
+    return _ordered([*known, *(metric for metric in own if metric not in known)])
 
 
 def _several(loaded: Metric | Iterable[Metric]) -> Iterable[Metric]:
