@@ -65,7 +65,8 @@ class DisturbanceKalman(ParameterEstimator):
             adds to the response alone, which is what a deformation sees.
         measured: state (q1, q1', ...), output (y, y', ...) or response (q1'' for order 2) -> deviation of its measurement noise, in
             its unit. A response shows its disturbance at once, and a deformation has it; an estimator that is late cannot serve the
-            filter.
+            filter. Of responses alone the filter has no state of its own: it evaluates the model at the measured one, and moves the
+            disturbance by the gain L times the innovation, as a model-referenced deformation of gain L does.
         noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.
         frequencies: of sines in every disturbance, rad per unit of time; each drifts as the constant does.
 
@@ -155,7 +156,7 @@ class DisturbanceKalman(ParameterEstimator):
         a, noise_input, c = self._matrices(problem)
         model, modes = problem.plant, self.modes(problem)
         size = len(self.drift) * len(modes.names)
-        used = self._used(problem, a, c)
+        used = self._corrected(problem, a, c)
         noise = np.array([self.noise.get(n, 0.0) for n in model.names])
         walk = problem.period * np.repeat(list(self.drift.values()), len(modes.names)) ** 2
         q = scipy.linalg.block_diag((noise_input * noise**2) @ noise_input.T, np.diag(walk))
@@ -199,7 +200,7 @@ class DisturbanceKalman(ParameterEstimator):
         model = problem.plant
         advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
         fixed = ca.DM(self.gain(problem)) if self.following(problem) is None else None
-        shown = self._shown_function(model)
+        shown, follows = self._shown_function(model), self._has_state(model)
         places = [model.parameter.elements.index(n) for n in self.learned()]
         moves, adds = self.modes(problem).of(len(places))
 
@@ -210,7 +211,9 @@ class DisturbanceKalman(ParameterEstimator):
 
         def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
             before = memory["observed_disturbance"]
-            predicted = advance(memory["observed_state"], seen.command, disturbed_by(before, seen), no_forcing)
+            predicted = seen.state
+            if follows:
+                predicted = advance(memory["observed_state"], seen.command, disturbed_by(before, seen), no_forcing)
             moved = moves @ before
             innovation = self._measured(model, seen) - shown(predicted, seen.command, disturbed_by(moved, seen))
             gain = _gain(fixed, seen, len(self.measured))
@@ -292,7 +295,7 @@ class DisturbanceKalman(ParameterEstimator):
                 f"{len(self.measured)} measured quantity(ies) ({measured}): measure as many, or estimate fewer"
             )
         a, _, c = self._matrices(problem)
-        used = self._used(problem, a, c)
+        used = self._corrected(problem, a, c)
         rank = _rank(a[np.ix_(used, used)], c[:, used])
         if rank < used.sum():
             raise NotSupported(
@@ -300,6 +303,16 @@ class DisturbanceKalman(ParameterEstimator):
                 f"{rank} and needs {used.sum()} (Pannocchia and Rawlings 2003); measure another state, or disturb the response "
                 "of a coordinate that acts on a measured state"
             )
+
+    def _corrected(self, problem: Problem, a: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Which states and disturbances the filter corrects, shape (nx + nw,); no state where it has the measured one."""
+        if self._has_state(problem.plant):
+            return self._used(problem, a, c)
+        return np.arange(len(a)) >= problem.plant.state.size
+
+    def _has_state(self, plant: Plant) -> bool:
+        """Whether the filter follows the state: unless it measures responses alone."""
+        return len(self._responses(plant)) < len(self.measured)
 
     def _used(self, problem: Problem, a: np.ndarray, c: np.ndarray) -> np.ndarray:
         """Which states and disturbances the filter corrects, shape (nx + nw,): all, where the measured states determine all.

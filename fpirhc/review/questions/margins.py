@@ -73,8 +73,8 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         text += "; neutral modes that no judged coordinate shows are left out"
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     gentler = "weigh the inputs more" if planned else "lower the rate"
-    change = "" if good else f"{_LOWER}, or {gentler}." if adapts else f"{gentler.capitalize()}."
-    return Answer(MARGINS, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
+    change = SLOWER if learner else f"{_LOWER}, or {gentler}." if adapts else f"{gentler.capitalize()}."
+    return Answer(MARGINS, Verdict.YES if good else Verdict.UNKNOWN, text, "" if good else change, numbers)
 
 
 def _poles_advice(loops: Loops, adapts: bool) -> str:
