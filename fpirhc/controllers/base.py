@@ -16,7 +16,7 @@ from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.mirror import mirror_blocks
 from fpirhc.controllers.reference_states import largest_response, motion_of, own_signals, own_values
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, LastRequest
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
@@ -145,7 +145,7 @@ def deform_block(
         largest: response of every controlled coordinate that the limits of the inputs allow; empty: any.
     """
     memory = deformation.memory(plant.controlled_names)
-    request_before = _REQUEST if deformation.mirror is None else "_modelled"
+    request_before = deformation.mirror.request
     responses = [plant.response_signal(name) for name in (request_before, "realised", "desired")]
     reads = (*responses, scalar("warm_up"))
 
@@ -266,7 +266,7 @@ def like(signal: Signal, name: str) -> Signal:
     return Signal(name, signal.elements, signal.units)
 
 
-_REQUEST, _HELD, _LAST = "_deformed_last", "deformation_held", "step_of_last_sample"
+_REQUEST, _HELD, _LAST = LastRequest.request, "deformation_held", "step_of_last_sample"
 _SMALL = 1e-6  # effective gain below which the formulas lose their digits
 
 

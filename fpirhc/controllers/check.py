@@ -145,7 +145,7 @@ class _Form:
 def _form(deformation: Deformation) -> _Form:
     pairing = deformation.iteration.pairing
     cycles = (pairing.cycles or 0.0) if pairing else 0.0
-    return _Form(cycles, deformation.iteration.leak, deformation.iteration.error_pole, deformation.mirror is not None)
+    return _Form(cycles, deformation.iteration.leak, deformation.iteration.error_pole, deformation.mirror.referenced)
 
 
 def _late(weights: np.ndarray, cycles: float) -> np.ndarray:
@@ -290,7 +290,7 @@ def _of_outputs(problem: Problem, controller: Controller) -> Iterator[str]:
             f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
             "need none; leave the estimator out: Sensing(sensors=...)"
         )
-    late = 0.0 if mirror is None else mirror.measurement
+    late = mirror.measurement
     if plant.outputs and (late % 1 > NONE or (plant.step and late)):
         yield (
             f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
@@ -313,8 +313,6 @@ def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
             f"{name} around a model-referenced form changes what the form compares, the model's response with the measured one; "
             f"put it inside: ModelReferenced({name}(map, ...))"
         )
-    if mirror is None:
-        return
     for setting, values in (("cycles", every(mirror.cycles)), ("lag", every(mirror.lag))):
         if len(values) not in (1, len(plant.inputs)):
             own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"

@@ -56,7 +56,7 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
         deformation: of the controller.
     """
     mirror = deformation.mirror
-    if mirror is None:
+    if not mirror.referenced:
         return [], []
     estimator, part = problem.sensing.estimator, mirror.measurement % 1 > NONE
     inputs = problem.plant.input

@@ -44,15 +44,37 @@ class Mirror:
         longest: longest dead time of the inputs that a run may set, cycles; None: it is not live.
     """
 
+    request: ClassVar[str] = "_modelled"  # the signal that the map is given as the request which caused the response
+    referenced: ClassVar[bool] = True
+
     cycles: float | tuple[float, ...] = 0.0
     measurement: float = 0.0
     lag: float | tuple[float, ...] = 0.0
     longest: float | None = None
 
     @property
+    def bare(self) -> bool:
+        """Whether nothing is believed of the way: the command acts at once."""
+        return self == type(self)()
+
+    def origin(self, request: Expression, desired: Expression) -> Expression:  # noqa: ARG002
+        """Where the next request begins."""
+        return desired
+
+    @property
     def lags(self) -> bool:
         """Whether an actuator is believed to lag."""
         return any(self.lag) if isinstance(self.lag, tuple) else self.lag > 0
+
+
+class LastRequest(Mirror):
+    """No model: a map is given the last request, and its next one begins there."""
+
+    request = "_deformed_last"
+    referenced = False
+
+    def origin(self, request: Expression, desired: Expression) -> Expression:  # noqa: ARG002
+        return request
 
 
 @dataclass(frozen=True)
@@ -166,9 +188,9 @@ class Deformation(Checked, ABC):
         return replace(inner, constant=inner.constant and own == self.inner.memory(("q",)).names)
 
     @property
-    def mirror(self) -> Mirror | None:
-        """The way of the model's response to `step`, which is given it as `request`; None: `step` is given the last request."""
-        return None if self.inner is None else self.inner.mirror
+    def mirror(self) -> Mirror:
+        """The way of the model's response to `step`, which is given it as `request`; without a model it is given the last one."""
+        return LastRequest() if self.inner is None else self.inner.mirror
 
     def suited(self, demand: Demand) -> Self:
         """Return the map with its automatic settings chosen for how much the desired response changes."""
@@ -282,13 +304,13 @@ def _is_number(value: object) -> bool:
 
 def pairs_lag(deformation: Deformation) -> bool:
     """Whether responses are compared with those of a model behind lagging actuators."""
-    return deformation.mirror is not None and deformation.mirror.lags
+    return deformation.mirror.lags
 
 
 def of_last_pair(deformation: Deformation) -> bool:
     """Whether a request follows from the last request and its response alone: no model, pairing or filter of its own."""
     iteration = deformation.iteration
-    return deformation.mirror is None and iteration.pairing is None and not iteration.error_pole
+    return not deformation.mirror.referenced and iteration.pairing is None and not iteration.error_pole
 
 
 _FORGETTING = 0.1  # share of the newest sign

@@ -129,17 +129,27 @@ class ModelReferenced(Wrapper):
         return Queue(self._delays, longest=None if self.longest is None else self.longest + self.measurement)
 
 
-def require_own_requests(owner: str, deformation: Deformation) -> None:
+def require_own_requests(refusal: str, deformation: Deformation) -> None:
+    """Check that a map may be given its own last request.
+
+    Raises:
+        NotSupported: a model-referenced form, with the refusal.
+    """
+    if deformation.mirror.referenced:
+        raise NotSupported(refusal)
+
+
+def require_map_of_plan(owner: str, deformation: Deformation) -> None:
     """Check that a map may be given its own last request, as a plan has nothing else.
 
     Raises:
         NotSupported: a model-referenced form.
     """
-    if deformation.mirror is not None:
-        raise NotSupported(
-            f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a "
-            "plan's gradient has no model beside it; use the map inside"
-        )
+    require_own_requests(
+        f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a plan's "
+        "gradient has no model beside it; use the map inside",
+        deformation,
+    )
 
 
 def settled(deformation: Deformation, request: Expression, response: Expression) -> dict[str, Expression]:
@@ -157,7 +167,7 @@ def settled(deformation: Deformation, request: Expression, response: Expression)
 def form_inside(deformation: Deformation) -> Deformation | None:
     """Return the wrapper that changes what a model-referenced form inside it compares; None where there is no such wrapper."""
     while deformation.inner is not None:
-        if deformation.inner.mirror is not None and not getattr(deformation, "passes_pair", False):
+        if deformation.inner.mirror.referenced and not getattr(deformation, "passes_pair", False):
             return deformation
         deformation = deformation.inner
     return None

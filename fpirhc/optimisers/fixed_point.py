@@ -13,7 +13,7 @@ import numpy as np
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.model_referenced import require_own_requests
+from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
@@ -78,7 +78,7 @@ class FixedPoint(Optimiser):
                 a cost whose quadratic model has no minimum; a model-referenced map.
             InvalidValue: a tolerance below the rounding of inputs.
         """
-        require_own_requests("FixedPoint", self.map)
+        require_map_of_plan("FixedPoint", self.map)
         reach = np.abs(np.concatenate([ocp.input_lower, ocp.input_upper, ocp.nodes[1].ravel()]))
         rounding = _DIGITS * float(reach[np.isfinite(reach)].max(initial=0.0))
         if self.tolerance < rounding:

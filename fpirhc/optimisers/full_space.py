@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.model_referenced import require_own_requests
+from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.problem import OptimalControl
@@ -64,7 +64,7 @@ class FullSpaceFixedPoint(Optimiser):
         """
         super().check(ocp)
         if self.map is not None:
-            require_own_requests("FullSpaceFixedPoint", self.map)
+            require_map_of_plan("FullSpaceFixedPoint", self.map)
             largest = 2 / _scaling(ocp, self.scaled)[1] ** 2
             gain = max(self.map.secant_gain(), self.map.effective_gain(), key=abs)
             if not 0 < gain < largest:

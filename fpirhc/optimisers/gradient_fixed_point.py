@@ -13,7 +13,7 @@ import casadi as ca
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.model_referenced import require_own_requests
+from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.problem import OptimalControl, steepest_curvature
@@ -61,7 +61,7 @@ class GradientFixedPoint(Optimiser):
         super().check(ocp)
         largest = 2 / _steepest(ocp)
         map_in_use = self._map(ocp)
-        require_own_requests("GradientFixedPoint", map_in_use)
+        require_map_of_plan("GradientFixedPoint", map_in_use)
         gain = max(map_in_use.secant_gain(), map_in_use.effective_gain(), key=abs)
         if not 0 < gain < largest:
             raise NotContractive(

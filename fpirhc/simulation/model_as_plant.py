@@ -32,7 +32,7 @@ def with_believed_way(problem: Problem, deformation: Deformation) -> Problem:
     that the problem states is a fact, and stays. A lag before a map, or before algebraic states, is left out.
     """
     mirror = deformation.mirror
-    return problem if mirror is None else _with_lag(_with_dead_time(problem, mirror), mirror)
+    return _with_lag(_with_dead_time(problem, mirror), mirror)
 
 
 def _with_dead_time(problem: Problem, mirror: Mirror) -> Problem:

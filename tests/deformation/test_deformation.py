@@ -25,7 +25,7 @@ INNER = (Sigmoid(gain=-0.5, scale=1.0), Affine(gain=-0.5), RFPTVector(offset=1e5
 ALL_WRAPPERS = tuple(w for inner in INNER for w in examples("deformations", inner) if w not in MAPS)
 # The others answer from what was measured earlier, or from the model's response.
 WRAPPERS = tuple(
-    w for w in ALL_WRAPPERS if w.iteration.pairing is None and w.iteration.error_pole == 0 and w.mirror is None
+    w for w in ALL_WRAPPERS if w.iteration.pairing is None and w.iteration.error_pole == 0 and not w.mirror.referenced
 )
 NEARLY_LINEAR = (
     Affine(gain=-0.5),

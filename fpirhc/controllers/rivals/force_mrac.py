@@ -13,7 +13,7 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, bounded, commanding_blocks, desired_blocks, like
 from fpirhc.controllers.contract import Deforms, PlantModel
 from fpirhc.controllers.reference_states import command_demand
-from fpirhc.deformation.base import Deformation, Mirror, automatic
+from fpirhc.deformation.base import Deformation, automatic
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
@@ -61,7 +61,7 @@ class ForceMRAC(Controller):
                 is then not the one that the response recalculates.
         """
         mirror, late = self.deformation.mirror, any((problem.dead_time.measurement, *problem.dead_time.inputs.values()))
-        if mirror is not None and (late or not problem.sensing.ideal or mirror != Mirror()):
+        if mirror.referenced and (late or not problem.sensing.ideal or not mirror.bare):
             raise NotSupported(
                 "ForceMRAC cannot use a model-referenced deformation here: it compares the last command with the one recalculated "
                 "from the response, through no estimator, dead time or lag; use the map itself or Increment"

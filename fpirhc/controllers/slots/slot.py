@@ -14,7 +14,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.deformation.base import Deformation, Identity, Mirror
+from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, NotSupported, nearest
 from fpirhc.fields.checked import Checked
@@ -111,7 +111,7 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
 
 
 def _check_deformation(deformation: Deformation) -> None:
-    if deformation.mirror not in (None, Mirror()):
+    if not deformation.mirror.bare:
         raise NotSupported(
             "ModelReferenced in a slot compares with the model's response of this instant; dead time and lag keep commands of "
             "earlier cycles, which belong to another slot after a switch; leave cycles, measurement and lag out"

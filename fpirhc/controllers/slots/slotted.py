@@ -390,7 +390,7 @@ def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blen
 
 def _request_before(one: Channel) -> str:
     """Name of the request that the slot's map is given: the response of the model in a model-referenced form, else its last one."""
-    return "deformed_last" if one.slot.deformation.mirror is None else "modelled"
+    return one.slot.deformation.mirror.request.removeprefix("_")
 
 
 def settled_in(one: Channel) -> First:

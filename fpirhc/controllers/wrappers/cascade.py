@@ -18,6 +18,7 @@ from fpirhc.controllers.base import Controller, like, reference_block
 from fpirhc.controllers.contract import Deforms, without_deformation
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import Deformation, Demand, automatic
+from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
@@ -316,10 +317,10 @@ class Cascade(Controller):
             InvalidValue: see `ThroughModel`.
         """
         self.controller.check(self.inner_problem(problem))
-        if self.deformation.mirror is not None:
-            raise NotSupported(
-                "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself"
-            )
+        require_own_requests(
+            "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself",
+            self.deformation,
+        )
         if self.deformation.iteration.pairing is not None:
             raise NotSupported(
                 f"Cascade: {type(self.deformation).__name__} pairs by itself; give the map inside, and "

@@ -62,7 +62,7 @@ class Guarded(Wrapper):
         inner = discrete(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
         # A model-referenced form begins at the desired response, not at the request that it is given.
-        origin = request if self.map.mirror is None else desired
+        origin = self.map.mirror.origin(request, desired)
         candidate = origin + own["factor"] * (next_request - origin)
         active = ca.logic_not(ca.logic_or(own["pause"] > 0.5, own["fallback"] > 0.5))
         watched = self._watched(request, response, desired, candidate, own)
@@ -91,7 +91,7 @@ class Guarded(Wrapper):
         limit = own["factor"] * self.map.largest_step()
         at_limit = (
             smooth_norm(candidate - request, 1e-12) >= _AT_LIMIT * limit
-            if math.isfinite(nominal(self.map.largest_step())) and self.map.mirror is None
+            if math.isfinite(nominal(self.map.largest_step())) and not self.map.mirror.referenced
             else 0
         )
         fast = own["fast"] + _FAST * (size - own["fast"])

@@ -31,7 +31,7 @@ def recommended_form(problem: Problem) -> tuple[str, str]:
 
 def form_of(deformation: Deformation) -> str:
     """The form in use."""
-    if deformation.mirror is not None:
+    if deformation.mirror.referenced:
         return REFERENCED
     if not deformation.iteration.slows_desired:
         return INCREMENT
@@ -69,7 +69,7 @@ def map_inside(deformation: Deformation) -> Deformation:
     """Return the map inside a form: without pairing, increment and model reference."""
     map_ = deformation
     while map_.inner is not None and (
-        map_.mirror is not None or map_.iteration.pairing is not None or not map_.iteration.slows_desired
+        map_.mirror.referenced or map_.iteration.pairing is not None or not map_.iteration.slows_desired
     ):
         map_ = map_.inner
     return map_
