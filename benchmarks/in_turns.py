@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.simulate import CHUNK, Simulator
+from fpirhc.simulation.path import CHUNK
+from fpirhc.simulation.simulate import Simulator
 
 Work = Callable[[], float]  # process time, s
 

@@ -18,7 +18,8 @@ import numpy as np
 
 import fpirhc as fp
 from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.simulate import CHUNK, Simulator, simulator
+from fpirhc.simulation.path import CHUNK
+from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.step_arguments import set_point_table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))

@@ -135,6 +135,4 @@ def _spread(measured: Sequence[tuple[str, float]]) -> dict[str, float]:
 def _quantum(family: run_metrics.Metric, nominal: Measurement, period: float) -> float:
     """The smallest step of a metric that counts cycles."""
     cycles = nominal.numbers.get("cycles", 0)
-    if family.step is None or not isinstance(cycles, int | float) or cycles < 1:
-        return 0.0
-    return family.step(period, int(cycles))
+    return family.step(period, int(cycles)) if isinstance(cycles, int | float) and cycles >= 1 else 0.0

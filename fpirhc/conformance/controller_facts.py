@@ -147,24 +147,25 @@ def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  
     """Near the reference it feeds the error back with the gains of its `tracking` law, from which reviews read its speed."""
     ready, plant = checked(trial.problem, trial.controller), trial.problem.plant
     law = tracking_law(ready)
-    if law is None or ready.planner is not None or ready.feeds or plant.outputs or plant.step is not None:
+    if law is None or ready.planner is not None or ready.feeds:
         return
     k = min(int(np.ceil(trial.problem.longest_warm_up)) + 2, trial.run.cycles - 1)
     replay = Replay(trial.problem, ready, trial.run)
     memory = [cycle.memory for cycle, _ in zip(replay.cycles(), range(k), strict=False)][-1]
     on = replay.cycle(k, memory)["reference"]
-    at = replay.cycle(k, memory, state=on)["desired"]
-    for row, (name, order) in enumerate(zip(plant.names, plant.orders, strict=True)):
-        feedback = law.feedback(order)
-        if feedback is None or name not in plant.controlled_names:
+    at = replay.cycle(k, memory, **{plant.output.name: on})["desired"]
+    for row, (name, order) in enumerate(plant.response_orders.items()):
+        feedback = law.feedback(order) if order else None
+        if feedback is None:
             continue
         for s, gain in enumerate(feedback.gains[-order:]):
-            place = plant.state.elements.index(name + "'" * s)
-            moved = replay.cycle(k, memory, state=on - _NEAR * (np.arange(on.size) == place))["desired"]
+            place = plant.output.elements.index(name + "'" * s)
+            near = on - _NEAR * (np.arange(on.size) == place)
+            moved = replay.cycle(k, memory, **{plant.output.name: near})["desired"]
             slope = float(moved[row] - at[row]) / _NEAR
             hold(
                 within(slope - gain, _SLOPE * (1 + abs(gain))),
-                f"near the reference the error of '{plant.state.elements[place]}' is fed back with {slope:.6g}, its law "
+                f"near the reference the error of '{plant.output.elements[place]}' is fed back with {slope:.6g}, its law "
                 f"{type(law).__name__} says {gain:.6g}",
             )
 

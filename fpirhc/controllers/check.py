@@ -230,7 +230,7 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
             response of the controller's own behind sensors or dead time.
     """
     task, build = nominal(problem), nominal(controller)
-    ready = _CHECKED.of((task, build), (numbers_only,), lambda: _checked(task, build, numbers_only))
+    ready = _CHECKED.of((task, build), (numbers_only, _REFUSES.get()), lambda: _checked(task, build, numbers_only))
     return ready if build is controller else controller
 
 

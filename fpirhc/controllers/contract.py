@@ -22,7 +22,7 @@ from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked, former_members, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
-from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.chain import measured_signals, rateless
 from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -445,15 +445,7 @@ def check_derivatives(problem: Problem, law: str) -> None:
     Raises:
         NotSupported: with the law.
     """
-    plant = problem.plant
-    instant = [name for name, order in plant.response_orders.items() if not order]
-    what = (
-        "a map has differences of its steps"
-        if plant.step is not None
-        else f"{instant[0]} is of order 0"
-        if instant
-        else ""
-    )
+    what = rateless(problem.plant)
     if what:
         raise NotSupported(
             f"{law} a derivative with respect to time, and {what}; use ComputedTorque with a deformation"

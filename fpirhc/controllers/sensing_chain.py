@@ -22,6 +22,7 @@ from fpirhc.controllers.reference_states import given_signals, with_reference
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.kinds import described
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
@@ -160,7 +161,7 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
         plant: a map, or any other plant, whose estimator then stays alone.
         estimate: writes the signal of the outputs.
     """
-    if plant.step is None or max(plant.chains.values()) == 1:
+    if not response_age(plant) * (max(plant.chains.values()) - 1):
         return [estimate]
     measured = replace(plant.output, name=_MEASURED)
 

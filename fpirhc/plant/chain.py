@@ -11,7 +11,8 @@ from collections.abc import Callable, Sequence
 
 import casadi as ca
 
-from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression
+from fpirhc.errors import NotSupported
+from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression, output_order, structural_order
 from fpirhc.plant.motion import controlled_places, derivative_unit, followed_units, outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Matrix
@@ -107,3 +108,29 @@ def differentiated_signals(plant: Plant) -> tuple[str, ...]:
     differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if plant.equations.output_orders.get(e, 1)]
     places = {name: plant.parameter.elements.index(name) for name in outside_names(plant)}
     return tuple(name for name, place in places.items() if ca.depends_on(ca.vertcat(*differentiated), p[place]))
+
+
+def relative_order(plant: Plant, name: str) -> int | None:
+    """Return the relative order of a coordinate or an output from the symbols; None where no input reaches it."""
+    return structural_order(plant, name) if name in plant.coordinates else output_order(plant, name)
+
+
+def rateless(plant: Plant) -> str:
+    """Return why a response is no derivative with respect to time; empty where every one is."""
+    if plant.step is not None:
+        return "a map has differences of its steps"
+    return next((f"{name} is of order 0" for name, order in plant.response_orders.items() if not order), "")
+
+
+def require_rates(plant: Plant, refusal: str) -> None:
+    """Raise where the states have no derivatives with respect to time.
+
+    Args:
+        plant: the plant.
+        refusal: the message: who needs them, and what to do.
+
+    Raises:
+        NotSupported: a map, with the refusal.
+    """
+    if plant.step is not None:
+        raise NotSupported(refusal)

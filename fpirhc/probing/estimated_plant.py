@@ -18,6 +18,7 @@ import numpy as np
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.nominal import known_on_reference
+from fpirhc.plant.chain import require_rates
 from fpirhc.plant.parameter import Parameter, outside
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
@@ -101,10 +102,12 @@ def gain_name(row: int, column: int) -> str:
 
 def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tuple[str, ...]]:
     """The plant without its lags, and the names of its drifts."""
-    if model.step is not None or model.algebraic is not None:
-        raise NotSupported("the estimated plant of a map, or of a plant with algebraic states, has no equations yet")
-    if model.equations.inverse_opaque:
-        raise NotSupported("the estimated plant of a model that is not affine in its inputs has no equations yet")
+    without = "the estimated plant of a {} has no equations yet"
+    require_rates(model, without.format("map"))
+    if model.algebraic is not None or model.equations.inverse_opaque:
+        raise NotSupported(
+            without.format("plant with algebraic states, or of a model that is not affine in its inputs,")
+        )
     count = len(model.controlled_names)
     signals = tuple(f"drift_{name}" for name in model.controlled_names) if drifts else ()
     known = {n: one if one.outside else replace(one, exact=one.approximate) for n, one in model.parameters.items()}

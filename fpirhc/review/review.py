@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from fpirhc.broken import attempted
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.check import any_gain, checked
 from fpirhc.controllers.contract import resolved, with_lateness
 from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import checked_call
@@ -68,7 +68,7 @@ def predict(problem: Problem, controller: Controller) -> Answer:
 
 def _of(grid: ReviewGrid, controller: Controller, general: tuple[Answer, ...], runs: NominalRuns) -> tuple[Answer, ...]:
     try:
-        if grid.real is not None or grid.problem.plant.outputs:
+        with any_gain():
             checked(grid.real or grid.problem, controller)
         ready = resolved(grid.problem, controller)
         ready.check(grid.problem)

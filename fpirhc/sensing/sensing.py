@@ -158,8 +158,6 @@ class Sensing(Checked):
         """State elements that follow from what is measured; a measured output determines no state by itself."""
         measures, elements = self.measures(plant), plant.state.elements
         shown = self.estimator.known(plant, measures)
-        if not plant.outputs:
-            return shown
         pairs = zip(elements, plant.equations.known_by_outputs, strict=True)
         by_outputs = {e for e, place in pairs if place >= 0 and plant.output.elements[place] in shown}
         return tuple(e for e in elements if e in by_outputs or e in measures)

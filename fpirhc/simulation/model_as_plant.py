@@ -151,7 +151,7 @@ def behind_actuators(plant: Plant, lags: Sequence[float]) -> Plant:
 
 def _free(name: str, plant: Plant) -> str:
     """The name, lengthened until nothing of the plant has it."""
-    taken = {*plant.coordinates, *plant.inputs, *plant.parameters, *plant.outputs}
+    taken = {*plant.coordinates, *plant.inputs, *plant.parameters, *plant.chains}
     while name in taken:
         name += "_"
     return name

@@ -23,6 +23,7 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import forcing_units, outside_names, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import backward_difference, combine, response_names
+from fpirhc.simulation.ranges import Ranges, physical_ranges, ranges_of
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
@@ -36,6 +37,8 @@ from fpirhc.task.problem import Problem
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
 REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates
 SENT = "_acting"  # signal of the inputs that a foreign reality is sent
+CHUNK = 500  # cycles of a compiled call: long enough to hide Python, short enough for progress and Ctrl-C
+SHORT = 25  # of the virtual machine, for which a longer chain takes longer than it saves
 _RAW, _HELD = "_foreign", "_foreign_held"
 _PAST, _FULL = "_outputs_past", "_outputs_known"
 
@@ -78,9 +81,55 @@ def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
     return (disturbance_signal(problem),)
 
 
+class Exchange:
+    """What passes between a run and what it moves after every call of the loop: nothing, where that is inside."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+
+    def ranges(self, trace: Layout) -> Ranges:
+        """Return what ends the run: the physical ranges of what moves, and errors beyond all sense."""
+        return ranges_of(self.problem, trace)
+
+    def begin(self, read: Sequence[np.ndarray]) -> None:
+        """Fill in what the first cycle reads beside memory and tables."""
+
+    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:  # noqa: ARG002
+        """Return why the run ends after this cycle, and what to do; None where it goes on."""
+        return None
+
+
+class _Conversation(Exchange):
+    """A body is sent the inputs of every cycle, and answers with measurements."""
+
+    def __init__(self, problem: Problem, body: ExternalPlant, seed: int) -> None:
+        super().__init__(problem)
+        self._body, self._seed, self._bridged = body, seed, 0
+
+    def ranges(self, trace: Layout) -> Ranges:
+        return physical_ranges(self.problem, trace)
+
+    def begin(self, read: Sequence[np.ndarray]) -> None:
+        self._answer, self._held = read
+        self._held[0] = 0.0
+        self._answer[:] = self._body.first(self._seed)
+
+    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:
+        reading = self._body.read(cycle * self.problem.period, sent[0].copy())
+        self._bridged = 0 if reading.values is not None else self._bridged + 1
+        self._held[0] = float(reading.values is None)
+        if reading.values is not None:
+            self._answer[:] = reading.values
+        return (reading.mistake, self._body.remedy) if self._bridged > self._body.holds else None
+
+
 class Mover(ABC):
     """What a run moves, as the loop meets it."""
 
+    cycles_of_call: ClassVar[int] = CHUNK
+    """Cycles that one call of the compiled loop runs."""
+    cycles_interpreted: ClassVar[int] = SHORT
+    """The same in the virtual machine."""
     doubted: ClassVar[bool]
     """Whether what it shows may be wrong, so that the loop looks for what is not plausible."""
     sent: ClassVar[tuple[str, ...]]
@@ -94,6 +143,10 @@ class Mover(ABC):
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
+
+    def exchange(self, seed: int) -> Exchange:  # noqa: ARG002
+        """Return what passes between a run with this seed and what it moves."""
+        return Exchange(self.problem)
 
     @property
     @abstractmethod
@@ -222,10 +275,15 @@ class Body(Mover):
     """A body outside, which is sent inputs and answers with measurements."""
 
     doubted, sent = True, (SENT,)
+    cycles_of_call = cycles_interpreted = 1  # it answers after each
 
     def __init__(self, problem: Problem, body: ExternalPlant) -> None:
         super().__init__(problem)
+        self._body = body
         self.measures, self.late = body.measures, tuple(body.dead_time)
+
+    def exchange(self, seed: int) -> Exchange:
+        return _Conversation(self.problem, self._body, seed)
 
     @property
     def states(self) -> tuple[str, ...]:

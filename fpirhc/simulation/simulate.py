@@ -20,11 +20,11 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.simulation.changes import Changes, InForce, in_force
+from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.log import with_common_columns
 from fpirhc.simulation.loop import close_loop, start_memory
-from fpirhc.simulation.path import disturbance_values
-from fpirhc.simulation.ranges import Dropped, physical_ranges, ranges_of
+from fpirhc.simulation.path import Exchange, disturbance_values, moving
+from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record, set_point_table
@@ -34,9 +34,9 @@ from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import Native, native
 from fpirhc.task.problem import Problem
 
-CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C
-SHORT, _CHAIN = 25, 5  # cycles per call of the virtual machine, for which a longer chain takes longer than it saves
+_CHAIN = 5  # cycles of the inner chain of the virtual machine
 Progress = Callable[[int, int], None]
+Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the memory, their values
 SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
 _TOO_SHORT = "compiled=None was given, and the run is short"
 _SHORT_RUN = 100_000  # cycles times stages, below which a compiler takes longer than the virtual machine
@@ -106,9 +106,9 @@ class Simulator:
         )
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
-        common = (problem, start, self.loop, self.evaluator, seed, disturbed, progress)
-        run_cycles = _run_chunks if problem.foreign is None else _run_foreign
-        logged, stop = run_cycles(*common, force, setpoints)
+        rows, talk = _padded(problem, force.patches), moving(problem).exchange(seed)
+        tables = run_tables(problem, seed, rows, disturbed=disturbed, setpoints=setpoints, later=force.later)
+        logged, stop = run_cycles(problem, start, self.loop, self.evaluator, tables, talk, progress, force.patches)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
@@ -166,15 +166,14 @@ def simulator(
     long = problem.cycles * (problem.horizon.stages if problem.horizon is not None else 1) > _SHORT_RUN
     backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
     if compiled or (compiled is None and long):
-        calls = 0 if problem.foreign else CHUNK
-        backend = native(loop.function, flags, required=bool(live), calls=calls)
-    function = backend.function if backend.compiled or problem.foreign else _chained(loop)
+        backend = native(loop.function, flags, required=bool(live), calls=moving(problem).cycles_of_call)
+    function = backend.function if backend.compiled else _chained(loop, moving(problem).cycles_interpreted)
     return Simulator(problem, ready, loop, Evaluator(function), backend.compiled, backend.reason, settings)
 
 
-def _chained(loop: Composite) -> ca.Function:
-    """The loop over `SHORT` cycles."""
-    return loop.function.mapaccum(f"{loop.function.name()}_run", SHORT, {"base": _CHAIN})
+def _chained(loop: Composite, cycles: int) -> ca.Function:
+    """The loop over so many cycles."""
+    return loop.function.mapaccum(f"{loop.function.name()}_run", cycles, {"base": _CHAIN})
 
 
 @checked_call
@@ -283,28 +282,42 @@ def run_tables(
     return tables
 
 
-def _run_chunks(
+def run_cycles(
     problem: Problem,
     start: np.ndarray,
     loop: Composite,
     evaluator: Evaluator,
-    seed: int,
-    disturbed: bool,
-    progress: Progress | None,
-    force: InForce,
-    setpoints: Setpoints | None,
+    tables: Sequence[np.ndarray],
+    talk: Exchange,
+    progress: Progress | None = None,
+    patches: Sequence[Patch] = (),
 ) -> tuple[np.ndarray, str | None]:
-    cycles, trace, dropped, patches = problem.cycles, loop.trace, Dropped(loop), force.patches
+    """Return the log, shape (cycles, trace.size), and the reason why the run ended early.
+
+    Args:
+        problem: of the run.
+        start: first memory of the loop.
+        loop: one cycle, which the log is of.
+        evaluator: of the loop over as many cycles as a call runs.
+        tables: disturbances and the sensors' random series, one row per cycle, in whole chunks.
+        talk: what passes between the loop and a plant outside after every call.
+        progress: called with (cycles done, cycles in all).
+        patches: changes of the memory before some cycles.
+
+    Raises:
+        InvalidProblem: a bad first answer of a plant outside.
+    """
+    cycles, trace, dropped, padded = problem.cycles, loop.trace, Dropped(loop), _padded(problem, patches)
     count = evaluator.results[1].size // trace.size  # a call
-    padded = (-(-cycles // CHUNK) + (1 if patches else 0)) * CHUNK
-    tables = run_tables(problem, seed, padded, disturbed=disturbed, setpoints=setpoints, later=force.later)
-    log, ranges = np.empty((padded, trace.size)), ranges_of(problem, trace)
-    evaluator.arguments[0][:] = start
+    log, ranges = np.empty((padded, trace.size)), talk.ranges(trace)
+    memory, *read = evaluator.arguments
+    memory[:] = start
+    talk.begin(read[len(tables) :])
     for at, end in _pieces(cycles, count, [cycle for cycle, _, _ in patches]):
         for cycle, places, values in patches:
             if cycle == at:
-                evaluator.arguments[0][places] = values
-        for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
+                memory[places] = values
+        for argument, table in zip(read, tables, strict=False):
             argument.reshape(count, -1)[:] = table[at : at + count]
         evaluator.redirect(1, log[at : at + count])
         why = evaluator.failure()
@@ -319,10 +332,19 @@ def _run_chunks(
         if outside is not None:
             row, what = outside
             return log[: at + row].copy(), stopped(problem, at + row, what)
-        evaluator.arguments[0][:] = evaluator.results[0].reshape(count, start.size)[end - at - 1]
+        memory[:] = evaluator.results[0].reshape(count, start.size)[end - at - 1]
+        ended = talk.after(end - 1, evaluator.results[2:])
+        if ended and end < cycles:
+            return log[:end].copy(), stopped(problem, end, ended[0]) + ended[1]
         if progress:
-            progress(at + rows.shape[0], cycles)
+            progress(end, cycles)
     return log[:cycles], None
+
+
+def _padded(problem: Problem, patches: Sequence[Patch]) -> int:
+    """Rows of a log in whole chunks, with one to spare where a call ends at a change of the memory."""
+    chunk = moving(problem).cycles_of_call
+    return (-(-problem.cycles // chunk) + (1 if patches else 0)) * chunk
 
 
 def _pieces(cycles: int, most: int, cuts: Sequence[int]) -> list[tuple[int, int]]:
@@ -335,22 +357,9 @@ def _pieces(cycles: int, most: int, cuts: Sequence[int]) -> list[tuple[int, int]
     return pieces
 
 
-def _run_foreign(
-    problem: Problem,
-    start: np.ndarray,
-    loop: Composite,
-    evaluator: Evaluator,
-    seed: int,
-    disturbed: bool,
-    progress: Progress | None,
-    force: InForce,
-    setpoints: Setpoints | None,
-) -> tuple[np.ndarray, str | None]:
-    tables = run_tables(problem, seed, problem.cycles, disturbed=disturbed, setpoints=setpoints, later=force.later)
-    return run_foreign(problem, start, loop, evaluator, seed, tables, progress, force.patches)
-
-
 def _failed(at: int, count: int, problem: Problem, why: str) -> str:
+    if count == 1:
+        return stopped(problem, at, f"a solver failed ({why})")
     return (
         f"a solver failed within {count} cycles after t = {at * problem.period:g} {problem.time_unit}: {why}; the run keeps the "
         "cycles before them"
@@ -359,75 +368,6 @@ def _failed(at: int, count: int, problem: Problem, why: str) -> str:
 
 def _why(trace: Layout, cycle: int, column: int, problem: Problem) -> str:
     return stopped(problem, cycle, f"signal '{trace.columns[column]}' is not finite")
-
-
-Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the memory, their values
-
-
-def run_foreign(
-    problem: Problem,
-    start: np.ndarray,
-    loop: Composite,
-    evaluator: Evaluator,
-    seed: int,
-    tables: Sequence[np.ndarray],
-    progress: Callable[[int, int], None] | None,
-    patches: Sequence[Patch] = (),
-) -> tuple[np.ndarray, str | None]:
-    """Return the log, shape (cycles, trace.size), and the reason why the run ended early.
-
-    Args:
-        problem: with a foreign reality.
-        start: first memory of the loop.
-        loop: one cycle, which the log is of.
-        evaluator: of one cycle of the loop.
-        seed: with which the reality is reset.
-        tables: disturbances and the sensors' random series, one row per cycle.
-        progress: called with (cycles done, cycles in all).
-        patches: changes of the memory before some cycles.
-
-    Raises:
-        InvalidProblem: a bad first answer.
-    """
-    foreign, cycles, trace, dropped = problem.foreign, problem.cycles, loop.trace, Dropped(loop)
-    assert foreign is not None
-    memory, *inputs = evaluator.arguments
-    *random, answer, held = inputs
-    log, ranges, bridged = np.empty((cycles, trace.size)), physical_ranges(problem, trace), 0
-    memory[:], held[0] = start, 0.0
-    answer[:] = foreign.first(seed)
-    for k in range(cycles):
-        for argument, table in zip(random, tables, strict=True):
-            argument[:] = table[k]
-        _patch(memory, k, patches)
-        failure = evaluator.failure()
-        if failure:
-            return log[:k], stopped(problem, k, f"a solver failed ({failure})")
-        memory_next, row, sent = evaluator.results
-        bad = dropped.first_bad(row[None, :], log[k - 1] if k else None)
-        if bad is not None:
-            return log[:k], stopped(problem, k, f"signal '{trace.columns[bad[1]]}' is not finite")
-        outside = ranges.first_outside(row[None, :])
-        if outside is not None:
-            return log[:k], stopped(problem, k, outside[1])
-        log[k] = row
-        memory[:] = memory_next
-        reading = foreign.read(k * problem.period, sent.copy())
-        bridged = 0 if reading.values is not None else bridged + 1
-        if bridged > foreign.holds and k + 1 < cycles:
-            return log[: k + 1], stopped(problem, k + 1, reading.mistake) + foreign.remedy
-        held[0] = float(reading.values is None)
-        if reading.values is not None:
-            answer[:] = reading.values
-        if progress:
-            progress(k + 1, cycles)
-    return log, None
-
-
-def _patch(memory: np.ndarray, cycle: int, patches: Sequence[Patch]) -> None:
-    for at, places, values in patches:
-        if at == cycle:
-            memory[places] = values
 
 
 def stopped(problem: Problem, cycle: int, what: str) -> str:

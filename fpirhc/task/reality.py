@@ -16,9 +16,8 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.chain import derivatives_function, input_reaches_at
+from fpirhc.plant.chain import derivatives_function, input_reaches_at, relative_order
 from fpirhc.plant.integrators import Integrator, stiffness
-from fpirhc.plant.lie_derivatives import output_order, structural_order
 from fpirhc.plant.maps import over
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
@@ -353,7 +352,7 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
             f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
             f"the order {order}; give the model this order, or the reality a coordinate of its own"
         )
-    elif name in (model.controlled or model.chains) and _order(plant, own) is None:
+    elif name in (model.controlled or model.chains) and relative_order(plant, own) is None:
         mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
 
 
@@ -382,11 +381,6 @@ def _check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes)
             f"its derivative {name}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
             "model; give the model this order, or the reality an actuator"
         )
-
-
-def _order(plant: Plant, name: str) -> int | None:
-    """The relative order of a coordinate or an output; None where no input reaches it."""
-    return structural_order(plant, name) if name in plant.coordinates else output_order(plant, name)
 
 
 _STEPS = 60  # of Newton's method

@@ -350,9 +350,9 @@ def compiler_flags(folder, patch):
 
 def chunk(folder, patch):
     """Another number of cycles per call."""
-    from fpirhc.simulation import simulate as simulation
+    from fpirhc.simulation.path import Mover
 
-    patch.setattr(simulation, "CHUNK", 77)
+    patch.setattr(Mover, "cycles_of_call", 77)
 
 
 def other_seed(seed):

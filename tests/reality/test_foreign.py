@@ -17,7 +17,8 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.simulate import Patch, run_foreign, simulator
+from fpirhc.simulation.path import moving
+from fpirhc.simulation.simulate import Patch, run_cycles, simulator
 
 MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
 
@@ -553,7 +554,8 @@ def test_memory_that_changes_during_the_run():
     start = start_memory(ready.loop, problem, ready.controller)
     place = np.arange(start.size)[ready.loop.memory.slice("parameters")]
     patches: list[list[Patch]] = [[], [(50, place, np.array([2.0]))]]
-    before, after = (run_foreign(problem, start, ready.loop, ready.evaluator, 0, [], None, one)[0] for one in patches)
+    loop, talk = (ready.loop, ready.evaluator), moving(problem).exchange(0)
+    before, after = (run_cycles(problem, start, *loop, [], talk, patches=one)[0] for one in patches)
     commands = [log[:, ready.loop.trace.slice("command")].ravel() for log in (before, after)]
     assert np.array_equal(commands[0][:50], commands[1][:50])
     assert commands[1][50] == pytest.approx(0.5 * commands[0][50], rel=1e-12)
@@ -567,6 +569,6 @@ def test_solver_that_fails_ends_the_run(monkeypatch):
     evaluate = Mock(wraps=ready.evaluator.evaluate, side_effect=[*[DEFAULT] * 10, failure])
     monkeypatch.setattr(ready.evaluator, "evaluate", evaluate)
     start = start_memory(ready.loop, problem, ready.controller)
-    log, stop = run_foreign(problem, start, ready.loop, ready.evaluator, 0, [], None)
+    log, stop = run_cycles(problem, start, ready.loop, ready.evaluator, [], moving(problem).exchange(0))
     assert len(log) == 10
     assert "a solver failed (solver has no solution) at t = 0.01 s (cycle 10)" in str(stop)

@@ -12,7 +12,8 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidProblem
-from fpirhc.simulation.simulate import SHORT, simulator
+from fpirhc.simulation.path import SHORT
+from fpirhc.simulation.simulate import simulator
 from fpirhc.symbolic.evaluate import Evaluator
 
 TRACK = fp.Exponential(rate=6.0)

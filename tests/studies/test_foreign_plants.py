@@ -85,7 +85,7 @@ def test_a_review_of_two_outputs_answers_no_question_with_no(plant, states):
     answers = fp.review(one.problem, {"CTC+FPI": one.controllers["CTC+FPI"]}, mismatch=10.0, seed=0)
     every = (*answers.problem, *answers.controllers["CTC+FPI"])
     assert not [a.question for a in every if a.verdict is Verdict.NO]
-    assert every[0].evidence.endswith(f"; {states} are simulated, while the outputs follow their reference")
+    assert every[0].evidence.endswith(f"; {states} have no task and are simulated")
     [admissible] = [a for a in every if "gain admissible" in a.question]
     assert admissible.verdict is Verdict.YES
     assert admissible.numbers["recommended"] == pytest.approx(admissible.numbers["limit"] / 2, rel=1e-6)

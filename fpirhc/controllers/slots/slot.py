@@ -18,6 +18,7 @@ from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, NotSupported, nearest
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.chain import require_rates
 from fpirhc.plant.lie_derivatives import output_expression, structural_order
 from fpirhc.plant.motion import derivative_unit, followed_units
 from fpirhc.plant.plant import Plant
@@ -258,11 +259,11 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
         NotSupported: a map.
     """
     name = _input(plant, coordinate, input_name)
-    if plant.step is not None:
-        raise NotSupported(
-            "output_chain differentiates with respect to time, which a map does not have; write an output, whose differences and "
-            "order are those of `Plant.equations.output_orders` and `Plant.equations.output`"
-        )
+    require_rates(
+        plant,
+        "output_chain differentiates with respect to time, which a map does not have; write an output, whose differences and "
+        "order are those of `Plant.equations.output_orders` and `Plant.equations.output`",
+    )
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     rate = plant.equations.forced_rate(x, u, p, w)

@@ -110,9 +110,8 @@ def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
     if growing >= 1 and of_zero_dynamics(grid, growing):
         return _OF_THE_PLANT
     if loops.ideal is not None and loops.ideal.radius >= 1:
-        advised = not grid.problem.plant.outputs  # its stages are looked at along references of states
         believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
-        stiff = stiff_advice(grid, believed, planned=is_planned(controller)) if advised else ""
+        stiff = stiff_advice(grid, believed, planned=is_planned(controller))
         outer = "The outer loop does not converge even with the right model"
         return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
     iteration = controller.deformation.iteration

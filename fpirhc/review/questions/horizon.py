@@ -91,11 +91,10 @@ def plan_gain(
     """
     plant, believed, n = problem.plant, problem.plant.approximate, horizon.stages
     assert problem.cost is not None
-    ends = [] if plant.outputs else [plant.state.elements.index(name) for name in horizon.terminal]
+    ends = [plant.state.elements.index(name) for name in horizon.terminal]
     cycles, stage = (count(horizon, problem.period) for count in (cycles_per_plan, cycles_per_stage))
-    horizon = replace(horizon, margins={}, terminal=horizon.terminal if plant.outputs else (), share=cycles / stage)
-    start = problem.start_state if plant.outputs else None
-    ocp = transcribe(plant, problem.reference, horizon, problem.cost, Limits(), start=start)
+    horizon = replace(horizon, margins={}, terminal=(), share=cycles / stage)
+    ocp = transcribe(plant, problem.reference, horizon, problem.cost, Limits(), start=problem.start_state)
     data = np.asarray(stage_data(plant, problem.reference, horizon, problem.cost)(0.0, believed).full())
     clock = horizon.nodes
     followed, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(n)(clock[None, :-1]))
@@ -161,7 +160,8 @@ def _advice(plant: Plant, change: float) -> str:
     """What to change where the model diverges under the plan's feedback."""
     if change <= _SAME:
         return "A longer horizon plans the same: weigh what diverges, see the zero dynamics."
-    return f"Lengthen the horizon, or weigh its end{'' if plant.outputs else ' (LQRTerminal)'}."
+    whole = " (LQRTerminal)" if plant.output.elements == plant.state.elements else ""
+    return f"Lengthen the horizon, or weigh its end{whole}."
 
 
 def _slowest(grid: ReviewGrid) -> float:

@@ -102,17 +102,15 @@ def _start_deviation(grid: ReviewGrid, shown: np.ndarray) -> np.ndarray:
 
 
 def effect(grid: ReviewGrid, name: str) -> float:
-    """Return the change of the responses by one unit of a disturbance: 1 on a coordinate, the exact gain on an input.
+    """Return the change of the responses by one unit of a disturbance: on an input the exact gain, on a state their slope.
 
-    One that adds to a state of a plant with outputs changes their responses by its slope. One that adds to an output changes the
-    response by its own derivative, which is zero for a jump.
+    One that adds to a coordinate changes its own response by one. One that adds to an output changes the response by its own
+    derivative, which is zero for a jump.
     """
     plant = grid.problem.plant
     of_input, name = disturbed_place(name, plant.inputs)
-    if not of_input and plant.outputs and name in plant.coordinates:
-        return _effect_of_state(grid, name)
     if not of_input:
-        return 0.0 if name in plant.outputs else 1.0
+        return _effect_of_state(grid, name) if name in plant.coordinates else 0.0
     unit = np.array([1.0 if i == name else 0.0 for i in plant.inputs])
     command = np.nan_to_num(grid.commands[0, 0])
     respond = plant.equations.controlled_response

@@ -6,7 +6,7 @@ import numpy as np
 
 from fpirhc.controllers.observed_state import FreeErrors, free_errors
 from fpirhc.errors import NotSupported
-from fpirhc.plant.lie_derivatives import structural_order
+from fpirhc.plant.chain import relative_order
 from fpirhc.plant.motion import outside_names
 from fpirhc.review.answer import Answer, Verdict, decided
 from fpirhc.review.grid import ReviewGrid
@@ -61,10 +61,8 @@ def _simulated(grid: ReviewGrid) -> str:
     if not names:
         return ""
     has, are = ("has", "is") if len(names) == 1 else ("have", "are")
-    if grid.problem.plant.outputs:
-        if grid.inner and (np.ptp(grid.states, axis=0) == 0).all():
-            return f"; {', '.join(names)} {are} where the plant rests on the reference"
-        return f"; {', '.join(names)} {are} simulated, while the outputs follow their reference"
+    if (np.ptp(grid.states, axis=0) == 0).all():
+        return f"; {', '.join(names)} {are} where the plant rests on the reference"
     return f"; {', '.join(names)} {has} no task and {are} simulated"
 
 
@@ -75,7 +73,7 @@ def relative_orders(grid: ReviewGrid) -> Answer:
     """Return the structural order of every controlled coordinate; a sum below the size of the state leaves zero dynamics."""
     plant = grid.problem.plant
     declared = plant.response_orders
-    structural = declared if plant.outputs else {c: structural_order(plant, c) for c in plant.controlled_names}
+    structural = {name: relative_order(plant, name) for name in plant.controlled_names}
     text = ", ".join(f"{c} {r}" for c, r in structural.items())
     inside = plant.state.size - sum(declared.values())
     alone = "moves by itself" if inside == 1 else "move by themselves"

@@ -24,6 +24,10 @@ Function = Callable[[Problem, Run], float | Mapping[str, float] | None]
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
 
 
+def _no_step(period: float, cycles: int) -> float:  # noqa: ARG001
+    return 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Metric(Checked):
     """A number that sums up a run, or one number for every coordinate, input or term.
@@ -46,7 +50,7 @@ class Metric(Checked):
         compared: how baselines compare it: 'banded' (inside a computed band), 'tight' (to 1e-6), 'exact', 'not'.
         finite: whether a run that finished must have a finite number.
         floor: size of a difference up to which two numbers count as equal.
-        step: (period, number of cycles) -> the smallest step of a number that counts cycles.
+        step: (period, number of cycles) -> the smallest step of a number that counts cycles; zero for every other number.
         order: place among the columns, smallest first.
 
     Raises:
@@ -68,7 +72,7 @@ class Metric(Checked):
     compared: Compared = "banded"
     finite: bool = False
     floor: float = 1e-12
-    step: Callable[[float, int], float] | None = None
+    step: Callable[[float, int], float] = _no_step
     order: float = 100.0
 
     def __post_init__(self) -> None:
