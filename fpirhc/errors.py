@@ -81,6 +81,10 @@ class NotSupported(FpirhcError, ValueError):
     """A valid setting that this member of a family cannot serve; the message names a member that can."""
 
 
+class NoAnswer(NotSupported):
+    """A question that these numbers leave without an answer, as where a run does not stay finite."""
+
+
 def package(name: str, extra: str, what: str = "this") -> Any:
     """Import a package of an extra.
 

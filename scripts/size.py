@@ -25,7 +25,9 @@ from fpirhc.simulation.loop import close_loop
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "fpirhc"
-FORM = re.compile(r"\.outputs\b|\.step is|instant_names|symbolic_reality|\.foreign\b|is_live\(|mirror\.referenced")
+FORM = re.compile(
+    r"(?<!self)\.outputs\b|\.step is|instant_names|symbolic_reality|\.foreign\b|is_live\(|mirror\.referenced"
+)
 OWNERS = ("plant", "symbolic")  # folders that may ask for the form of a plant or a number
 SILENT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING}
 

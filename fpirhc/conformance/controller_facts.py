@@ -175,7 +175,8 @@ def outputs_are_controlled(trial: Trial, generator: np.random.Generator) -> None
     spelled = spelled_by_states(trial.problem)
     if spelled is None:
         return
-    trials = [_moved(replace(p, duration=_SHORT * p.period, measure_from=0.0), trial) for p in (trial.exact, spelled)]
+    short = (replace(p, duration=_SHORT * p.period, measure_from=0.0) for p in (trial.exact, spelled))
+    trials = [_moved(p, trial, "a plant with outputs") for p in short]
     if None in trials:
         return
     one, other = (run["command"] for run in trials if run is not None)
@@ -191,7 +192,7 @@ def outputs_are_controlled(trial: Trial, generator: np.random.Generator) -> None
 def maps_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """A map that it does not refuse, which moves in coarse steps and is known exactly, it does not drive away."""
     problem = coarse_steps()
-    run = _moved(problem, trial)
+    run = _moved(problem, trial, "a map")
     if run is None:
         return
     errors = np.abs(run["true_error"])
@@ -204,15 +205,15 @@ def maps_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  
     )
 
 
-def _moved(problem: Problem, trial: Trial) -> Run | None:
-    """A run on another problem, which the controller says it can control; None where it refuses it for another reason."""
+def _moved(problem: Problem, trial: Trial, kind: str) -> Run | None:
+    """A run on another problem, with a plant of this kind; None where the controller refuses it, for a reason of its own."""
     try:
         return simulate(problem, trial.controller, seed=trial.seed, compiled=False)
     except FpirhcError:
         return None
     except Exception as error:
-        kind = "a map" if problem.plant.step is not None else "a plant with outputs"
-        hold(False, f"it says that it can control {kind}, but cannot be built for one: {' '.join(str(error).split())}")
+        words = " ".join(str(error).split())
+        hold(False, f"it says that it can control {kind}, but cannot be built for one: {words}")
         raise
 
 

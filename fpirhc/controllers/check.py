@@ -263,7 +263,7 @@ def check_outputs(problem: Problem, controller: Controller) -> None:
     Raises:
         NotSupported: with the reason.
     """
-    _refuse(_of_outputs(problem, controller))
+    refuse(_of_outputs(problem, controller))
 
 
 def check_form(problem: Problem, controller: Controller) -> None:
@@ -273,10 +273,15 @@ def check_form(problem: Problem, controller: Controller) -> None:
         NotSupported: the number of dead times or lags differs from the plant's number of channels; a wrapper changes what a
             model-referenced form inside it compares.
     """
-    _refuse(_of_form(problem, nominal(controller.deformation)))
+    refuse(_of_form(problem, nominal(controller.deformation)))
 
 
-def _refuse(reasons: Iterator[str]) -> None:
+def refuse(reasons: Iterator[str]) -> None:
+    """Raise with the first reason, where there is one.
+
+    Raises:
+        NotSupported: with the reason.
+    """
     for reason in reasons:
         raise NotSupported(reason)
 

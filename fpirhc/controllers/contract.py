@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -243,12 +243,9 @@ class Controller(Checked, ABC):
         Raises:
             NotSupported: neither it nor an inner controller has a field `deformation`.
         """
-        changed = replaced(self, "deformation", deformation)
-        if changed is not None:
-            return changed
-        if self.inner is not None:
-            return with_inner(self, self.inner.with_deformation(deformation))
-        raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
+        if self.inner is None or replaced(self, "deformation", deformation) is not None:
+            return _replaceable(self, "deformation", deformation, "deformation that can be replaced")
+        return with_inner(self, self.inner.with_deformation(deformation))
 
     def with_defaults(self, problem: Problem) -> Self:
         """Return the controller with the numbers chosen that it leaves to the problem; what it wraps has its own already."""
@@ -358,7 +355,10 @@ def tracking_law(controller: Controller) -> Tracking | None:
     return getattr(innermost(controller), "tracking", None)
 
 
-def with_setting(controller: Controller, name: str, value: object) -> Controller | None:
+_Own = TypeVar("_Own", bound=Controller)
+
+
+def with_setting(controller: _Own, name: str, value: object) -> _Own | None:
     """Return the controller with another value of a field, its own or that of an inner one; None where nobody has the field."""
     changed = replaced(controller, name, value)
     if changed is not None or controller.inner is None:
@@ -385,7 +385,7 @@ def with_margins(controller: Controller, margins: Mapping[str, Sequence[float]])
     return _replaceable(controller, "margins", margins, "plan that could keep margins")
 
 
-def _replaceable(controller: Controller, name: str, value: object, what: str) -> Controller:
+def _replaceable(controller: _Own, name: str, value: object, what: str) -> _Own:
     changed = with_setting(controller, name, value)
     if changed is None:
         raise NotSupported(f"{type(innermost(controller)).__name__} has no {what}")

@@ -20,7 +20,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.model_inputs import CommandPath
 from fpirhc.controllers.reference_states import nominal_motion
-from fpirhc.errors import NotSupported
+from fpirhc.errors import NoAnswer, NotSupported
 from fpirhc.horizon.nominal import known_on_reference, nominal_run, reference_state
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
@@ -296,7 +296,7 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
             slopes.append(slope)
             seen.append(part)
     if not slopes:
-        raise NotSupported("believed states: the model has no finite Jacobian along the reference")
+        raise NoAnswer("believed states: the model has no finite Jacobian along the reference")
     return np.array(states), slopes, seen
 
 

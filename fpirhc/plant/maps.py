@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -20,6 +20,7 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.motion import Motion, sampling
 from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.symbolic.live import nominal
 
 _Motion = TypeVar("_Motion", bound=Motion)
 _WHOLE = 1e-6  # share of a step by which a cycle may differ from a whole number of steps
@@ -133,6 +134,13 @@ def step_of(plant: Motion, matrix: np.ndarray, time: float) -> np.ndarray:
     return np.linalg.matrix_power(np.eye(len(matrix)) + sampling(plant) * matrix, round(time / sampling(plant)))
 
 
+def poles_over(plant: Motion, modes: np.ndarray, time: float) -> np.ndarray:
+    """Return what eigenvalues of the rates, or of a map's divided differences, become over a time: whole cycles of a map."""
+    if plant.step is None:
+        return np.asarray(np.exp(modes * time))
+    return np.asarray((1 + sampling(plant) * modes) ** round(time / sampling(plant)))
+
+
 def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
     return np.real if plant.step is None else partial(decay_rates, cycle=sampling(plant))
@@ -163,3 +171,27 @@ def _differences(step: float) -> Callable[[Expression, Expression, int], list[Ex
         return column
 
     return differences
+
+
+def check_modes(law: object, plant: Motion, gains: Sequence[float]) -> None:
+    """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked.
+
+    Args:
+        law: for the message.
+        plant: that it acts on.
+        gains: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.
+
+    Raises:
+        InvalidValue: a pole z on or outside the unit circle.
+    """
+    if plant.step is None or not gains:
+        return
+    cycle = sampling(plant)
+    poles = 1 + cycle * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
+    if np.abs(poles).max() >= 1:
+        worst = complex(poles[int(np.abs(poles).argmax())])
+        shown = f"{worst.real:.3g}" if abs(worst.imag) < 1e-6 * abs(worst) else f"{worst:.3g}"
+        raise InvalidValue(
+            f"{law!r}: in the map's cycles of {cycle:g} {plant.time_unit} a mode of the error has the pole z = {shown} "
+            f"and does not decay; use a rate below {2 / cycle:g} 1/{plant.time_unit} ({1 / cycle:g} is deadbeat)"
+        )

@@ -164,6 +164,11 @@ def followed(motion: Motion) -> str:
     return "output" if motion.outputs else "coordinate"
 
 
+def disturbed(motion: Motion) -> str:
+    """What quantities are called that disturbances may add to."""
+    return "input, coordinate or output" if motion.outputs else "input or coordinate"
+
+
 def followed_units(motion: Motion) -> dict[str, str]:
     """Return name -> unit of what may follow a reference: the outputs, or without any the coordinates."""
     return {name: one.unit for name, one in motion.outputs.items()} or dict(motion.coordinates)

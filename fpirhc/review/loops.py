@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.describe import identity
-from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.late import is_late, scaled
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
@@ -86,7 +86,7 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     strongest = np.max([_fed_back(one) for one in every.values()], axis=0)
     places = tuple(k for k, one in every.items() if (_fed_back(one) >= _SMALL * strongest).all())
     if not places or not (strongest.all() or all(points.asked.inside(points.quiet(k)) for k in places)):
-        raise NotSupported("the command stands at a limit all along the reference")
+        raise NoAnswer("the command stands at a limit all along the reference")
     learns = controller.learns and points.asked.keeps_learned
     return Loops(places, tuple(every[k] for k in places), None, learns=learns)
 
@@ -255,7 +255,7 @@ def _finite(commands: np.ndarray, inverse: str) -> list[int]:
     """Points whose command is finite; raises where there is none."""
     finite = [k for k, command in enumerate(commands) if np.isfinite(command).all()]
     if not finite:
-        raise NotSupported(f"the {inverse} does not exist along the reference")
+        raise NoAnswer(f"the {inverse} does not exist along the reference")
     return finite
 
 

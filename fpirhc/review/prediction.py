@@ -5,18 +5,19 @@ Theory: docs/theory-questions.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like
+from fpirhc.controllers.check import refuse
 from fpirhc.controllers.contract import resolved, tracking_law, without_deformation
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.describe import identity
-from fpirhc.errors import NotSupported
+from fpirhc.errors import NoAnswer
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import known_exactly, with_exact_parameters
 from fpirhc.plant.plant import Plant
@@ -102,7 +103,7 @@ def nominal_of(problem: Problem, controller: Controller, run: Callable[[], Run])
     ready.check(problem)
     made = run()
     if made.stop is not None or made.cycles < 2:
-        raise NotSupported(f"no prediction: the model's own run ended early: {made.stop}")
+        raise NoAnswer(f"no prediction: the model's own run ended early: {made.stop}")
     believed = ready.plant_model(problem).parameters(problem.plant)
     return NominalRun(problem, ready, made["state"], made["desired"][:-1], believed)
 
@@ -223,20 +224,25 @@ def check_prediction(problem: Problem, controller: Controller) -> None:
     Raises:
         NotSupported: see `nominal_run`.
     """
+    refuse(_against(problem, controller))
+
+
+def _against(problem: Problem, controller: Controller) -> Iterator[str]:
+    """Reasons against a prediction."""
     follows = tracking_law(controller) is not None or controller.planner is not None
     if controller.learns or controller.feeds or controller.deforms != "response" or not follows:
-        raise NotSupported(
+        yield (
             f"no prediction for {type(controller).__name__}: it needs a controller that tracks or plans with one model and one "
             "map, and is given the measured state"
         )
     if problem.reality is not None:
-        raise NotSupported(
+        yield (
             "no prediction beside a reality, whose response may not see the command at once; that of the model alone is that of "
             "problem.of_model"
         )
     if problem.signals:
-        raise NotSupported("no prediction with signals from outside, which change along the run; simulate it")
+        yield ("no prediction with signals from outside, which change along the run; simulate it")
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
     if late or problem.sensing.delay(problem.plant, problem.period):
         what = "dead time" if late else "an estimated response"
-        raise NotSupported(f"no prediction with {what}: the response must belong to the last request")
+        yield (f"no prediction with {what}: the response must belong to the last request")

@@ -225,7 +225,7 @@ def _outer_slopes(reality: Reality, model: Plant, state: np.ndarray, command: np
         command: shape (nu,).
     """
     plant, known = reality.plant, sorted(reality.shared(model).values())
-    if model.outputs or len(known) == model.state.size or len(reality.shown(model.state.elements)) < model.state.size:
+    if len(known) == model.state.size or len(reality.shown(model.state.elements)) < model.state.size:
         return np.eye(plant.state.size)[known]
     x, u, p = plant.symbols()
     shown = reality.function(reality.shown(model.state.elements))(x, u, p, ca.SX.zeros(len(plant.names)))

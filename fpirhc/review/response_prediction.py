@@ -11,7 +11,7 @@ from fpirhc.by_name import ByName
 from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.errors import NotSupported
+from fpirhc.errors import NoAnswer, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.mismatch import check_mismatch
@@ -218,7 +218,7 @@ def _effect(grid: ReviewGrid, nominal: NominalRun, place: int) -> np.ndarray:
 def _impulses(loop: LinearLoop, gain: np.ndarray, cycles: int) -> np.ndarray:
     """|h_j| (j, nx, n): the motion of the states after a unit of the responses over one cycle."""
     if loop.radius >= 1:
-        raise NotSupported("no tube: the loop does not converge even with the right model")
+        raise NoAnswer("no tube: the loop does not converge even with the right model")
     sizes = np.abs(loop.impulses(np.linalg.inv(gain), cycles)).max(
         axis=0
     )  # of all cycles of a period in which the unit may come

@@ -14,6 +14,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.integrators import Integrator
+from fpirhc.plant.maps import poles_over
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.state_slopes import state_slopes
@@ -71,7 +72,7 @@ def step_poles(plant: Plant, integrator: Integrator, step: float, place: Place) 
     """
     rates = np.linalg.eigvals(state_slopes(plant, place.state, place.command, place.parameters).a)
     poles = np.linalg.eigvals(_matrix(plant, integrator, step, place))
-    exact = np.exp(rates * step)
+    exact = poles_over(plant, rates, step)
     apart = float(max(np.abs(poles - one).min() for one in exact))
     return StepPoles(
         apart, float(np.abs(rates).max()), float(np.abs(poles).max()), bool(np.abs(exact).max() <= 1 + 1e-9)
@@ -98,8 +99,6 @@ def advice(setting: str, plant: Plant, integrator: Integrator, step: float, plac
 def stiff_advice(grid: ReviewGrid, believed: np.ndarray, *, planned: bool) -> str:
     """Return what to change where a step of the horizon or of the simulated plant grows by itself; empty where none does."""
     problem, plant = grid.problem, grid.problem.plant
-    if plant.step is not None:
-        return ""
     try:
         place, horizon, cycle = first_place(grid, believed), problem.horizon, problem.integrator
         if (

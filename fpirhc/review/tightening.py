@@ -12,7 +12,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, with_margins
-from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue, NoAnswer, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.review.grid import each, review_grid
@@ -88,7 +88,7 @@ def state_margins(
             break
         if k + 1 == passes:
             amounts = ", ".join(f"'{e}' by {v:.2g}" for e, v in passed.items())
-            raise NotSupported(
+            raise NoAnswer(
                 f"no margins: after {passes} runs the plant still passes its limits ({amounts}); with tightened(passes=0) the "
                 "plans keep the predicted margins, and no run verifies them"
             )
@@ -119,7 +119,7 @@ def _beyond(problem: Problem, controller: Controller, exact: np.ndarray, seed: i
     controller.check(problem)
     run = simulate(replace(problem, plant=exactly(problem.plant, exact)), controller, seed=seed)
     if run.stop is not None:
-        raise NotSupported(f"no margins: the run that verifies them ended early: {run.stop}")
+        raise NoAnswer(f"no margins: the run that verifies them ended early: {run.stop}")
     lower, upper = problem.limits.state_bounds(problem.plant)
     states = run["state"][min(round(problem.measure_from / problem.period), run.cycles - 1) :]
     beyond = np.maximum(states - upper, lower - states).max(axis=0)
@@ -144,14 +144,14 @@ def _deviations(nominal: NominalRun, exact: np.ndarray) -> np.ndarray:
     states_next = each(advance, nominal.states[:-1], errors.command, rows, still)
     deviations = states_next - each(advance, nominal.states[:-1], own, believed, still)
     if not np.isfinite(deviations).all():
-        raise NotSupported("no margins: the predicted deviations do not stay finite")
+        raise NoAnswer("no margins: the predicted deviations do not stay finite")
     return np.asarray(deviations[min(round(problem.measure_from / problem.period), nominal.cycles - 1) :])
 
 
 def _reached(loop: LinearLoop, cycles: int, deviations: np.ndarray) -> np.ndarray:
     """Largest over k of the sum of |H_l d_(k-l)| over l < 1 ... cycles: shape (cycles, nx)."""
     if loop.radius >= 1:
-        raise NotSupported("no margins: the loop does not converge even with the right model")
+        raise NoAnswer("no margins: the loop does not converge even with the right model")
     after = loop.carried(loop.placed, cycles)[0]
     sums, total = [], np.zeros_like(deviations)
     for late, matrix in enumerate(after):

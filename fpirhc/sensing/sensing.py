@@ -87,7 +87,7 @@ def uncovered(
     missing = [n for n in estimator.measures(plant) if n not in measured]
     if named is not None and not measured:
         yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
-    elif observer is not None and named is None and not plant.outputs:
+    elif observer is not None and named is None and {*plant.state.elements} <= {*estimator.known(plant, measured)}:
         yield (
             f"observer: everything that {type(estimator).__name__} needs is measured; name what sensors show: "
             f"Sensing(measured={list(measured)!r}, ...)"

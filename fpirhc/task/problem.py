@@ -20,7 +20,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of
-from fpirhc.plant.motion import derivative_unit, followed, followed_units, with_exact_parameters, words
+from fpirhc.plant.motion import derivative_unit, disturbed, followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
 from fpirhc.sensing.sensing import Sensing
@@ -117,9 +117,8 @@ class Problem(Checked):
             mistakes.add(
                 f"disturbances: '{name}' names both an input and a coordinate; write 'input {name}' or 'coordinate {name}'"
             )
-        disturbed = [*self.disturbable, *shared]
-        what = "input, coordinate or output" if plant.outputs else "input or coordinate"
-        mistakes.unknown(f"disturbances: {what}", self.disturbances, disturbed)
+        names = [*self.disturbable, *shared]
+        mistakes.unknown(f"disturbances: {disturbed(plant)}", self.disturbances, names)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         checks = (

@@ -10,17 +10,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 import casadi as ca
-import numpy as np
 
-from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.motion import followed_units, sampling
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import GAP, Block, Delay, is_long
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.live import nominal, remembered
+from fpirhc.symbolic.live import remembered
 
 
 @dataclass(frozen=True)
@@ -220,30 +218,6 @@ def bumpless(s: Signals, gains: Sequence[float]) -> tuple[Expression, dict[str, 
     now = numbers(gains)
     factor = ca.if_else(now == 0, 1, s.integral_gain / ca.if_else(now == 0, 1, now))
     return factor * s._integral_before, {"integral_gain_next": now}
-
-
-def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
-    """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked.
-
-    Args:
-        law: for the message.
-        plant: that it acts on.
-        gains: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.
-
-    Raises:
-        InvalidValue: a pole z on or outside the unit circle.
-    """
-    if plant.step is None or not gains:
-        return
-    cycle = sampling(plant)
-    poles = 1 + cycle * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
-    if np.abs(poles).max() >= 1:
-        worst = complex(poles[int(np.abs(poles).argmax())])
-        shown = f"{worst.real:.3g}" if abs(worst.imag) < 1e-6 * abs(worst) else f"{worst:.3g}"
-        raise InvalidValue(
-            f"{law!r}: in the map's cycles of {cycle:g} {plant.time_unit} a mode of the error has the pole z = {shown} "
-            f"and does not decay; use a rate below {2 / cycle:g} 1/{plant.time_unit} ({1 / cycle:g} is deadbeat)"
-        )
 
 
 def error_signal(plant: Plant) -> Signal:

@@ -13,13 +13,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import GAP, Block, straightened
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import following, live_numbers, nominal, settled
-from fpirhc.tracking.base import ROOM, IntegralLaw, Useful, check_modes, error_chains, law_signals, own_errors
+from fpirhc.tracking.base import ROOM, IntegralLaw, Useful, error_chains, law_signals, own_errors
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default

@@ -17,6 +17,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Duration
+from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
@@ -27,7 +28,6 @@ from fpirhc.tracking.base import (
     IntegralLaw,
     Useful,
     bumpless,
-    check_modes,
     error_chains,
     gains_before,
     law_signals,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import InvalidField, InvalidName, InvalidShape, InvalidValue, NotSupported, nearest
+from fpirhc.errors import InvalidField, InvalidName, InvalidShape, InvalidValue, NoAnswer, nearest
 from fpirhc.problem_files.problem_file import load_problem
 
 TASK = load_problem("two_mass")
@@ -122,7 +122,7 @@ def test_deviations_whose_square_is_no_number_are_refused(make, deviation):
 def test_deviations_that_leave_no_digit_are_refused_by_name():
     """A hundred powers of ten apart the Riccati equation has no solution that numbers can hold."""
     wild = fp.DisturbanceKalman(drift={"q1": 1e90}, measured={"q1": 1e-90}, noise={"q2": 1.0})
-    with pytest.raises(NotSupported, match="no stationary gain makes the filter stable"):
+    with pytest.raises(NoAnswer, match="no stationary gain makes the filter stable"):
         fp.simulate(PROBLEM, fp.Estimating(CONTROLLER, wild), seed=0)
 
 

@@ -17,14 +17,14 @@ from fpirhc.controllers.contract import Undeformed, check_chains
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
-from fpirhc.plant.maps import step_of
+from fpirhc.plant.maps import check_modes, step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, total
 from fpirhc.symbolic.functions import exp, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import check_modes, error_chains, own_errors
+from fpirhc.tracking.base import error_chains, own_errors
 
 
 @dataclass(frozen=True)

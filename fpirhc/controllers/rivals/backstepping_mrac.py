@@ -16,13 +16,14 @@ from fpirhc.controllers.rivals.reference_model import decay_gains, model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
+from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import check_modes, error_chains
+from fpirhc.tracking.base import error_chains
 
 
 @dataclass(frozen=True)

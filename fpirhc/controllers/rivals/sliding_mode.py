@@ -15,13 +15,14 @@ from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
+from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import check_modes, error_chains
+from fpirhc.tracking.base import error_chains
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,17 @@ laws and deformations work in a slot as they do on a whole plant, or on the outp
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.check import refuse
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import form_inside
-from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, NotSupported, nearest
+from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.chain import require_rates
 from fpirhc.plant.lie_derivatives import output_expression, structural_order
@@ -103,7 +104,7 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
         raise NotInvertible(
             f"derivative {chain.order} of '{slot.coordinate}' is not affine in '{chain.input}', which a slot needs"
         )
-    _check_deformation(slot.deformation)
+    refuse(_against(slot.deformation))
     rest = np.zeros(plant.input.size)
     gain = float(chain.gain(problem.start_state, rest, plant.approximate))
     if not (np.isfinite(gain) and gain != 0):
@@ -111,9 +112,10 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
     return Channel(slot, chain, number, _light_plant(plant, chain), gain)
 
 
-def _check_deformation(deformation: Deformation) -> None:
+def _against(deformation: Deformation) -> Iterator[str]:
+    """Reasons against a deformation in a slot."""
     if not deformation.mirror.bare:
-        raise NotSupported(
+        yield (
             "ModelReferenced in a slot compares with the model's response of this instant; dead time and lag keep commands of "
             "earlier cycles, which belong to another slot after a switch; leave cycles, measurement and lag out"
         )
@@ -121,13 +123,13 @@ def _check_deformation(deformation: Deformation) -> None:
         pairs = deformation
         while pairs.inner is not None and pairs.inner.iteration.pairing is not None:
             pairs = pairs.inner
-        raise NotSupported(
+        yield (
             f"{type(pairs).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch; "
             "use the map itself"
         )
     outer = form_inside(deformation)
     if outer is not None:
-        raise NotSupported(
+        yield (
             f"{type(outer).__name__} around a model-referenced form: put it inside, ModelReferenced({type(outer).__name__}(map))"
         )
 

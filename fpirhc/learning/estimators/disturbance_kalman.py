@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NoAnswer, NotSupported
 from fpirhc.fields.kinds import Deviation, finite_number
 from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
 from fpirhc.plant.integrators import one_step
@@ -179,7 +179,7 @@ class DisturbanceKalman(ParameterEstimator):
             hint = (
                 f"give noise={{{noiseless[0]!r}: ...}}, or measure more states" if noiseless else "measure more states"
             )
-            raise NotSupported(f"DisturbanceKalman: no stationary gain makes the filter stable; {hint}")
+            raise NoAnswer(f"DisturbanceKalman: no stationary gain makes the filter stable; {hint}")
         return np.asarray(gain)
 
     def memory(self, problem: Problem) -> Layout:

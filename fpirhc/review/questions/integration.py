@@ -24,7 +24,7 @@ def discretisation_follows(grid: ReviewGrid) -> Answer | None:
 def stage_follows(grid: ReviewGrid, believed: np.ndarray, question: str) -> Answer | None:
     """Return the same for a model with the believed parameters, shape (np,)."""
     problem, plant = grid.problem, grid.problem.plant
-    if problem.horizon is None or plant.step is not None:
+    if problem.horizon is None or problem.horizon.discretisation.steps_maps:
         return None
     h, discretisation = problem.horizon.longest, problem.horizon.discretisation
     place = first_place(grid, believed)

@@ -9,6 +9,7 @@ from fpirhc.contraction.large_errors import least_product
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation
+from fpirhc.plant.maps import response_age
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.question import Case, ControllerQuestion
@@ -26,8 +27,6 @@ def fast_enough(case: Case) -> Answer | None:
     """Return the smallest a lambda beside the one that the plain form needs; None for other forms, unknown poles, and maps."""
     grid, controller = case.grid, case.controller
     law = law_of(grid, controller)
-    if grid.problem.plant.step is not None:
-        return None  # the linear loop of a map is exact
     if law is None or case.spectra is None or not controller.deformation.iteration.slows_desired:
         return None
     rate, poles = law
@@ -79,7 +78,7 @@ def bears_lag(case: Case) -> Answer | None:
     """
     grid = case.grid
     law, period, unit = law_of(grid, case.controller), grid.problem.period, grid.problem.time_unit
-    if law is None or case.spectra is None or grid.problem.response_delay > 0 or grid.problem.plant.step is not None:
+    if law is None or case.spectra is None or grid.problem.response_delay > 0:
         return None
     (rate, poles), product = law, _products(case)[1]
     longest = bearable_lag(product, period, rate, poles, damping=_DAMPING)
@@ -97,9 +96,12 @@ def bears_lag(case: Case) -> Answer | None:
 
 
 def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
-    """Return rate and number of poles of the tracking law for the most demanding coordinate; None where there is no such law."""
+    """Return rate and number of poles of the tracking law for the most demanding coordinate; None where there is no such law.
+
+    That of a map has no rate: its linear loop is exact.
+    """
     law, plant = tracking_law(controller), grid.problem.plant
-    laws = [law.feedback(plant.chains[n]) for n in plant.controlled_names] if law else []
+    laws = [law.feedback(plant.chains[n]) for n in plant.controlled_names] if law and not response_age(plant) else []
     known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]
     return max(known, key=lambda pair: pair[1]) if known else None
 

@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import resolved
-from fpirhc.errors import NotSupported
+from fpirhc.errors import NoAnswer, NotSupported
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 from fpirhc.simulation.linearise.linear_map import GAIN
 from fpirhc.simulation.linearise.slopes import Directions, Step, along, reached
@@ -194,7 +194,7 @@ class AskedLoop:
         """
         commands, n = passage.trace[:, self._command], self.repeats
         if len(commands) <= n + 1:
-            raise NotSupported("the loop's run does not stay finite in its first cycles")
+            raise NoAnswer("the loop's run does not stay finite in its first cycles")
         inside = self._inside(commands)
         sizes = np.maximum(np.abs(commands).max(axis=0), 1e-300)
         change = (np.abs(commands[n:] - commands[:-n]) / sizes).max(axis=1)
@@ -276,10 +276,10 @@ class AskedLoop:
             if np.array_equal(memory_next[self._phases], memory[self._phases]):
                 return memories
             if not np.isfinite(memory_next).all():
-                raise NotSupported("the loop's run does not stay finite from one plan to the next")
+                raise NoAnswer("the loop's run does not stay finite from one plan to the next")
             phases = memory_next[self._phases].tobytes()
             if phases in passed:  # a cycle that is skipped for ever
-                raise NotSupported("the loop's run does not come to its next plan")
+                raise NoAnswer("the loop's run does not come to its next plan")
             memories.append(memory_next)
             passed.add(phases)
 

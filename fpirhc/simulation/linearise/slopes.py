@@ -13,7 +13,7 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported
+from fpirhc.errors import NoAnswer, NotSupported
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 
@@ -234,4 +234,4 @@ def _derivative(function: ca.Function) -> ca.Function:
 def _finite(*slopes: np.ndarray) -> None:
     """Raise if a slope is not finite."""
     if not all(np.isfinite(m).all() for m in slopes):
-        raise NotSupported("the loop has no finite slope at a point of its run")
+        raise NoAnswer("the loop has no finite slope at a point of its run")
