@@ -6,14 +6,14 @@ The theorem with its proof, and what it does not cover: docs/certificate.md.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import refuse
 from fpirhc.controllers.contract import resolved, tracking_law, with_margins
-from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count
 from fpirhc.plant.mismatch import exact_ranges
@@ -63,11 +63,11 @@ class LimitsCertificate:
         return not self.failures
 
     def __repr__(self) -> str:
-        verdict = "holds" if self.holds else "fails: " + "; ".join(self.failures)
+        if not self.error:
+            return line(self, f"fails: {'; '.join(self.failures)}")
+        verdict = "holds" if self.holds else f"fails: {'; '.join(self.failures)}"
         errors = ", ".join(f"{name} {value:.3g}" for name, value in self.error.items())
-        return line(
-            self, verdict, f"contraction {self.contraction:.3g}", f"response error at most {errors or 'unknown'}"
-        )
+        return line(self, verdict, f"contraction {self.contraction:.3g}", f"response error at most {errors}")
 
 
 @checked_call
@@ -101,7 +101,7 @@ def certify_limits(
     boxes = _pieces(box, pieces)
     believed = ready.plant_model(problem).parameters(problem.plant)
     functions, chains = expressions(problem.plant, believed), Chains(problem.plant, problem.period, law)
-    margins = dict.fromkeys(_hard(problem), 0.0)
+    given, more = _margins(problem, ready), dict.fromkeys(_hard(problem), 0.0)
     for k in range(passes):
         ready.check(problem)
         tubes = _tubes(problem, ready, boxes, functions, chains, believed)
@@ -109,11 +109,21 @@ def certify_limits(
         over = _over(problem, certificate.lower, certificate.upper)
         if not over or ready.planner is None or problem.horizon is None or k + 1 == passes:
             break
-        margins = {name: margin + _MORE * over.get(name, 0.0) for name, margin in margins.items()}
+        more = {name: own + _MORE * over.get(name, 0.0) for name, own in more.items()}
+        margins = {**given, **{name: tuple(m + own for m in given[name]) for name, own in more.items()}}
         if _leaves_nothing(problem, margins):
             break
-        ready = with_margins(ready, {name: (margin,) * problem.horizon.stages for name, margin in margins.items()})
+        ready = with_margins(ready, margins)
     return certificate
+
+
+def _margins(problem: Problem, ready: Controller) -> dict[str, tuple[float, ...]]:
+    """The margins that plans already keep, and zero for every other hard limit of a state; empty without plans."""
+    if ready.planner is None or problem.horizon is None:
+        return {}
+    own = problem.horizon.margins if ready.planner.margins is None else ready.planner.margins
+    none = dict.fromkeys(_hard(problem), (0.0,) * problem.horizon.stages)
+    return none | {name: tuple(values) for name, values in own.items()}
 
 
 def _covered_law(problem: Problem, ready: Controller) -> Tracking:
@@ -122,34 +132,42 @@ def _covered_law(problem: Problem, ready: Controller) -> Tracking:
     Raises:
         NotSupported: everything that it does not cover.
     """
-    check_prediction(problem, ready)
-    plant, planner, deformation = problem.plant, ready.planner, ready.deformation
-    mirror, own = deformation.mirror, deformation.memory(plant.controlled_names)
-    iterates = mirror is not None and not (np.any(mirror.cycles) or mirror.measurement or mirror.lags)
-    linear = deformation.largest_step() == np.inf and deformation.secant_gain() == deformation.effective_gain()
-    law = tracking_law(ready) if planner is None else planner.tracking
-    equations = not plant.outputs and plant.step is None and plant.equations.affine
-    reasons = {
-        "the plant is a map, has outputs, or its response is not affine in the inputs": not equations,
-        "there are disturbances": bool(problem.disturbances),
-        "state or response are estimated or noisy": not problem.sensing.ideal,
-        "the deformation must be ModelReferenced(Affine(...)) without dead time, lag or filter": not (
-            iterates and linear and own.size == len(plant.controlled_names)
-        ),
-        "its plans start from the measured state; use RecedingHorizon(..., replanning=FromPlan(law, room=...))": planner
-        is not None
-        and planner.restarts,
-        "its plans depend on the plant; say what they leave for feedback, FromPlan(law, room={...})": planner
-        is not None
-        and not planner.restarts
-        and not planner.independent,
-        "it has no tracking law": law is None,
-    }
-    for reason, holds in reasons.items():
-        if holds:
-            raise NotSupported(f"no certificate for {type(ready).__name__}: {reason}")
+    check_prediction(problem, ready, "certificate")
+    refuse(f"no certificate for {type(ready).__name__}: {reason}" for reason in _against(problem, ready))
+    law = tracking_law(ready) if ready.planner is None else ready.planner.tracking
     assert law is not None
     return law
+
+
+def _against(problem: Problem, ready: Controller) -> Iterator[str]:
+    """What the theorem does not cover."""
+    plant, planner = problem.plant, ready.planner
+    if plant.outputs or plant.step is not None or not plant.equations.affine:
+        yield "the plant is a map, has outputs, or its response is not affine in the inputs"
+    if problem.disturbances:
+        yield "there are disturbances"
+    if not problem.sensing.ideal:
+        yield "state or response are estimated or noisy"
+    if ready.plant_model(problem).exact:
+        yield "its model has the exact parameters of every plant, so there is no box to be certified"
+    if not _iterates(problem, ready):
+        yield "the deformation must be ModelReferenced(Affine(...)) without dead time, lag or filter"
+    if planner is not None and planner.restarts:
+        yield "its plans start from the measured state; use RecedingHorizon(..., replanning=FromPlan(law, room=...))"
+    if planner is not None and not planner.independent:
+        yield "its plans depend on the plant; say what they leave for feedback, FromPlan(law, room={...})"
+    if planner is None and tracking_law(ready) is None:
+        yield "it has no tracking law"
+
+
+def _iterates(problem: Problem, ready: Controller) -> bool:
+    """Whether the deformation is the recursion of the theorem, by its facts; the run shows whether it is."""
+    deformation, names = ready.deformation, problem.plant.controlled_names
+    mirror = deformation.mirror
+    if mirror is None or np.any(mirror.cycles) or mirror.measurement or mirror.lags:
+        return False
+    linear = deformation.largest_step() == np.inf and deformation.secant_gain() == deformation.effective_gain()
+    return linear and deformation.memory(names).size == len(names)
 
 
 def _hard(problem: Problem) -> list[str]:
@@ -188,7 +206,7 @@ def _tubes(
             return centre
         sweep = Sweep(functions, chains, centre, believed, float(ready.deformation.effective_gain()))
         if sweep.residual > _AGREES:
-            return _other_recursion(centre)
+            return f"{_of(lower, upper)} does not follow the recursion of the theorem: its deformation is another one"
         tube = sweep.tube()
         if isinstance(tube, str):
             return f"{tube}; a smaller mismatch, more pieces, a shorter period or another gain may mend it"
@@ -196,20 +214,21 @@ def _tubes(
     return tubes
 
 
-def _other_recursion(centre: Centre) -> str:
-    parameters = np.array2string(centre.parameters, precision=4)
-    return (
-        f"the run with the exact parameters {parameters} clips commands, or its deformation is not the recursion of the theorem; "
-        "more room, or wider limits of inputs"
-    )
-
-
 def _centre(problem: Problem, loop: Simulator, lower: np.ndarray, upper: np.ndarray) -> Centre | str:
-    parameters = 0.5 * (lower + upper)
-    run = loop.run(seed=0, variant=replace(problem, plant=exactly(problem.plant, parameters)))
+    plant = exactly(problem.plant, 0.5 * (lower + upper))
+    longer = problem.duration + problem.period  # so that the end of the last cycle is there
+    run = loop.run(seed=0, variant=replace(problem, plant=plant, duration=longer))
     if run.stop is not None:
-        return f"the run with the exact parameters {np.array2string(parameters, precision=4)} ends early: {run.stop}"
+        return f"{_of(lower, upper)} ends early: {run.stop}"
+    if run["clipped"].any():
+        when = problem.period * int(np.argmax(run["clipped"].ravel() > 0))
+        wanted = "wider limits of inputs, more room of FromPlan or a slower law may mend it"
+        return f"{_of(lower, upper)} clips a command at t = {when:g} {problem.time_unit}; {wanted}"
     return Centre(run["state"].T, run["command"].T, run["desired"].T, lower, upper)
+
+
+def _of(lower: np.ndarray, upper: np.ndarray) -> str:
+    return f"the run with the exact parameters {np.array2string(0.5 * (lower + upper), precision=4)}"
 
 
 def _certificate(
@@ -275,7 +294,7 @@ def _beyond_states(problem: Problem, lower: np.ndarray, upper: np.ndarray) -> li
     return failures
 
 
-def _leaves_nothing(problem: Problem, margins: Mapping[str, float]) -> bool:
+def _leaves_nothing(problem: Problem, margins: Mapping[str, Sequence[float]]) -> bool:
     lower, upper = problem.limits.state_bounds(problem.plant)
     places = {e: k for k, e in enumerate(problem.plant.state.elements)}
-    return any(2 * m >= upper[places[e]] - lower[places[e]] for e, m in margins.items())
+    return any(2 * max(m) >= upper[places[e]] - lower[places[e]] for e, m in margins.items())

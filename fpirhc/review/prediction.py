@@ -218,31 +218,31 @@ def exactly(plant: Plant, values: np.ndarray) -> Plant:
 _EXACT: Latest[Plant] = Latest(8)
 
 
-def check_prediction(problem: Problem, controller: Controller) -> None:
+def check_prediction(problem: Problem, controller: Controller, what: str = "prediction") -> None:
     """Raise where the response does not belong to the last request of one model and one map.
 
     Raises:
         NotSupported: see `nominal_run`.
     """
-    refuse(_against(problem, controller))
+    refuse(_against(problem, controller, what))
 
 
-def _against(problem: Problem, controller: Controller) -> Iterator[str]:
-    """Reasons against a prediction."""
+def _against(problem: Problem, controller: Controller, what: str) -> Iterator[str]:
+    """Reasons against it."""
     follows = tracking_law(controller) is not None or controller.planner is not None
     if controller.learns or controller.feeds or controller.deforms != "response" or not follows:
         yield (
-            f"no prediction for {type(controller).__name__}: it needs a controller that tracks or plans with one model and one "
+            f"no {what} for {type(controller).__name__}: it needs a controller that tracks or plans with one model and one "
             "map, and is given the measured state"
         )
     if problem.reality is not None:
         yield (
-            "no prediction beside a reality, whose response may not see the command at once; that of the model alone is that of "
+            f"no {what} beside a reality, whose response may not see the command at once; that of the model alone is that of "
             "problem.of_model"
         )
     if problem.signals:
-        yield ("no prediction with signals from outside, which change along the run; simulate it")
+        yield f"no {what} with signals from outside, which change along the run; simulate it"
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
     if late or problem.sensing.delay(problem.plant, problem.period):
-        what = "dead time" if late else "an estimated response"
-        yield (f"no prediction with {what}: the response must belong to the last request")
+        lateness = "dead time" if late else "an estimated response"
+        yield f"no {what} with {lateness}: the response must belong to the last request"

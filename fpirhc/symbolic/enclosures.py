@@ -7,7 +7,8 @@ intervals that contain zero. An affine form keeps what moves together,
 
 and every operation of the expanded Function maps forms to a form that contains all its values: sums are exact, products add
 the product of the radii to e, and a curved function is its tangent plus the bound of its second derivative. Every operation also
-adds the bound of its rounding. The excess of the bounds is quadratic in the width of the box.
+adds the bound of its rounding. The excess of the bounds is quadratic in the width of the box. Comparisons and signs have bounds
+where they are decided all over the box, because bounds by derivatives do not see a jump.
 
 Source: L. H. de Figueiredo, J. Stolfi, Affine arithmetic: concepts and applications, Numerical Algorithms 37, 2004.
 """
@@ -186,9 +187,37 @@ def _smaller(a: Form, b: Form) -> Form:
     return _negative(_larger(_negative(a), _negative(b)))
 
 
+def _decided(yes: np.ndarray, no: np.ndarray, like: Form) -> Form:
+    """One where it is sure, zero where it is sure not; else not a number: a function may jump there, which no derivative shows."""
+    number = np.where(yes, 1.0, np.where(no, 0.0, np.nan))
+    return Form(number, np.zeros_like(like.slopes), np.zeros_like(number))
+
+
 def _sign(a: Form) -> Form:
     low, high = a.ends
-    return _between(np.sign(low), np.sign(high), a)
+    positive = _decided(low > 0, high < 0, a)
+    return Form(2 * positive.centre - 1, positive.slopes, positive.spread)
+
+
+def _less(a: Form, b: Form) -> Form:
+    (low_a, high_a), (low_b, high_b) = a.ends, b.ends
+    return _decided(high_a < low_b, low_a > high_b, a)
+
+
+def _not(a: Form) -> Form:
+    return Form(1 - a.centre, a.slopes, a.spread)
+
+
+def _either(a: Form, b: Form) -> Form:
+    """Of two decided truths."""
+    return Form(np.maximum(a.centre, b.centre), a.slopes, a.spread)
+
+
+def _chosen(condition: Form, value: Form) -> Form:
+    """The value where the condition holds, else zero."""
+    yes = condition.centre != 0.0
+    known = np.where(np.isnan(condition.centre), np.nan, 0.0)
+    return Form(*(np.where(yes, entry, 0.0) + known for entry in (value.centre, value.slopes, value.spread)))
 
 
 def _power(a: Form, b: Form) -> Form:
@@ -225,6 +254,12 @@ _RULES: dict[int, Callable[..., Form]] = {
     ca.OP_ATAN: _curved(np.arctan, lambda c: 1 / (1 + c * c), _of_size(0.65)),
     ca.OP_FABS: lambda a: _larger(a, _negative(a)),
     ca.OP_SIGN: _sign,
+    ca.OP_LT: _less,
+    ca.OP_LE: _less,
+    ca.OP_NOT: _not,
+    ca.OP_AND: _product,
+    ca.OP_OR: _either,
+    ca.OP_IF_ELSE_ZERO: _chosen,
     ca.OP_FMIN: _smaller,
     ca.OP_FMAX: _larger,
     ca.OP_POW: _power,

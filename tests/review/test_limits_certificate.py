@@ -172,8 +172,22 @@ def test_a_reference_is_certified_too_and_the_tube_vanishes_with_the_period():
     for period in (0.01, 0.005, 0.0025):
         stated = fp.certify_limits(*pushed(period), mismatch=5)
         assert stated.holds, stated
+        assert len(stated.lower) == round(3.0 / period)  # every cycle of the run, to its end
         tubes.append(stated.tube["q'"])
     assert all(0.35 < later / before < 0.55 for before, later in pairwise(tubes))
+
+
+def test_margins_of_a_controller_are_kept_and_widened():
+    """Those that it has are the least; only limits that may be passed need more."""
+    problem, controller = task("body")
+    own = replace(controller, margins={"w1": (0.05,) * 30, "w2": (0.0,) * 30})
+    stated = fp.certify_limits(replace(problem, duration=1.0), own, mismatch=5)
+    assert stated.holds
+    planner = stated.controller.planner
+    assert planner is not None
+    assert planner.margins is not None
+    assert min(planner.margins["w1"]) >= 0.05
+    assert max(planner.margins["w2"]) < 0.05
 
 
 def test_what_fails_is_named_with_its_amount():
@@ -183,7 +197,7 @@ def test_what_fails_is_named_with_its_amount():
     assert not stated.holds
     assert "may pass its limits (-0.9, 0.9) by" in " ".join(stated.failures)
     clipped = replace(problem, limits=fp.Limits(inputs={"F": (-1.0, 1.0)}))
-    assert "clips commands" in fp.certify_limits(clipped, controller, mismatch=5).failures[0]
+    assert "clips a command at t = " in fp.certify_limits(clipped, controller, mismatch=5).failures[0]
     low, high = fp.certify_limits(problem, controller, mismatch=20).commands["F"]
     tight = replace(problem, limits=fp.Limits(inputs={"F": (low + 0.1, high)}))
     assert re.search("input 'F' may need .* by 0.1;", fp.certify_limits(tight, controller, mismatch=20).failures[0])
@@ -216,6 +230,8 @@ def test_what_the_theorem_does_not_cover_is_refused():
             fp.certify_limits(problem, one, mismatch=5)
     with pytest.raises(NotSupported, match="disturbances"):
         fp.certify_limits(replace(problem, disturbances={"q": fp.Noise(0.1)}), controller, mismatch=5)
+    with pytest.raises(NotSupported, match="exact parameters of every plant"):
+        fp.certify_limits(problem, fp.ExactModel(controller), mismatch=5)
     tanks, planned = task("tanks")
     with pytest.raises(NotSupported, match="FromPlan"):
         fp.certify_limits(tanks, replace(planned, replanning=fp.FromMeasurement()), mismatch=5)

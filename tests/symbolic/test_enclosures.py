@@ -19,7 +19,8 @@ VALUES = {
     "exponential": ca.exp(a) * ca.log(5 + b) + ca.tanh(c),
     "roots": ca.sqrt(4 + a) + (5 + b) ** 1.5 + (4 + a) ** -2 + ca.atan(c),
     "power of two arguments": (4 + a) ** b,
-    "sides": ca.fabs(a) + ca.fmax(b, c) - ca.fmin(a, c) + ca.sign(b),
+    "sides": ca.fabs(a) + ca.fmax(b, c) - ca.fmin(a, c),
+    "cases": ca.if_else(ca.logic_or(a < b, c > 1), ca.sin(a), 2 + b) + ca.sign(b) * c,
     "flow": fp.signed_power(3 + a - 0.5 * b, 0.5),
 }
 
@@ -42,7 +43,7 @@ def test_no_value_is_outside(name, radius):
         assert (values <= bounds.upper).all()
 
 
-@pytest.mark.parametrize("name", [n for n in VALUES if n != "sides"])
+@pytest.mark.parametrize("name", [n for n in VALUES if n not in ("sides", "cases")])
 def test_the_excess_is_quadratic_in_the_width(name):
     """Against the range to first order, sum_i |df/dx_i| radius."""
     slopes = Enclosure(ca.jacobian(VALUES[name], X), X)
@@ -69,6 +70,15 @@ def test_bounds_are_infinite_where_a_function_is_not_defined():
     bounds = Enclosure(ca.vertcat(1 / a, ca.log(a), ca.sqrt(a)), X).over(Box(-np.ones((3, 1)), np.ones((3, 1))))
     assert np.isinf(bounds.lower).all()
     assert np.isinf(bounds.upper).all()
+
+
+def test_where_a_function_may_jump_there_are_no_bounds():
+    """A derivative does not contain the jump, so a bound by derivatives would be false; where the case is sure there are bounds."""
+    values = (ca.sign(a), ca.if_else(a < 0.1, b, c), (a <= 0) * b)
+    at_the_jump, beside = (Box(np.full((3, 1), low), np.full((3, 1), low + 0.4)) for low in (-0.2, 0.3))
+    for value in values:
+        assert np.isinf(Enclosure(value, X).over(at_the_jump).upper).all()
+        assert np.isfinite(Enclosure(value, X).over(beside).upper).all()
 
 
 def test_an_operation_without_a_rule_is_named():
