@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Literal, NoReturn, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -388,8 +388,27 @@ def with_margins(controller: Controller, margins: Mapping[str, Sequence[float]])
 def _replaceable(controller: _Own, name: str, value: object, what: str) -> _Own:
     changed = with_setting(controller, name, value)
     if changed is None:
-        raise NotSupported(f"{type(innermost(controller)).__name__} has no {what}")
+        refuse_without(controller, what)
     return changed
+
+
+def refuse_without(controller: Controller, what: str) -> NoReturn:
+    """Raise, because the controller lacks what a question or a change is about.
+
+    Raises:
+        NotSupported: always, with what it lacks.
+    """
+    raise NotSupported(f"{type(innermost(controller)).__name__} has no {what}")
+
+
+def require_controlled_response(problem: Problem, controller: Controller, refusal: str) -> None:
+    """Raise where a controller reads other responses than those of the plant's controlled quantities.
+
+    Raises:
+        NotSupported: with the refusal.
+    """
+    if controller.response(problem) is not None:
+        raise NotSupported(refusal)
 
 
 def innermost(controller: Controller) -> Controller:

@@ -97,6 +97,38 @@ def over(plant: _Motion, cycle: float) -> _Motion:
     return plant if count == plant.steps else replace(plant, steps=count)
 
 
+def unlike(plant: Motion, model: Motion) -> str:
+    """Return how a plant moves otherwise than a model; empty where both step, or neither."""
+    if (plant.step is None) == (model.step is None):
+        return ""
+    return "differential equations, and the model is a map" if plant.step is None else "steps, and the model has none"
+
+
+def check_time(plant: Motion, model: Motion, orders: Mapping[str, int], mistakes: Mistakes, *, at_once: bool) -> None:
+    """Add to `mistakes` where one of model and reality steps and the other does not, and a response needs both alike.
+
+    Args:
+        plant: the reality's.
+        model: of the problem.
+        orders: of the model's outputs.
+        mistakes: of the problem.
+        at_once: whether the command moves everything controlled at once, so that no derivative is looked for.
+    """
+    if not unlike(plant, model):
+        return
+    later = [name for name, order in orders.items() if order > 1]
+    if model.step is None and not at_once:
+        mistakes.add(
+            "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write "
+            "the model as a map with the same step"
+        )
+    elif model.step is not None and later:
+        mistakes.add(
+            f"reality: '{later[0]}' has the order {orders[later[0]]} in the model's steps, and the reality has "
+            "differential equations, in which every input shows within one cycle; write a model in which it does too"
+        )
+
+
 def shifted(plant: Motion, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX, ca.SX]) -> Expression:
     """Return the divided difference of an expression of the state over one control cycle.
 

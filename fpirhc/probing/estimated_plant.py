@@ -121,13 +121,9 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
         answers = model.equations.controlled_response(x, inputs, parameters)
         matrix = ca.blockcat([[p[gain_name(i, j)] for j in range(count)] for i in range(count)])
         wanted = matrix @ answers + (ca.vertcat(*(p[name] for name in signals)) if signals else 0)
-        if model.outputs:
-            inputs = model.equations.inverse(x, wanted, parameters)
+        inputs = model.equations.inverse(x, wanted, parameters)
         own = Named(tuple(known), parameters, "parameter")
-        moved = dict(model.response(*derivatives, Named(tuple(model.inputs), inputs, "input"), own))
-        if not model.outputs:
-            moved |= dict(zip(model.controlled_names, ca.vertsplit(wanted), strict=True))
-        return moved
+        return dict(model.response(*derivatives, Named(tuple(model.inputs), inputs, "input"), own))
 
     vars(response)["__signature__"] = inspect.signature(model.response)
     plant = replace(model, parameters={**known, **added, **courses}, response=response, inverse=None)

@@ -183,7 +183,8 @@ def _carrying(reality: Reality, model: Plant) -> Carrying | None:
     """
     plant, names = reality.plant, model.names
     count, rest = divmod(plant.state.size, len(names))
-    if model.outputs or rest or len(model.controlled_names) != len(names) or len(plant.inputs) != len(names):
+    on_reference = model.equations.known_by_outputs == tuple(range(model.state.size))
+    if not on_reference or rest or len(model.controlled_names) != len(names) or len(plant.inputs) != len(names):
         return None
     if min(model.orders) != max(model.orders) or count < max(model.orders):
         return None

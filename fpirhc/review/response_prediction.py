@@ -10,7 +10,7 @@ import numpy as np
 from fpirhc.by_name import ByName
 from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.contract import refuse_without, resolved
 from fpirhc.errors import NoAnswer, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -115,7 +115,7 @@ def predict_response(
     if mismatch is not None:
         check_mismatch(problem.plant, mismatch)
     if resolved(problem, controller).deformation.effective_gain() == 0:
-        raise NotSupported(f"{type(controller).__name__} has no deformation whose effect could be predicted")
+        refuse_without(controller, "deformation whose effect could be predicted")
     nominal = nominal_run(problem, controller, compiled=compiled)
     adapted = response_errors(nominal)
     widest, reason = _widest(nominal, adapted, mismatch, seed)

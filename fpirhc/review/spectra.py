@@ -108,7 +108,7 @@ def largest_product(problem: Problem, deformation: Deformation, eigenvalues: np.
     if not any(late) and not (pairing and pairing.cycles):
         return _LIMIT
     own = (pairing.channels or (pairing.cycles or 0.0,) * len(late)) if pairing else (0.0,) * len(late)
-    sizes = np.array([1.0]) if eigenvalues is None or not deformation.mirror.referenced else np.abs(eigenvalues)
+    sizes = np.array([1.0]) if eigenvalues is None else np.abs(eigenvalues)
     extremes = {float(sizes.min()), float(sizes.max())}
     return min(_limit(deformation, *pair, size) for pair in set(zip(late, own, strict=True)) for size in extremes)
 

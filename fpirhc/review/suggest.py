@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.by_name import FoundByName
 from fpirhc.contraction.spectrum import Array, response_jacobians
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.controllers.contract import refuse_without, resolved, without_deformation
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, NotContractive, NotSupported, nearest
@@ -140,9 +140,7 @@ def _harm(problem: Problem, controller: Controller, deformation: Deformation) ->
 
 def _check(controller: Controller, ringing: float) -> None:
     if controller.deformation.effective_gain() == 0:
-        raise NotSupported(
-            f"{type(controller).__name__} has no deformation to choose a gain for; give it Sigmoid(gain=...)"
-        )
+        refuse_without(controller, "deformation to choose a gain for; give it Sigmoid(gain=...)")
     if not (math.isfinite(ringing) and ringing >= 0):
         raise InvalidValue(
             f"suggest(ringing={ringing!r}): expected a number of at least 0; 4 to 8 is usual, 0 is no filter"

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved, with_margins
-from fpirhc.errors import InvalidProblem, InvalidValue, NoAnswer, NotSupported
+from fpirhc.controllers.contract import refuse_without, resolved, with_margins
+from fpirhc.errors import InvalidProblem, InvalidValue, NoAnswer
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.review.grid import each, review_grid
@@ -101,7 +101,7 @@ def _predicted(problem: Problem, controller: Controller, plants: np.ndarray, wid
     ready = resolved(problem, controller)
     hard = [e for e in problem.limits.states if e not in problem.limits.soft and e not in problem.limits.prices]
     if ready.planner is None or problem.horizon is None:
-        raise NotSupported(f"{type(controller).__name__} does not plan over a horizon, so no plan can keep a margin")
+        refuse_without(controller, "plan that could keep margins")
     if not hard:
         raise InvalidProblem("no margins: the problem has no hard limits of states; name them in Limits(states=...)")
     nominal = nominal_run(problem, controller)

@@ -18,7 +18,7 @@ from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.chain import derivatives_function, input_reaches_at, relative_order
 from fpirhc.plant.integrators import Integrator, stiffness
-from fpirhc.plant.maps import over
+from fpirhc.plant.maps import check_time, over, unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
@@ -113,19 +113,7 @@ class Reality(Checked):
             mistakes: of the problem.
             at_once: whether the command moves everything controlled at once, so that no derivative is looked for.
         """
-        if (self.plant.step is None) == (model.step is None):
-            return
-        later = [name for name, order in model.chains.items() if order > 1]
-        if model.step is None and not at_once:
-            mistakes.add(
-                "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write "
-                "the model as a map with the same step"
-            )
-        elif model.step is not None and later:
-            mistakes.add(
-                f"reality: '{later[0]}' has the order {model.chains[later[0]]} in the model's steps, and the reality has "
-                "differential equations, in which every input shows within one cycle; write a model in which it does too"
-            )
+        check_time(self.plant, model, model.chains, mistakes, at_once=at_once)
 
     def check(self, model: Plant, needed: Collection[str] | None = None, measured: Collection[str] = ()) -> None:  # noqa: ARG002
         """Raise if the reality cannot stand for what the model describes.
@@ -287,8 +275,8 @@ class Reality(Checked):
             differences = ["its coordinates in another order"]
         if plant.output.elements != model.output.elements:
             differences.append("other outputs")
-        if (plant.step is None) != (model.step is None):
-            differences.append("differential equations, and the model is a map")
+        if unlike(plant, model):
+            differences.append(unlike(plant, model))
         if not differences and tuple(plant.controlled or plant.chains) != model.controlled_names:
             differences = [
                 f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"

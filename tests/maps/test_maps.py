@@ -334,3 +334,24 @@ def test_a_cascade_on_a_map_iterates_on_its_target() -> None:
         for c in (fp.ComputedTorque(law), cascade)
     )
     assert deformed < 0.1 * plain
+
+
+@pytest.mark.parametrize(("steps", "words"), [(True, "steps, and the model has none"), (False, "the model is a map")])
+def test_the_exact_model_is_refused_with_the_time_that_each_has(steps: bool, words: str) -> None:
+    """A plant that steps is no exact model of one that flows, nor the other way round, and the sentence says which is which."""
+    common: dict[str, Any] = {
+        "states": {"a": "1"},
+        "inputs": {"u": "1"},
+        "parameters": {"k": fp.Parameter(0.1, 0.2, "1")},
+    }
+    stepping = fp.Plant.discrete(**common, next=lambda x, u, p: {"a": p.k * x.a + u.u}, step=1.0)
+    flowing = fp.Plant(
+        coordinates=common["states"],
+        inputs=common["inputs"],
+        parameters=common["parameters"],
+        response=lambda x, u, p: {"a": p.k * x.a + u.u},
+        order=1,
+    )
+    reality, model = (stepping, flowing) if steps else (flowing, stepping)
+    with pytest.raises(NotSupported, match=f"the reality has .*{words}.*leave ExactModel out"):
+        fp.Reality(reality).as_model(model)

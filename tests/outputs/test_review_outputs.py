@@ -12,6 +12,7 @@ from test_outputs import ARM, TRACK, arm, circle, curve, hill, planned, sedated,
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotContractive
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
@@ -144,3 +145,15 @@ def test_a_plan_on_the_hand_of_an_arm_has_a_linear_loop() -> None:
     assert loops.radii.max() < 1
     bare = loops_along(review_grid(problem, 0.0, 0), fp.ComputedTorque(TRACK))
     assert not bare.reason
+
+
+def test_a_gain_of_the_wrong_sign_is_answered_and_not_refused() -> None:
+    """The loop of such a gain is judged as that of a plant with coordinates is: it fits the problem, and its gain does not."""
+    wrong = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2), fp.Affine(1.5))
+    every = answers(planned(), wrong)
+    assert not [q for q in every if "fit the problem" in q]
+    admissible = every["Is the map's gain admissible?"]
+    assert admissible.verdict is Verdict.NO
+    assert "gain = 1.5; the smallest limit is -" in admissible.evidence
+    with pytest.raises(NotContractive):
+        simulated(planned(), wrong)

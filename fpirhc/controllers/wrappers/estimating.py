@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, command_before, like
-from fpirhc.controllers.contract import ControllerWrapper, Planner, with_setting
+from fpirhc.controllers.contract import ControllerWrapper, Planner, require_controlled_response, with_setting
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.errors import NotSupported
@@ -87,10 +87,11 @@ class Estimating(ControllerWrapper):
                 f"{type(self.estimator).__name__} learns from the response, which needs {', '.join(lost)}, and no sensor shows it; "
                 "measure it, or use a DisturbanceKalman that measures states alone"
             )
-        if self.controller.response(modelled) is not None:
-            raise NotSupported(
-                f"Estimating needs the response of the controlled coordinates; {type(self.controller).__name__} reads another"
-            )
+        require_controlled_response(
+            modelled,
+            self.controller,
+            f"Estimating needs the response of the controlled coordinates; {type(self.controller).__name__} reads another",
+        )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         modelled = self.inner_problem(problem)

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, like
-from fpirhc.controllers.contract import ControllerWrapper
+from fpirhc.controllers.contract import ControllerWrapper, require_controlled_response
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.reference_states import own_signals
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
@@ -209,10 +209,12 @@ class Predicted(ControllerWrapper):
         """
         self.controller.check(problem)
         self.by.check(problem.plant)
-        if self.controller.response(problem) is not None and self.by != ByModel():
-            raise NotSupported(
+        if self.by != ByModel():
+            require_controlled_response(
+                problem,
+                self.controller,
                 f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
-                f"{type(self.controller).__name__} reads others; use by=ByModel()"
+                f"{type(self.controller).__name__} reads others; use by=ByModel()",
             )
         if self._length(problem) > MOST:
             raise InvalidValue(f"Predicted: {self._length(problem)} cycles of dead time, more than {MOST}")

@@ -68,9 +68,7 @@ PLAIN, INCREMENT, REFERENCED = "plain", "increment", "model-referenced"
 def map_inside(deformation: Deformation) -> Deformation:
     """Return the map inside a form: without pairing, increment and model reference."""
     map_ = deformation
-    while map_.inner is not None and (
-        map_.mirror.referenced or map_.iteration.pairing is not None or not map_.iteration.slows_desired
-    ):
+    while map_.inner is not None and (map_.iteration.pairing is not None or not map_.iteration.slows_desired):
         map_ = map_.inner
     return map_
 

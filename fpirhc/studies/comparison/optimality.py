@@ -15,6 +15,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.fixed_point import FixedPoint
+from fpirhc.plant.chain import measured_signals
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.summary import written_out
@@ -68,7 +69,8 @@ def measure_optimality(
         return None
     if ready.learns or "parameters" in feeds or own_signals(problem):
         return None
-    times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
+    read = ("time", "state", problem.plant.output.name)
+    times, states, seen = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in read)
     plant_model = ready.plant_model(problem)
     model, known = plant_model.plant, plant_model.signals
     other = (
@@ -87,7 +89,8 @@ def measure_optimality(
     except FpirhcError:
         return None
     data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost, signals=ahead)
-    of_measured = shifted_reference(planned.plant, ocp.data, ocp.stages + 1) if planned.plant.outputs else None
+    beside = measured_signals(planned.plant)[1:]  # outputs that are given beside the state
+    shifts = [shifted_reference(planned.plant, ocp.data, ocp.stages + 1) for _ in beside]
     offset = offset_limits(planned.plant, planned.horizon, ocp.data) if planned.horizon.measured else None
     begin = consistent_state(planned.plant) if planner.starts_consistent(planned.plant) else None
     stride = cycles_per_plan(problem.horizon, problem.period)
@@ -95,7 +98,6 @@ def measure_optimality(
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
     times = np.ravel(times)
     parameters = rows_of(model_values(model, known), times + problem.period / 2, plant_model.parameters(model))
-    seen = run[feeds["output"] if feeds.get("output") in run.layout.names else "output"] if of_measured else states
     excess, stuck = [], []
     for row in rows:
         shift = run["command_shift"][row - 1]
@@ -103,8 +105,8 @@ def measure_optimality(
         state = states[row] if begin is None else begin(states[row], seen[row], parameters[row])
         first = ocp.start(state, run["command"][row - 1] - shift).full().ravel()
         data = np.asarray(data_of(times[row], parameters[row]).full())
-        if of_measured is not None:
-            data = np.asarray(of_measured(data, state, seen[row], parameters[row]).full())
+        for shift_of in shifts:
+            data = np.asarray(shift_of(data, state, seen[row], parameters[row]).full())
         if offset is not None:
             data = np.asarray(offset(data, state, states[row]).full())
         best, cost_of_plan = solve(first, data, lower, upper), run["solve.cost"][row]
