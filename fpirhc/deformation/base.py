@@ -302,11 +302,6 @@ def _is_number(value: object) -> bool:
     return finite_number(value)
 
 
-def pairs_lag(deformation: Deformation) -> bool:
-    """Whether responses are compared with those of a model behind lagging actuators."""
-    return deformation.mirror.lags
-
-
 def of_last_pair(deformation: Deformation) -> bool:
     """Whether a request follows from the last request and its response alone: no model, pairing or filter of its own."""
     iteration = deformation.iteration

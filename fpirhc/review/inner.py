@@ -118,9 +118,7 @@ def _rest(problem: Problem, parameters: np.ndarray) -> np.ndarray | None:
     plant = problem.plant
     x, u, p = plant.symbols()
     calm = np.zeros(len(plant.names))
-    drift = (
-        plant.equations.forced_rate(x, u, p, calm) if plant.step is None else plant.equations.next(x, u, p, calm) - x
-    )
+    drift = plant.equations.forced_rate(x, u, p, calm)  # of a map its differences
     wanted = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
     places = [plant.output.elements.index(name) for name in plant.controlled_names]
     off = plant.equations.output(x, u, p, calm)[places] - wanted[places]

@@ -10,7 +10,6 @@ import numpy as np
 
 from fpirhc.contraction.delayed import damped_product, resonant_limit
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.deformation.base import pairs_lag
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.question import Case, ControllerQuestion
@@ -34,7 +33,7 @@ def real_pair_converges(case: Case) -> Answer | None:
     numbers = {"radius": adapted, "bare_radius": bare}
     if adapted < 1:
         return Answer(LOOP, Verdict.YES, text, "", numbers)
-    whole = pairs_lag(case.controller.deformation)
+    whole = case.controller.deformation.mirror.lags
     lag = "the whole lag of the reality." if whole else "the reality's lag: ModelReferenced(map, lag=...)."
     change = f"Lower the gain, or pair through {lag}"
     if bare >= 1:
@@ -65,10 +64,8 @@ _REAL = 1e-6  # share of the imaginary part, below which a pole is real
 def leaves_room(case: Case) -> Answer | None:
     """Return N Lambda tau, and the largest a lambda with some damping; None without a reality, an unpaired lag or a known law."""
     law = law_of(case.grid, case.controller) if case.grid.real is not None else None
-    if law is None or pairs_lag(
-        case.controller.deformation
-    ):  # paired through it, which the loop with the reality judges
-        return None
+    if law is None or case.controller.deformation.mirror.lags:
+        return None  # paired through it, which the loop with the reality judges
     rate, poles = law
     extras = [extra_modes(case.grid, point, case.believed) for point in real_points(case.grid)]
     lags = [float(np.sum(-1 / one.poles.real[_is_lag(one.poles)])) for one in extras]
