@@ -273,6 +273,10 @@ class Sweep:
 
     def tube(self) -> Tube | str:
         """Return bounds that follow from themselves, or why none were found."""
+        with np.errstate(all="ignore"):  # bounds that are not finite are no bounds, below
+            return self._closed()
+
+    def _closed(self) -> Tube | str:
         bounds = self._first()
         largest = _LOST * (1 + max(np.abs(v).max() for v in (self.centre.states, self._responses)))
         for _ in range(_SWEEPS):

@@ -41,6 +41,8 @@ def tightened(
 ) -> Controller:
     """Return the controller whose plans keep a margin from the limits of states, and with which the plants keep the limits.
 
+    The plants are those that are run; `certify_limits` speaks for every plant of a box of parameters.
+
     Args:
         problem: with hard limits of states. The margins are computed for it, and it stays as it is.
         controller: that plans over the problem's horizon.

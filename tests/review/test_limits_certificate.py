@@ -177,6 +177,16 @@ def test_a_reference_is_certified_too_and_the_tube_vanishes_with_the_period():
     assert all(0.35 < later / before < 0.55 for before, later in pairwise(tubes))
 
 
+def test_bounds_that_do_not_close_are_refused():
+    """The third level has no input: in one piece its bounds feed those of the flows, and grow without end."""
+    problem, controller = task("tanks")
+    stated = fp.certify_limits(problem, controller, mismatch=8)
+    assert "the bounds do not close" in stated.failures[0]
+    assert "of 'h3' first" in stated.failures[0]
+    assert not stated.holds
+    assert not stated.error
+
+
 def test_margins_of_a_controller_are_kept_and_widened():
     """Those that it has are the least; only limits that may be passed need more."""
     problem, controller = task("body")
