@@ -311,14 +311,16 @@ def run_cycles(
     count = evaluator.results[1].size // trace.size  # a call
     log, ranges = np.empty((padded, trace.size)), talk.ranges(trace)
     memory, *read = evaluator.arguments
+    windows = [(argument.reshape(count, -1), table) for argument, table in zip(read, tables, strict=False)]
+    ends, sent = evaluator.results[0].reshape(count, start.size), evaluator.results[2:]
     memory[:] = start
     talk.begin(read[len(tables) :])
     for at, end in _pieces(cycles, count, [cycle for cycle, _, _ in patches]):
         for cycle, places, values in patches:
             if cycle == at:
                 memory[places] = values
-        for argument, table in zip(read, tables, strict=False):
-            argument.reshape(count, -1)[:] = table[at : at + count]
+        for argument, table in windows:
+            argument[:] = table[at : at + count]
         evaluator.redirect(1, log[at : at + count])
         why = evaluator.failure()
         if why:
@@ -332,8 +334,8 @@ def run_cycles(
         if outside is not None:
             row, what = outside
             return log[: at + row].copy(), stopped(problem, at + row, what)
-        memory[:] = evaluator.results[0].reshape(count, start.size)[end - at - 1]
-        ended = talk.after(end - 1, evaluator.results[2:])
+        memory[:] = ends[end - at - 1]
+        ended = talk.after(end - 1, sent)
         if ended and end < cycles:
             return log[:end].copy(), stopped(problem, end, ended[0]) + ended[1]
         if progress:
