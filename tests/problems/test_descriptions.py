@@ -19,6 +19,7 @@ from fpirhc.problem_files.shipped import missing
 
 ROOT = Path(__file__).parents[2] / "problems"
 FILES = sorted([*ROOT.glob("*.py"), *(ROOT / "gallery").glob("*.py"), *(ROOT / "outside").glob("*.py")])
+LONG = ("diabetes", "diabetes_announced")  # runs without a baseline that take some seconds each
 HEAD = "rms error, seed 0"
 
 
@@ -56,7 +57,9 @@ def errors(path: Path, controller: str) -> dict[str, float]:
     return dict(fp.measure(task.problem, run).rms_error)
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in LONG), id=p.stem) for p in FILES]
+)
 def test_a_table_is_what_runs_give(path):
     """Every judged quantity with its unit, in two digits; a run on another machine may differ in the last one."""
     task = loaded(path)

@@ -315,7 +315,7 @@ def test_values_that_make_no_sense_are_refused():
 _LONG = (
     *("chain_of_masses", "puma560", "three_link_arm", "planar_arm", "two_link_arm", "van_der_pol", "leaking_tanks"),
     *("delayed_mass", "delayed_tanks"),  # the journey below reviews dead time
-    *("noisy_motor", "anaesthesia", "freeway"),  # others of their kind are quicker
+    *("noisy_motor", "anaesthesia", "freeway", "diabetes", "diabetes_announced"),  # others of their kind are quicker
     *("hodgkin_huxley_silent", "tumour_daily", "turbojet_slow"),  # the plants of others with another task
 )
 

@@ -1,0 +1,154 @@
+"""The people of `diabetes` are the published ones, and its controllers keep the rule for low glucose in all of them.
+
+References: the run of two days and the states at rest of jxx123/simglucose, commit a6f6777; Magni et al. for the grid are in
+`test_pictures`.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.problem_files.problem_file import Task
+
+TWO_DAYS = Path(__file__).parents[1] / "data" / "diabetes" / "two_days.csv"
+# Minutes of a row of 3 min in which a meal begins: the recording has the mean of the row.
+BEGINS = {172: 1, 214: 2, 291: 0, 369: 2, 638: 1, 669: 0, 709: 2, 784: 1, 828: 0}
+EATING = 5.0  # g/min
+# Of adolescent#001, in the order of the source: Gp, Gt, Ip, X, I1, Id, Il, two depots, Gs.
+PUBLISHED = (
+    250.621836,
+    176.506559902,
+    4.697517762,
+    0.0,
+    97.554,
+    97.554,
+    3.19814917262,
+    57.951224472,
+    93.2258828462,
+    250.621836,
+)
+
+
+@cache
+def task(name: str = "diabetes") -> Task:
+    return fp.load_problem(name)
+
+
+def body(name: str) -> tuple[fp.Problem, fp.Plant, np.ndarray, np.ndarray]:
+    """Problem, map of a minute, state at the start and parameters of a person."""
+    cases = task().cases
+    assert cases is not None
+    problem = cases.problem(name, task().problem)
+    reality = problem.reality
+    assert isinstance(reality, fp.Reality)
+    assert isinstance(reality.plant, fp.Plant)
+    minute = replace(reality.plant, steps=1)
+    return problem, minute, np.array([*problem.start_state, 0.0, 0.0]), np.array(minute.exact)
+
+
+def test_two_published_days_are_met():
+    """The same doses and meals give the glucose of the other simulator, which has a variable step, to 1e-4 mg/dl."""
+    _, minute, x, p = body("adolescent#001")
+    names, calm = list(minute.parameter.elements), np.zeros(len(minute.names))
+    carbs, basal, volume = (names.index(name) for name in ("carbs", "basal", "Vg"))
+    with TWO_DAYS.open() as file:
+        rows = [[float(v) for v in row.values()] for row in csv.DictReader(line for line in file if line[0] != "#")]
+    left, worst = 0.0, 0.0
+    for k, (_, eaten, dose) in enumerate(rows[:-1]):
+        glucose = []
+        for m in range(3):
+            left += 3 * eaten if BEGINS.get(k) == m else 0.0
+            p[carbs] = min(EATING, left)
+            left -= p[carbs]
+            x = np.asarray(minute.equations.next(x, 60 * dose - p[basal], p, calm)).ravel()
+            glucose.append(x[minute.names.index("Gs")] / p[volume])
+        worst = max(worst, abs(np.mean(glucose) - rows[k + 1][0]))
+    assert worst < 1e-4
+
+
+def test_everybody_rests_with_the_basal_dose():
+    """Nothing moves in a minute, by 1e-10; the first one's rest is the published one."""
+    cases = task().cases
+    assert cases is not None
+    for name in cases.names:
+        _, minute, x, p = body(name)
+        after = np.asarray(minute.equations.next(x, 0.0, p, np.zeros(len(minute.names)))).ravel()
+        assert np.abs(after - x).max() < 1e-10
+    names = ("Gp", "Gt", "Ip", "X", "I1", "Id", "Il", "depot1", "depot2", "Gs")
+    _, minute, x, _ = body("adolescent#001")
+    np.testing.assert_allclose(x[[minute.names.index(n) for n in names]], PUBLISHED, atol=1e-9)
+
+
+def test_the_clinic_knows_the_weight_the_dose_and_the_fasting_glucose():
+    """Its model rests where the person does, with parameters of the group; the emptying of the stomach is not in it."""
+    problem, minute, _, _ = body("child#003")
+    believed, own = problem.plant.parameters, minute.parameters
+    assert {"kmin", "b", "d"}.isdisjoint(believed)
+    for known in ("BW", "basal"):
+        assert believed[known].approximate == own[known].exact
+    for mean in ("kp2", "Vmx", "kabs"):
+        assert believed[mean].approximate != own[mean].exact
+        assert believed[mean].approximate != task().problem.plant.parameters[mean].approximate  # of another group
+
+
+def of_people(of: Task, names: list[str], controllers: list[str], folder: Path) -> dict[str, dict[str, list[float]]]:
+    """Shares of the time below 70 mg/dl and in the range, by controller."""
+    study = fp.compare_scenarios(of, cases=names, controllers=controllers, seed=0, folder=folder, compiled=False)
+    duration = of.problem.duration
+    return {
+        name: {
+            "below": [r["metrics"]["below_70"][""] / duration for r in records],
+            "within": [r["metrics"]["in_range"][""] for r in records],
+        }
+        for name, records in study.records.items()
+    }
+
+
+def test_the_lowest_of_all_keeps_the_rule(tmp_path):
+    """A child whom unfinished plans take lowest is never below 70 mg/dl, and longer in the range than with PID."""
+    shares = of_people(task(), ["child#001"], ["PID", "RHC"], tmp_path)
+    assert max(shares["RHC"]["below"]) < 0.04
+    assert shares["RHC"]["within"][0] > 1.3 * shares["PID"]["within"][0]
+
+
+def described(task_of: Task, head: str) -> dict[str, list[float]]:
+    """The rows of the description's table that begins with this head."""
+    lines = task_of.description.splitlines()
+    first = next(k for k, line in enumerate(lines) if line.strip().startswith(head))
+    rows = [line.strip() for line in lines[first + 1 : first + 1 + len(task_of.controllers)]]
+    cells = [[cell.strip() for cell in row.split("  ") if cell.strip()] for row in rows]
+    return {name: [float(number) for number in numbers] for name, *numbers in cells}
+
+
+def shares_as_described(of: Task, names: list[str], folder: Path) -> dict[str, dict[str, list[float]]]:
+    """The shares, once they are those of the description."""
+    shares = of_people(of, names, list(of.controllers), folder)
+    table = described(of, "shares of the time")
+    assert set(table) == set(shares)
+    for controller, one in shares.items():
+        within, below = (100 * np.array(one[what]) for what in ("within", "below"))
+        assert table[controller] == pytest.approx([within.mean(), within.min(), below.mean(), below.max()], abs=0.6)
+    return shares
+
+
+@pytest.mark.slow
+def test_nobody_of_thirty_breaks_the_rule(tmp_path):
+    """Below 70 mg/dl for 4 % of the time, with no controller."""
+    for controller, one in shares_as_described(task(), ["all"], tmp_path).items():
+        assert len(one["below"]) == 30
+        assert max(one["below"]) < 0.04, controller
+
+
+@pytest.mark.slow
+def test_announced_meals_break_the_rule(tmp_path):
+    """With every controller, for most children."""
+    for controller, one in shares_as_described(task("diabetes_announced"), ["child*"], tmp_path).items():
+        assert len(one["below"]) == 10
+        assert sum(share > 0.04 for share in one["below"]) > 5, controller
