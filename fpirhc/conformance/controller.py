@@ -167,10 +167,10 @@ def command_keeps_the_limits(trial: Trial, generator: np.random.Generator) -> No
         name: (float(middle[k] - _TIGHT * most[k]), float(middle[k] + _TIGHT * most[k]))
         for k, name in enumerate(plant.inputs)
     }
-    for problem in (trial.problem, replace(trial.problem, limits=replace(trial.problem.limits, inputs=inputs))):
+    narrow = replace(trial.problem, limits=replace(trial.problem.limits, inputs=inputs))
+    # A weak actuator may lose the plant: every command up to there counts.
+    for problem, run in ((trial.problem, trial.run), (narrow, trial.simulated(narrow))):
         lower, upper = problem.limits.input_bounds(plant)
-        # A weak actuator may lose the plant: every command up to there counts.
-        run = trial.simulated(problem)
         outside = np.maximum(lower - run["command"], run["command"] - upper)
         worst = np.unravel_index(int(np.argmax(outside)), outside.shape)
         name = plant.input.elements[worst[1]]

@@ -103,15 +103,22 @@ def test_a_slider_that_needs_python_is_left_out_and_says_why(monkeypatch):
     assert not paths & set(lab.without)
 
 
-def test_a_slider_stays_inside_the_bounds_of_its_setting(monkeypatch):
-    monkeypatch.setattr(module, "package", lambda *_: None)
-    lab = made("two_mass", duration=0.5)
-    for slider in lab.sliders:
+@pytest.fixture(scope="module")
+def short() -> Lab:
+    """Half a second of two masses, without WebAssembly."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "package", lambda *_: None)
+        return made("two_mass", duration=0.5)
+
+
+def test_a_slider_stays_inside_the_bounds_of_its_setting(short):
+    for slider in short.sliders:
         assert slider.low < slider.value < slider.high or slider.value in (slider.low, slider.high)
         if not slider.path.startswith(("exact.", "approximate.")):
-            loops = [loop for loop in lab.loops if slider.path in loop.ready.live.paths]
-            assert all(loop.ready.live.bounds(slider.path)[0] <= slider.low for loop in loops)
-            assert all(loop.ready.live.bounds(slider.path)[1] >= slider.high for loop in loops)
+            bounds = [
+                loop.ready.live.bounds(slider.path) for loop in short.loops if slider.path in loop.ready.live.paths
+            ]
+            assert all(low <= slider.low and high >= slider.high for low, high in bounds)
 
 
 def test_what_has_no_lab(monkeypatch):
@@ -140,11 +147,10 @@ class _Body:
         return np.full(6, time + command[0])
 
 
-def test_a_page_runs_its_own_scripts_and_webassembly_alone(monkeypatch):
+def test_a_page_runs_its_own_scripts_and_webassembly_alone(short, monkeypatch):
     """The policy names hashes, and nothing of a title or a reason is markup."""
-    monkeypatch.setattr(module, "package", lambda *_: None)
     monkeypatch.setattr(module.LabLoop, "module", b"")
-    lab = replace(made("two_mass", duration=0.5), title="<b>&", without={"a": "</script><b>"})
+    lab = replace(short, title="<b>&", without={"a": "</script><b>"})
     text = page(lab)
     policy = text.partition('content="')[2].partition('"')[0]
     assert "default-src 'none'" in policy

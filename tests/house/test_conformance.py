@@ -18,14 +18,13 @@ from wrong.tables import OPTIMISERS as WRONG_OPTIMISERS
 
 import fpirhc as fp
 import fpirhc.conformance.controller as controller_laws
-import fpirhc.conformance.deformation as deformation_laws
 import fpirhc.conformance.optimiser as optimiser_laws
 import fpirhc.conformance.plant as plant_laws
 import fpirhc.conformance.tracking as tracking_laws
 import fpirhc.controllers
 import fpirhc.optimisers
 import fpirhc.tracking
-from fpirhc.conformance import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
+from fpirhc.conformance import check_controller, check_optimiser, check_plant, check_tracking
 from fpirhc.conformance.laws import within
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.base import Controller
@@ -523,19 +522,6 @@ def test_nan_is_within_nothing():
     assert not within(math.nan, 1.0)
     assert not within([0.0, math.nan], 1.0)
     assert within([0.0, -1.0], 1.0)
-
-
-def test_deformations_are_named_too():
-    """The deformations' laws speak in the same way."""
-
-    class Bare(fp.Affine):
-        def step(self, request, response, desired, memory):
-            """Weaker than it says."""
-            del memory
-            return request + 0.4 * self.gain * (response - desired), {}
-
-    with pytest.raises(AssertionError, match=f"Bare {breaks(deformation_laws.first_step_is_effective_gain)}"):
-        check_deformation(Bare(-0.5), seed=1)
 
 
 def test_what_a_class_raises_is_noted():
