@@ -189,15 +189,17 @@ def test_draws_are_those_of_the_reality():
     assert np.array_equal(variant.plant.exact, problem.plant.exact)
 
 
+RUBBED = fp.Plant(
+    coordinates={"y": "m"},
+    inputs={"u": "N"},
+    parameters={"gain": fp.Parameter(2.0, 2.5, "1/kg"), "friction": fp.Parameter(1.0, 3.0, "N s/m")},
+    response=lambda q, v, u, p: {"y": p.gain * (u.u - p.friction * ca.tanh(v.y))},
+)
+
+
 def test_exact_model_is_the_reality():
     """A reality with another friction and other parameters is the model of the exact controller, which then needs no adaptation."""
-    real = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "N"},
-        parameters={"gain": fp.Parameter(2.0, 2.5, "1/kg"), "friction": fp.Parameter(1.0, 3.0, "N s/m")},
-        response=lambda q, v, u, p: {"y": p.gain * (u.u - p.friction * ca.tanh(v.y))},
-    )
-    problem = task(reality=fp.Reality(real), start={"y": 0.0, "y'": 3.0}, duration=0.5)
+    problem = task(reality=fp.Reality(RUBBED), start={"y": 0.0, "y'": 3.0}, duration=0.5)
     bare = CONTROLLERS["computed torque"]
     errors = [np.abs(run(problem, one)["error.y"]).max() for one in (bare, fp.ExactModel(bare))]
     assert errors[1] < 0.02 * errors[0]
@@ -207,13 +209,7 @@ def test_exact_model_is_the_reality():
 
 def test_comparison_with_the_reality_as_exact_model():
     """Plans of the exact model are judged by the reality's equations: none is above the optimum of its own horizon."""
-    real = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "N"},
-        parameters={"gain": fp.Parameter(2.0, 2.5, "1/kg"), "friction": fp.Parameter(1.0, 3.0, "N s/m")},
-        response=lambda q, v, u, p: {"y": p.gain * (u.u - p.friction * ca.tanh(v.y))},
-    )
-    problem = task(reality=fp.Reality(real))
+    problem = task(reality=fp.Reality(RUBBED))
     plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6))
     file = replace(fp.load_problem("two_mass"), problem=problem, headline=None)
     comparison = fp.compare(replace(file, controllers={"RHC": plan, "RHC exact": fp.ExactModel(plan)}), seed=0)

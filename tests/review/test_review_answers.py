@@ -445,28 +445,8 @@ def test_a_jump_that_fits_into_one_step_takes_one_cycle():
     assert one.evidence.endswith("; a jump of a disturbance takes the map 1 cycle")
 
 
-def test_a_disturbance_of_a_state_acts_on_the_response_of_the_output():
-    """With y = a, a' = 3 b (1 + a), b' = u, one unit on b' is 3 (1 + a) = 4.5 on y'' at the start, where a = 0.5; on y none."""
-    plant = fp.Plant.of_states(
-        states={"a": "m", "b": "m"},
-        inputs={"u": "m/s"},
-        outputs={"y": fp.Output("m", lambda x, p: x.a)},
-        rates=lambda x, u, p: {"a": p.k * x.b * (1 + x.a), "b": u.u},
-        parameters={"k": fp.Parameter(3.0, 3.0, "1/s")},
-    )
-    problem = fp.Problem(
-        plant,
-        fp.Trajectory(lambda t: {"y": 0.5 + ca.sin(t)}),
-        start={"a": 0.5, "b": 0.2},
-        period=PERIOD,
-        duration=PERIOD * CYCLES,
-    )
-    own = review_grid(problem, 0.0, 0)
-    assert [effect(own, name) for name in ("b", "y", "u")] == pytest.approx([4.5, 0.0, 4.5])
-
-
-def test_a_start_off_the_reference_of_outputs_is_the_state_that_explains_them():
-    """With y = a, a' = 3 b (1 + a) the start (0.6, 0.3) has y' = 1.44, the reference 0.5 and 1; coordinates have theirs."""
+def grown(**start: float) -> fp.Problem:
+    """Along 0.5 + sin t, with y = a, a' = 3 b (1 + a), b' = u."""
     plant = fp.Plant.of_states(
         states={"a": "m", "b": "m"},
         inputs={"u": "m/s"},
@@ -475,9 +455,21 @@ def test_a_start_off_the_reference_of_outputs_is_the_state_that_explains_them():
         parameters={"k": fp.Parameter(3.0, 3.0, "1/s")},
     )
     reference = fp.Trajectory(lambda t: {"y": 0.5 + ca.sin(t)})
-    problem = fp.Problem(plant, reference, start={"a": 0.6, "b": 0.3}, period=PERIOD, duration=PERIOD * CYCLES)
+    return fp.Problem(plant, reference, start=start, period=PERIOD, duration=PERIOD * CYCLES)
+
+
+def test_a_disturbance_of_a_state_acts_on_the_response_of_the_output():
+    """One unit on b' is 3 (1 + a) = 4.5 on y'' at the start, where a = 0.5; on y none."""
+    own = review_grid(grown(a=0.5, b=0.2), 0.0, 0)
+    assert [effect(own, name) for name in ("b", "y", "u")] == pytest.approx([4.5, 0.0, 4.5])
+
+
+def test_a_start_off_the_reference_of_outputs_is_the_state_that_explains_them():
+    """The start (0.6, 0.3) has y' = 1.44, the reference 0.5 and 1; coordinates have theirs."""
     shown = np.array([[1.0, 0.0], [2 / 3, 4.5]])  # of y and y' by a and b, at a = 0.5 and b = 2 / 9
-    assert _start_deviation(review_grid(problem, 0.0, 0), shown) == pytest.approx([0.1, (0.44 - 0.2 / 3) / 4.5])
+    assert _start_deviation(review_grid(grown(a=0.6, b=0.3), 0.0, 0), shown) == pytest.approx(
+        [0.1, (0.44 - 0.2 / 3) / 4.5]
+    )
     off = review_grid(mass(start={"q": 0.2, "q'": 1.0}), 0.0, 0)
     assert _start_deviation(off, np.full((2, 2), np.nan)) == pytest.approx([0.2, -0.5])
 
