@@ -11,7 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.studies.comparison.caveats import error_left_alone, yardstick_of
 from fpirhc.studies.comparison.changes import ranges
-from fpirhc.studies.scenarios.bench import reaches
+from fpirhc.studies.scenarios.bench import held
 
 
 def tank(**changes: Any) -> fp.Problem:
@@ -55,7 +55,7 @@ def test_ranges_are_those_of_references_that_move():
     assert ranges(tank(reference=fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}))) == {}
 
 
-def held(size: float) -> fp.Problem:
+def held_tank(size: float) -> fp.Problem:
     """The set-point 1 from 0.99, and a disturbance that leaves the tank alone with an error of about its size."""
     disturbed = {"y": fp.Sine(amplitude=size, frequency=0.5)}
     return tank(
@@ -69,16 +69,34 @@ def held(size: float) -> fp.Problem:
 
 def test_a_reference_that_moves_from_the_start_alone_is_measured_against_the_plant_left_alone():
     """A disturbance of 8 makes errors of 1 there, beside which 0.01 from the start says nothing; without one the start counts."""
-    calm, rough = (yardstick_of(held(size), seed=0) for size in (0.0, 8.0))
+    calm, rough = (yardstick_of(held_tank(size), seed=0) for size in (0.0, 8.0))
     assert calm.ranges["y"] == pytest.approx(0.01)
     assert rough.ranges["y"] == rough.alone["y"] > 1.0
     alone = yardstick_of(tank(duration=10.0), seed=0)
     assert alone.ranges["y"] == pytest.approx(0.6, rel=1e-3)
 
 
-def test_a_run_diverges_beyond_a_held_reference_and_not_beyond_the_start():
-    """The set-point 1 is the size of its motion; a reference that moves has its range, and one at zero what is off at the start."""
-    assert reaches(held(8.0)) == {"y": 1.0}
-    assert reaches(tank(duration=10.0))["y"] == pytest.approx(0.5)
-    assert reaches(tank(reference=fp.Trajectory(lambda t: {"y": 0 * t}))) == {"y": 1.0}
-    assert reaches(tank(reference=fp.Trajectory(lambda t: {"y": 0 * t}), start={"y": 0.3})) == {"y": pytest.approx(0.3)}
+def test_a_case_with_a_held_reference_diverges_where_the_plant_left_alone_does_better(tmp_path):
+    """More than what is off at the start is no divergence beside a disturbance that moves the plant by more."""
+    path = tmp_path / "tank.py"
+    path.write_text(TANK)
+    task = fp.load_problem(str(path))
+    study = fp.compare_scenarios(task, cases=["all"], seed=0, folder=tmp_path / "out", compiled=False)
+    outcomes = {name: [record["outcome"] for record in some] for name, some in study.records.items()}
+    assert outcomes == {"good": ["finished"], "bad": ["diverged"]}
+    [good] = study.records["good"]
+    assert good["error"] > 1
+    assert held(held_tank(8.0)) == {"y"}
+    assert held(tank(duration=10.0)) == frozenset()
+
+
+TANK = '''"""A tank."""
+import fpirhc as fp
+from test_left_alone import held_tank
+problem = held_tank(8.0)
+controllers = {
+    "good": fp.ComputedTorque(fp.Exponential(rate=20.0)),
+    "bad": fp.ComputedTorque(fp.Exponential(rate=2.9)),  # the model's decay is 3 1/s too fast
+}
+cases = fp.Cases({"usual": {}})
+'''

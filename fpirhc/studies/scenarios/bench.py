@@ -25,6 +25,7 @@ from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.studies.comparison.caveats import error_left_alone
 from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
 from fpirhc.task.problem import Problem
 
@@ -102,7 +103,7 @@ class Bench:
         self._live = live or {}
         self._task, self._conditions = task, conditions
         self._scenarios = scenarios(task, conditions)
-        self._ranges, self._reaches = ranges(task.problem), reaches(task.problem)
+        self._ranges, self._held = ranges(task.problem), held(task.problem)
         self._simulators: dict[tuple[str, object], Simulator | FpirhcError] = {}
         self._shared: dict[tuple[str, object], Simulator | None] = {}
         self._last: tuple[int, Scenario] | None = None
@@ -127,13 +128,21 @@ class Bench:
             "group": scenario.group,
             "controller": name,
             "mismatch": scenario.mismatch,
-            "outcome": outcome(run, relative_error(metrics, self._reaches)),
+            "outcome": outcome(run, self._judged(scenario, metrics, size)),
             "error": _finite(size),
             "metrics": _finite(metrics.values),
             "pictures": _finite(self._kept(name, run)),
             "lasted": run.cycles / scenario.problem.cycles,
             "stop": run.stop,
         }
+
+    def _judged(self, scenario: Scenario, metrics: Metrics, size: float) -> float:
+        """The relative error by which a run has diverged: where a reference is held, beside the plant left alone."""
+        if not DIVERGED < size < math.inf or not self._held:
+            return size
+        alone = error_left_alone(scenario.problem, seed=scenario.seed)
+        sizes = {c: max(r, alone.get(c, 0.0)) if c in self._held else r for c, r in self._ranges.items()}
+        return relative_error(metrics, sizes)
 
     def _kept(self, name: str, run: Run) -> dict[str, Kept]:
         """What the pictures of many runs need of this one, by title."""
@@ -262,34 +271,27 @@ def ranges(problem: Problem) -> dict[str, float]:
 
     The error at the start stands for it where that is larger, and 1 where both are zero.
     """
-    return _by_name(problem, _sizes(problem, _wanted(problem)))
-
-
-def reaches(problem: Problem) -> dict[str, float]:
-    """Return the error from which a run has diverged, of every judged coordinate: the range of the reference.
-
-    Of a reference that does not move it is its own size where that is larger: there disturbances move the plant.
-    """
     rows = _wanted(problem)
-    sizes, largest = _sizes(problem, rows), np.abs(rows).max(axis=1)
-    held = np.ptp(rows, axis=1) <= _ROUNDING * largest
-    return _by_name(problem, np.where(held, np.maximum(sizes, largest), sizes))
+    sizes = np.maximum(np.ptp(rows, axis=1), np.abs(rows[:, 0] - problem.start_output[_places(problem)]))
+    return {c: float(s) if s > 0 else 1.0 for c, s in zip(problem.judged_names, sizes, strict=True)}
+
+
+def held(problem: Problem) -> frozenset[str]:
+    """Return the judged coordinates whose reference does not move: disturbances move them."""
+    rows = _wanted(problem)
+    still = np.ptp(rows, axis=1) <= _ROUNDING * np.abs(rows).max(axis=1)
+    return frozenset(c for c, one in zip(problem.judged_names, still, strict=True) if one)
 
 
 def _wanted(problem: Problem) -> np.ndarray:
     """The reference of the judged coordinates over the run, by rows."""
-    places = [problem.plant.output.elements.index(c) for c in problem.judged_names]
     times = np.linspace(0.0, problem.duration, _SAMPLES)
-    return np.asarray(problem.reference.function(problem.plant).map(_SAMPLES)(times[None, :])[0].full())[places]
+    states = problem.reference.function(problem.plant).map(_SAMPLES)(times[None, :])[0]
+    return np.asarray(states.full())[_places(problem)]
 
 
-def _sizes(problem: Problem, rows: np.ndarray) -> np.ndarray:
-    places = [problem.plant.output.elements.index(c) for c in problem.judged_names]
-    return np.maximum(np.ptp(rows, axis=1), np.abs(rows[:, 0] - problem.start_output[places]))
-
-
-def _by_name(problem: Problem, sizes: np.ndarray) -> dict[str, float]:
-    return {c: float(s) if s > 0 else 1.0 for c, s in zip(problem.judged_names, sizes, strict=True)}
+def _places(problem: Problem) -> list[int]:
+    return [problem.plant.output.elements.index(c) for c in problem.judged_names]
 
 
 def relative_error(metrics: Metrics, sizes: dict[str, float]) -> float:

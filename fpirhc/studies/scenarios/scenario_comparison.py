@@ -20,8 +20,9 @@ from fpirhc.summary import Column, Table, line, written_out
 _ERRORS = "Errors are rms errors divided by the range of the reference, root mean square over the judged coordinates. "
 _MEANING = (
     "Every scenario has the same noise, disturbances and parameters for all controllers; differences are taken within scenarios, "
-    "and their intervals are 95 % percentile bootstrap intervals of the median. A run whose error exceeds the reference's range "
-    "has diverged; a run that ended early counts as worse than every other run."
+    "and their intervals are 95 % percentile bootstrap intervals of the median. A run whose error exceeds the reference's range, "
+    "and where the reference is held that of the plant left alone, has diverged; a run that ended early counts as worse than every "
+    "other run."
 )
 _UNTUNED = "No file of tuned settings was given: all settings are those of the problem file."
 
