@@ -38,7 +38,12 @@ from fpirhc.task.reference import Reference
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _TRIED = 8  # states near the start, at which an input may have an effect that it lacks there
-_OF_EXACT = ("truth", "real_start", "start_output")  # cached properties that depend on the exact parameters
+_OF_EXACT = (
+    "truth",
+    "real_start",
+    "start_output",
+    "of_equations",
+)  # cached properties that depend on the exact parameters
 _INSTANTS = 101  # at which signals from outside are tried before a run
 
 

@@ -133,7 +133,7 @@ def test_mistakes_are_named():
     free = replace(problem, limits=fp.Limits())
     with pytest.raises(InvalidProblem, match="no hard limits of states"):
         fp.tightened(free, adaptive())
-    with pytest.raises(NotSupported, match="does not plan"):
+    with pytest.raises(NotSupported, match="has no plan that could keep margins"):
         fp.tightened(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)))
     with pytest.raises(InvalidValue, match="widen=0"):
         fp.tightened(problem, adaptive(), widen=0)

@@ -22,7 +22,7 @@ NAMES = ["two_mass", "tumour", "freeway", "crane_slots", "heat_exchanger"]
 def said(problem: Problem, name: str) -> object:
     """A cached property as something that can be compared."""
     value = getattr(problem, name)
-    if isinstance(value, Reality):
+    if isinstance(value, Reality | Problem):
         return describe(value)
     return np.asarray(value(0.3)[0].full()).tolist() if callable(value) else np.asarray(value).tolist()
 
@@ -38,6 +38,7 @@ def test_what_is_shared_does_not_depend_on_the_exact_parameters(name):
     anew = replace(problem, plant=with_exact_parameters(problem.plant, exact))
     assert describe(shared) == describe(anew)
     assert {one: said(shared, one) for one in CACHED} == {one: said(anew, one) for one in CACHED}
+    np.testing.assert_array_equal(shared.of_equations.real_parameters, anew.real_parameters)
     assert np.array_equal(problem.real_parameters, problem.of_model.real_parameters)
     assert not np.array_equal(shared.real_parameters, problem.real_parameters)
 

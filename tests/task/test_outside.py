@@ -343,7 +343,7 @@ def test_a_review_says_for_which_weather_it_holds():
         answers = fp.review(task(room(OUTSIDE), {"ambient": course}), {}, mismatch=0.0, seed=1).problem
         [answer] = [a for a in answers if a.question == question]
         assert answer.verdict == verdict
-        assert ("274 to 285 in the run" if verdict == "unknown" else "283 to 283 in the run") in answer.evidence
+        assert ("274 to 285 in the run" if verdict == "unknown" else "283 K here, 283 in the run") in answer.evidence
 
 
 def priced(cost: Any) -> fp.Problem:

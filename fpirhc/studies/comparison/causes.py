@@ -122,6 +122,11 @@ def limit_cause(plain: Entry, adaptive: Entry) -> str:
     if after < _OFTEN:
         return ""
     fact = f"Its command stands at a limit in {in_percent(after)} of the cycles (that of {plain.name} in {in_percent(before)})"
+    if before >= _OFTEN and not np.ptp(adaptive.run["reference"], axis=0).any():
+        return (
+            f"{fact}, where no adaptation can act: disturbances and noise ask for more than the limits allow, or the loop swings "
+            "by itself; its review says whether it is stable."
+        )
     if before >= _OFTEN and _swings(plain) and _swings(adaptive):
         advice = "Mend the loop without adaptation first; see its review."
         return f"{fact}: both swing to and fro where the reference does not. {advice}"
