@@ -39,7 +39,7 @@ def cycles(name: str, across: bool) -> tuple[float, float]:
     recorded = optimisers.recorded(p)
     optimiser = fp.FixedPoint(iterations=1, tolerance=recorded.tolerance)
     settings = PlainSettings(optimiser.tolerance, optimiser.map, GaussNewton(), optimiser.damping, 1, converging=False)
-    source = plain_driver(recorded.ocp, settings).source()
+    source = plain_driver(recorded.ocp, settings, settings.stops).source()
     assert source.count(_CALL) == 1
     source = source.replace(_CALL, f"TIMED(count, {_CALL})")
     source = source.replace(', "no-ipa-ra"', "") if across else source

@@ -21,7 +21,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser, first_plan, require_settings, sane, stage_later
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
-from fpirhc.optimisers.plain import MOST, PlainSettings, plain_memory, plain_step, shifted_plain
+from fpirhc.optimisers.plain import PlainSettings, plain_memory, plain_step, shifted_plain
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import settled
@@ -105,12 +105,12 @@ class FixedPoint(Optimiser):
     def step(self, ocp: OptimalControl) -> ca.Function:
         if ocp.bounds_states:
             return limited_step(ocp, self._limited(self.most_iterations))
-        return plain_step(ocp, self._plain(self.iterations, converging=False))
+        return plain_step(ocp, self._plain(converging=False))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
         if ocp.bounds_states:
             return limited_step(ocp, self._limited(_MOST_LIMITED))
-        return plain_step(ocp, self._plain(MOST, converging=True))
+        return plain_step(ocp, self._plain(converging=True))
 
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:
         if ocp.bounds_states:
@@ -124,9 +124,9 @@ class FixedPoint(Optimiser):
         memory = first_plan(self, ocp, state, data, calls=_FIRST_CALLS)[2]
         return memory if np.isfinite(memory).all() else self.memory(ocp).start()
 
-    def _plain(self, iterations: int, *, converging: bool) -> PlainSettings:
+    def _plain(self, *, converging: bool) -> PlainSettings:
         hessian = self.hessian or GaussNewton()
-        return PlainSettings(self.tolerance, self.map, hessian, self.damping, iterations, converging)
+        return PlainSettings(self.tolerance, self.map, hessian, self.damping, self.iterations, converging)
 
     def _limited(self, iterations: int) -> LimitedSettings:
         return LimitedSettings(self.tolerance, self.feasible, self.map, self.hessian, self.damping, iterations)

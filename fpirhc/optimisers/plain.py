@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from importlib import resources
 
 import casadi as ca
@@ -33,7 +34,7 @@ from fpirhc.symbolic.expression import FINITE, is_finite
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import LiveNumber, Number
-from fpirhc.symbolic.native import native
+from fpirhc.symbolic.native import Native, native
 
 MOST = 100  # iterations of one converging call
 _MOST_PLAIN = 30  # plain steps after which a converging call gives up
@@ -49,8 +50,8 @@ class PlainSettings:
         map: the deformation that makes the next plan.
         hessian: second derivatives of the quadratic model.
         damping: added to the curvature of the inputs, in units of it.
-        iterations: most iterations of one call.
-        converging: whether a call stops where the tolerance is met.
+        iterations: of one call that does not converge.
+        converging: whether a call goes on until the tolerance is met.
     """
 
     tolerance: Number
@@ -59,6 +60,16 @@ class PlainSettings:
     damping: Number
     iterations: int
     converging: bool
+
+    @property
+    def most(self) -> int:
+        """Most iterations of one call."""
+        return MOST if self.converging else self.iterations
+
+    @property
+    def stops(self) -> dict[str, object]:
+        """Definitions for the loops in C of when a call ends."""
+        return {"STOP_EARLY": int(self.converging), "ITERATIONS": self.most}
 
 
 def plain_memory(ocp: OptimalControl) -> Layout:
@@ -77,21 +88,35 @@ def plain_memory(ocp: OptimalControl) -> Layout:
 
 def plain_step(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:
     """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+    if plans_are_compiled():
+        alike = replace(settings, converging=False)
+        library = _LIBRARIES.of((ocp, settings.map), (alike,), lambda: _library(ocp, alike))
+        if library.compiled:
+            return _of_library(ocp, settings, library.function)
     name = "fpirhc_fixed_point_converging" if settings.converging else "fpirhc_fixed_point"
-    driver = plain_driver(ocp, settings)
-    # A plan that converges is the first one of a run: the virtual machine solves it in less time than a compiler takes.
-    compiles = plans_are_compiled() and not settings.converging
-    library = native(_outline(ocp, registered(name, driver))) if compiles else None
-    if library is not None and library.compiled:
-        return library.function
+    driver = plain_driver(ocp, settings, settings.stops)
     return with_driver(name, driver, lambda unique: plain_graph(ocp, settings, unique))
 
 
-def _outline(ocp: OptimalControl, name: str) -> ca.Function:
-    """A Function with the arguments and results of `plain_graph` and without its graph, for a library of the driver alone."""
+def _library(ocp: OptimalControl, settings: PlainSettings) -> Native:
+    """The driver alone as a library, which a last argument tells whether a call stops where the plan is converged."""
+    stops = {"STOP_EARLY": "(arg[5] && *arg[5] > 0)", "ITERATIONS": f"(STOP_EARLY ? {MOST} : {settings.iterations})"}
+    name = registered("fpirhc_fixed_point_both", plain_driver(ocp, settings, stops))
     arguments, memory = call_symbols(ocp)
     sizes = (ocp.input.size, ocp.stages), (5, 1), memory.shape
-    return ca.Function(name, [*arguments, memory], [ca.MX.zeros(*size) for size in sizes])
+    return native(
+        ca.Function(name, [*arguments, memory, ca.MX.sym("converging")], [ca.MX.zeros(*size) for size in sizes])
+    )
+
+
+def _of_library(ocp: OptimalControl, settings: PlainSettings, library: ca.Function) -> ca.Function:
+    """The library's Function without its last argument."""
+    arguments, memory = call_symbols(ocp)
+    results = library.call([*arguments, memory, ca.MX(int(settings.converging))])
+    return ca.Function("fpirhc_fixed_point_library", [*arguments, memory], results, {"always_inline": True})
+
+
+_LIBRARIES: Latest[Native] = Latest(8)
 
 
 def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
@@ -106,8 +131,8 @@ def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
     return layout.join({**parts, **shifted_parts})
 
 
-def plain_driver(ocp: OptimalControl, settings: PlainSettings) -> Driver:
-    """Return the loops in C with what they call."""
+def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[str, object]) -> Driver:
+    """Return the loops in C with what they call; `stops` are the definitions of STOP_EARLY and ITERATIONS."""
     stage, linearise = stage_leaves(ocp, ("evaluate", "pull"))
     leaves = {
         **stage,
@@ -118,7 +143,9 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings) -> Driver:
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     texts.insert(1, linearise)
-    return Driver("\n".join(texts), leaves, {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings)}, _room(ocp))
+    return Driver(
+        "\n".join(texts), leaves, {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings), **stops}, _room(ocp)
+    )
 
 
 def _room(ocp: OptimalControl) -> int:
@@ -155,8 +182,6 @@ def _number(ocp: OptimalControl, number: Number) -> str:
 
 def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object]:
     return {
-        "ITERATIONS": settings.iterations,
-        "STOP_EARLY": int(settings.converging),
         "TOLERANCE": _number(ocp, settings.tolerance),
         "DAMPING": _number(ocp, settings.damping),
         "SHARE": SHARE,
@@ -244,7 +269,7 @@ def _converged(
     rest = ca.Function("fpirhc_rest", [*arguments, *symbols], list(symbols))
     choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
     again = _needed(ocp, settings, arguments, symbols)
-    for _ in range(settings.iterations + 1):
+    for _ in range(settings.most + 1):
         needed = again(*arguments, anchor.inputs, anchor.slope, anchor.value, plain)
         plain += ca.logic_and(needed, anchor.step < SHORTEST)
         anchor, count = Anchor(*choice(needed, *arguments, *anchor)), count + needed
