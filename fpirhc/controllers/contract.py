@@ -159,7 +159,7 @@ class Planner:
     def _measured(self, problem: Problem) -> tuple[str, ...]:
         """The limited states that no output shows, where a plan starts at another state than the measured one."""
         plant = problem.plant
-        if not self.starts_consistent(plant):
+        if not (self.restarts and self.starts_consistent(plant)):
             return ()
         pairs = zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)
         return tuple(e for e, place in pairs if place < 0 and e in problem.limits.states)

@@ -162,7 +162,7 @@ class RecedingHorizon(Controller):
             InvalidProblem: horizon or cost missing.
             NotSupported: the optimiser cannot keep the problem's bounds; references of states are needed that no output gives.
         """
-        _check_states_of_plans(problem.plant, self.replanning, self.on_failure)
+        _check_states_of_plans(problem.plant, self.on_failure)
         if problem.horizon is None:
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
@@ -177,7 +177,7 @@ class RecedingHorizon(Controller):
         cycles = cycles_per_plan(problem.horizon, problem.period)
         before, after, late, remembered = self.replanning.parts(problem)
         room = _room(problem, self.replanning)
-        plan = every(_plan_block(problem, self.optimiser, self.on_failure, room), cycles)
+        plan = every(_plan_block(problem, self, room), cycles)
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
         if self.planner.starts_consistent(plant):
             before, after = (at_consistent_start(plant, some) for some in (before, after))
@@ -195,14 +195,12 @@ class RecedingHorizon(Controller):
         return blocks, delays
 
 
-def _check_states_of_plans(plant: Plant, replanning: Replanning, on_failure: OnFailure) -> None:
-    """Raise where a way of replanning, or of failing, needs states that the outputs do not give."""
+def _check_states_of_plans(plant: Plant, on_failure: OnFailure) -> None:
+    """Raise where a way of failing needs states that the outputs do not give."""
     reason = ""
     instant = [name for name, order in plant.equations.output_orders.items() if not order]
     if instant:
         reason = f"{', '.join(instant)} depends on the command too (order 0), and plans are for functions of the state"
-    elif plant.outputs and replanning.law is not None:
-        reason = f"{type(replanning).__name__} tracks the planned motion of the model's states; use FromMeasurement"
     elif on_failure.uses_feedforward and not known_on_reference(plant):
         reason = f"{type(on_failure).__name__} needs references of states that no output gives; use HoldPlan"
     if reason:
@@ -263,11 +261,12 @@ def _room(problem: Problem, replanning: Replanning) -> np.ndarray | None:
     return room
 
 
-def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure, room: np.ndarray | None = None) -> Block:
+def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray | None) -> Block:
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
     _check_reference(problem)
+    optimiser, on_failure, restarts = controller.optimiser, controller.on_failure, controller.replanning.restarts
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
     count = live_signals(ocp.settings, plant.input).size
     data_of = _stage_data(problem, count)
@@ -286,7 +285,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure, r
         own = own_values(problem, s)
         motion = () if preview is None else preview(*own)
         data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, optimiser, ocp, s))
-        for seen in measured_signals(plant)[1:]:  # outputs that are given beside the state
+        for seen in measured_signals(plant)[1:] if restarts else ():  # outputs that are given beside the state
             shifted = shifted_reference(plant, ocp.data, ocp.stages + 1)
             data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters)
         if horizon.measured:

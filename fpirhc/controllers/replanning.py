@@ -45,7 +45,7 @@ class Replanning(Checked, ABC):
     @property
     def consistent(self) -> bool | None:
         """Whether a plan on outputs starts at the state at which the model has the measured ones; see `FromMeasurement`."""
-        return False
+        return True
 
     @property
     @abstractmethod
@@ -117,7 +117,7 @@ class FromMeasurementTracked(Replanning):
     def parts(self, problem: Problem) -> Parts:
         def start(s: Signals) -> dict[str, Expression]:
             fresh = ca.logic_or(s.warm_up < 0.5, s._due > 0.5)
-            return {"_plan_state": s.state, "_target": ca.if_else(fresh, s.state, s._target_before)}
+            return {"_plan_state": s.state, _FOLLOWED: ca.if_else(fresh, s.state, s._target_before)}
 
         return _tracked(problem, self.tracking, start)
 
@@ -157,15 +157,18 @@ class FromPlan(Replanning):
     def parts(self, problem: Problem) -> Parts:
         def start(s: Signals) -> dict[str, Expression]:
             target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)
-            return {"_plan_state": target, "_target": target}
+            return {"_plan_state": target, _FOLLOWED: target}
 
         return _tracked(problem, self.tracking, start)
+
+
+_FOLLOWED = "_followed_state"  # of the model on the planned motion
 
 
 def _tracked(problem: Problem, tracking: Tracking, start: Callable[[Signals], dict[str, Expression]]) -> Parts:
     plant = problem.plant
     law = tracking.within(largest_response(problem))
-    begin = _choose("plan_state", plant, start, ["_plan_state", "_target"])
+    begin = _choose("plan_state", plant, start, ["_plan_state", _FOLLOWED])
     delay = Delay(like(plant.state, "_target_before"), "target")
     after = [_propagate(plant, problem.period), law.law(plant, problem.period)]
     return [begin], after, [law.update(plant, problem.period)], [delay, *law.delays(plant)]
@@ -179,15 +182,19 @@ def _choose(name: str, plant: Plant, step: Callable[[Signals], dict[str, Express
 
 
 def _propagate(plant: Plant, period: float) -> Block:
-    """Block (target, planned input) -> (nominal response, target one cycle later by the model)."""
-    reads = Layout((like(plant.state, "_target"), like(plant.input, "planned"), plant.parameter))
-    writes = Layout((plant.response_signal("nominal"), like(plant.state, "target")))
-    response, calm = plant.equations.controlled_response, ca.DM.zeros(len(plant.names))
+    """Block (model's state, planned input) -> (its outputs, its response, its state one cycle later)."""
+    reads = Layout((like(plant.state, _FOLLOWED), like(plant.input, "planned"), plant.parameter))
+    writes = Layout((like(plant.output, "_target"), plant.response_signal("nominal"), like(plant.state, "target")))
+    model, calm = plant.equations, ca.DM.zeros(len(plant.names))
     after = motion_of(plant, USUAL, USUAL).step(plant, period)
 
     def step(s: Signals) -> dict[str, Expression]:
-        target_next = after(s._target, s.planned, s.parameters, calm)
-        return {"nominal": response(s._target, s.planned, s.parameters), "target": target_next}
+        state = getattr(s, _FOLLOWED)
+        return {
+            "_target": model.output(state, s.planned, s.parameters, calm),
+            "nominal": model.controlled_response(state, s.planned, s.parameters),
+            "target": after(state, s.planned, s.parameters, calm),
+        }
 
     return Block("propagate", reads, writes, step)
 

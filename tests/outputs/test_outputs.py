@@ -372,12 +372,7 @@ def test_a_gain_that_vanishes_on_the_way_is_named_for_several_inputs_too() -> No
 
 
 NOT_COVERED: dict[str, tuple[Callable[[], Controller], str]] = {
-    "from plan": (lambda: fp.RecedingHorizon(OPTIMISER, replanning=fp.FromPlan(TRACK)), "FromPlan tracks"),
-    "tracked": (
-        lambda: fp.RecedingHorizon(OPTIMISER, replanning=fp.FromMeasurementTracked(TRACK)),
-        "FromMeasurementTracked",
-    ),
-    "feedforward": (lambda: fp.RecedingHorizon(OPTIMISER, on_failure=fp.Feedforward()), "Feedforward needs references"),
+    "feedforward": (lambda: fp.RecedingHorizon(OPTIMISER, on_failure=fp.Feedforward()), "Feedforward needs references")
 }
 
 

@@ -116,11 +116,7 @@ REFUSED: dict[str, tuple[Callable[[], Controller], str]] = {
     "desired": (
         lambda: fp.Predicted(fp.ComputedTorque(LAW), inputs=LATE, by=fp.ByDesired()),
         r"ByDesired\(\) does not predict C, which no desired response moves; use ByModel\(\)",
-    ),
-    "inside": (
-        lambda: fp.Predicted(fp.RecedingHorizon(OPTIMISER, replanning=fp.FromPlan(LAW)), inputs=LATE),
-        "FromPlan tracks",
-    ),
+    )
 }
 
 

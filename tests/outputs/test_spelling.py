@@ -47,6 +47,7 @@ LOOPS: dict[str, tuple[Controller, fp.Problem]] = {
         for name, controller, changes in (
             ("rate", fp.rivals.ResolvedAccelerationRate(rate=6.0), {}),  # the measured responses move the states of a wrong model
             ("disturbed", TWO_MASS.controllers["RHC+FPI"], PUSHED),
+            ("plan", fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2), MAP, fp.FromPlan(TRACK)), {}),
             ("late", TWO_MASS.controllers["RHC+FPI"], LATE),
             ("paired", fp.Predicted(fp.ComputedTorque(TRACK, fp.Paired(MAP, cycles=5)), inputs=3e-3, measurement=2e-3), LATE),
             ("at once", fp.Estimating(fp.ComputedTorque(TRACK), FILTER, at_once=True), {}),
@@ -200,12 +201,30 @@ def agree(states: fp.Problem, coordinates: fp.Problem, controller: Controller) -
     return run
 
 
+REPLANNING = {
+    "measured": fp.FromMeasurement(),
+    "tracked": fp.FromMeasurementTracked(fp.Exponential(rate=4.0)),
+    "own": fp.FromPlan(fp.Exponential(rate=4.0)),
+}
+
+
+@pytest.mark.parametrize("way", REPLANNING)
 @pytest.mark.parametrize("name", PLANTS)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_adaptive_plans_on_a_plant_are_those_on_the_plant_in_its_outputs(name: str, seed: int) -> None:
+def test_adaptive_plans_on_a_plant_are_those_on_the_plant_in_its_outputs(name: str, seed: int, way: str) -> None:
     wrong = np.random.default_rng(seed).uniform(0.6, 1.6, 3)
-    run = agree(*both(PLANTS[name](wrong)), fp.RecedingHorizon(OPTIMISER, WHOLE))
+    run = agree(*both(PLANTS[name](wrong)), fp.RecedingHorizon(OPTIMISER, WHOLE, REPLANNING[way]))
     assert np.abs(run["command_shift"]).max() > 0.1
+
+
+@pytest.mark.parametrize("way", ["tracked", "own"])
+@pytest.mark.parametrize("name", PLANTS)
+def test_so_are_tracked_plans_without_adaptation(name: str, way: str) -> None:
+    """From a start at which model and plant have other derivatives; what the law adds is passed through the same inverse."""
+    wrong = np.random.default_rng(3).uniform(0.6, 1.6, 3)
+    states, coordinates = both(PLANTS[name](wrong), {"x0": 0.4, "x1": -0.2})
+    run = agree(states, coordinates, fp.RecedingHorizon(OPTIMISER, replanning=REPLANNING[way]))
+    assert np.abs(run["desired"] - run["nominal"]).max() > 0.1
 
 
 @pytest.mark.parametrize("name", PLANTS)
