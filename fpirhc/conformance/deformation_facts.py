@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.conformance.laws import hold, keep
-from fpirhc.deformation.base import Deformation, Demand, automatic, innermost, with_inner
+from fpirhc.deformation.base import Deformation, RequestChange, automatic, innermost, with_inner
 from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
 
@@ -56,7 +56,7 @@ class _Cycles:
     @cached_property
     def function(self) -> ca.Function:
         """Function (request, response, desired, memory) -> (request, memory)."""
-        settled = self.deformation.suited(Demand(self.amplitude, sudden=True))
+        settled = self.deformation.with_scale_for(RequestChange(self.amplitude, sudden=True))
         request, response, desired = (ca.SX.sym(name) for name in ("request", "response", "desired"))
         memory = ca.SX.sym("memory", self.layout.size)
         deformed, next_memory = settled.step(request, response, desired, self.layout.split(memory))
@@ -156,17 +156,19 @@ def held_keeps_the_memory(trial: _Cycles, generator: np.random.Generator) -> Non
 
 
 def automatic_settings_are_chosen(trial: _Cycles, generator: np.random.Generator) -> None:
-    """`suited` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
+    """`with_scale_for` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
     deformation = trial.deformation
     for sudden in (False, True):
         change = float(generator.uniform(2.0, 20.0))
-        ready = deformation.suited(Demand(change, sudden))
-        hold(not automatic(ready), f"suited() leaves {automatic(ready)} open")
+        ready = deformation.with_scale_for(RequestChange(change, sudden))
+        hold(not automatic(ready), f"with_scale_for() leaves {automatic(ready)} open")
         if not automatic(deformation):
-            hold(describe(ready) == describe(deformation), f"no setting is automatic, but suited() gives {ready}")
+            hold(
+                describe(ready) == describe(deformation), f"no setting is automatic, but with_scale_for() gives {ready}"
+            )
         else:
             step = ready.largest_step()
-            hold(step >= 0.99 * change, f"suited to changes of {change:.3g} its largest step is {step:.3g}")
+            hold(step >= 0.99 * change, f"with the scale for changes of {change:.3g} its largest step is {step:.3g}")
 
 
 def constant_map_keeps_its_gain(trial: _Cycles, generator: np.random.Generator) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, NoReturn, Self, TypeVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.reference_states import plan_demand, reference_demand
+from fpirhc.controllers.reference_states import request_along_reference, request_of_plans
 from fpirhc.deformation.base import Deformation, Identity, automatic, with_inner
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked, former_members, replaced, unnamed_inner
@@ -253,8 +253,10 @@ class Controller(Checked, ABC):
         deformation = _late(own, problem)
         if automatic(deformation):
             where = problem if self.inner is None else self.inner_problem(problem)
-            demand = reference_demand(where, tracking_law(self)) if self.planner is None else plan_demand(where)
-            deformation = deformation.suited(demand)
+            request = (
+                request_along_reference(where, tracking_law(self)) if self.planner is None else request_of_plans(where)
+            )
+            deformation = deformation.with_scale_for(request)
         return self if deformation is own else self.with_deformation(deformation)
 
     def response(self, problem: Problem) -> Response | None:

@@ -203,7 +203,7 @@ _STAYS = 1e-9  # share of the fastest pole below which an error counts as stayin
 
 
 @dataclass(frozen=True)
-class FreeErrors:
+class UnobservableErrors:
     """Errors of believed states that no measurement corrects.
 
     Args:
@@ -218,11 +218,11 @@ class FreeErrors:
 
 
 @lru_cache(maxsize=8)  # several controllers are checked on one problem
-def free_errors(problem: Problem) -> FreeErrors:
+def unobservable_errors(problem: Problem) -> UnobservableErrors:
     """Return the errors of the believed states that no measurement corrects; of a problem without an observer there are none."""
     plant, observer = problem.plant, problem.sensing.observer
     if observer is None:
-        return FreeErrors((), -np.inf, decays=True)
+        return UnobservableErrors((), -np.inf, decays=True)
     names = observer.uses(problem.sensing.measures(plant))
     states, slopes, shown = _linearised(problem, names)
     size = np.maximum(np.abs(states).max(axis=0), np.abs(problem.start_state))
@@ -232,7 +232,9 @@ def free_errors(problem: Problem) -> FreeErrors:
     basis = observer.free(scaled, [c * size for c in shown], known)
     pole = slowest(scaled, basis, growth_of(plant))
     fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
-    return FreeErrors(tuple(plant.state.elements[k] for k in members(basis)), pole, decays=pole < -_STAYS * fastest)
+    return UnobservableErrors(
+        tuple(plant.state.elements[k] for k in members(basis)), pole, decays=pole < -_STAYS * fastest
+    )
 
 
 def check_observed(problem: Problem) -> None:
@@ -244,7 +246,7 @@ def check_observed(problem: Problem) -> None:
     observer = problem.sensing.observer
     if observer is None or not observer.needs_detectability:
         return
-    free = free_errors(problem)
+    free = unobservable_errors(problem)
     if not free.decays:
         measured = ", ".join(observer.uses(problem.sensing.measures(problem.plant)))
         raise NotSupported(

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction.large_errors import step_for_basin
-from fpirhc.deformation.base import Demand
+from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
 from fpirhc.horizon.nominal import known_on_reference, nominal_run
 from fpirhc.plant.chain import nominal_responses
@@ -160,17 +160,17 @@ def _with(command: np.ndarray, k: int, value: float) -> np.ndarray:
 _INSTANTS = 2000
 
 
-def reference_demand(problem: Problem, law: Tracking | None = None) -> Demand:
+def request_along_reference(problem: Problem, law: Tracking | None = None) -> RequestChange:
     """Return the change period max|d/dt r^N| of the nominal response r^N, or its largest jump, with the recovery for `law`."""
     t = ca.MX.sym("t")
     responses = nominal_motion(problem)(t)[1]
     response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant)
     smooth = problem.period * _slew(response_of, problem.duration)
     change = max(jump, _largest_change(response_of, problem)) if jump else smooth
-    return Demand(change, sudden=False, recovery=_recovery(problem, law))
+    return RequestChange(change, sudden=False, recovery=_recovery(problem, law))
 
 
-def plan_demand(problem: Problem) -> Demand:
+def request_of_plans(problem: Problem) -> RequestChange:
     """Return the jump of the model's response when the command jumps from limit to limit in one cycle.
 
     Raises:
@@ -187,17 +187,17 @@ def plan_demand(problem: Problem) -> Demand:
     x, u, p = plant.symbols()
     gain = ca.Function("g", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
     at_start = np.asarray(gain(problem.start_state, (lower + upper) / 2, plant.approximate).full())
-    return Demand(float(np.linalg.norm(np.abs(at_start) @ (upper - lower))), sudden=True)
+    return RequestChange(float(np.linalg.norm(np.abs(at_start) @ (upper - lower))), sudden=True)
 
 
-def command_demand(problem: Problem, parameters: np.ndarray) -> Demand:
+def request_of_commands(problem: Problem, parameters: np.ndarray) -> RequestChange:
     """Return the change period max|dQ/dt| of the command Q that the model with these parameters needs along the reference."""
     plant, times = problem.plant, np.linspace(0.0, problem.duration, _INSTANTS)
     wanted = nominal_motion(problem).map(_INSTANTS)(times[None, :])[1]
     values = plant.equations.inverse.map(_INSTANTS)(
         reference_states(problem, _INSTANTS), wanted, np.repeat(parameters[:, None], _INSTANTS, axis=1)
     )
-    return Demand(problem.period * _steepest(np.asarray(values.full()), times), sudden=False)
+    return RequestChange(problem.period * _steepest(np.asarray(values.full()), times), sudden=False)
 
 
 def _recovery(problem: Problem, law: Tracking | None) -> float:

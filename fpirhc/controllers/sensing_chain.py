@@ -36,7 +36,7 @@ from fpirhc.task.problem import Problem
 _LATEST: Latest[Composite] = Latest(4)
 
 
-def compose_seeing(problem: Problem, controller: Controller) -> Composite:
+def compose_with_sensing(problem: Problem, controller: Controller) -> Composite:
     """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
 
     Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.

@@ -29,6 +29,7 @@ FORMER = {  # members of earlier versions
         "write `iteration`, a value of the class Iteration with all of these",
     ),
     "settled": "leave it out",
+    "suited": "write `with_scale_for`, with the same argument",
 }
 Wrapping = TypeVar("Wrapping")
 
@@ -106,7 +107,7 @@ class Pairing:
 
 
 @dataclass(frozen=True)
-class Demand:
+class RequestChange:
     """How much the desired response of a controller changes, for maps whose automatic settings depend on it.
 
     Args:
@@ -192,9 +193,9 @@ class Deformation(Checked, ABC):
         """The way of the model's response to `step`, which is given it as `request`; without a model it is given the last one."""
         return LastRequest() if self.inner is None else self.inner.mirror
 
-    def suited(self, demand: Demand) -> Self:
+    def with_scale_for(self, request: RequestChange) -> Self:
         """Return the map with its automatic settings chosen for how much the desired response changes."""
-        return self if self.inner is None else with_inner(self, self.inner.suited(demand))
+        return self if self.inner is None else with_inner(self, self.inner.with_scale_for(request))
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """What the map remembers besides the pair (request, desired); by default nothing."""
@@ -265,7 +266,7 @@ def with_inner(wrapper: Wrapping, inner: object) -> Wrapping:
 
 
 def automatic(deformation: Deformation) -> tuple[str, ...]:
-    """Return names of settings that `suited` still has to choose: fields with the metadata {"automatic": True} that are None."""
+    """Names of settings that `with_scale_for` still has to choose: None, with the metadata {"automatic": True}."""
     own = innermost(deformation)
     if not is_dataclass(own):
         return ()

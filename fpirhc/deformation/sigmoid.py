@@ -16,7 +16,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Demand, require_numbers, smooth_norm
+from fpirhc.deformation.base import Deformation, RequestChange, require_numbers, smooth_norm
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.functions import atanh, signed, sqrt, tanh
 from fpirhc.symbolic.layout import Expression
@@ -66,8 +66,8 @@ class Sigmoid(Deformation):
         """Return the same map with scale S."""
         return replace(self, scale=scale)
 
-    def suited(self, demand: Demand) -> Self:
-        """Return the map with a scale S of at least 1 that serves the demand; a scale that the user has set stays.
+    def with_scale_for(self, request: RequestChange) -> Self:
+        """Return the map with a scale S of at least 1 for the change of the request; a scale that the user has set stays.
 
         The largest step covers a sudden change. For a change that goes on from cycle to cycle S is twice the change. In both cases
         the largest step covers the recovery.
@@ -75,8 +75,8 @@ class Sigmoid(Deformation):
         if self.scale is not None:
             return self
         step = self.with_scale(1.0).largest_step()
-        scale = demand.change / step if demand.sudden else 2 * demand.change
-        return self.with_scale(float(f"{max(1.0, scale, demand.recovery / step):.3g}"))
+        scale = request.change / step if request.sudden else 2 * request.change
+        return self.with_scale(float(f"{max(1.0, scale, request.recovery / step):.3g}"))
 
     @cached_property
     def _tanh_fixed_point(self) -> float:

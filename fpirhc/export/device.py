@@ -15,7 +15,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import BRIDGED
-from fpirhc.controllers.sensing_chain import compose_seeing
+from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.c_text import portable
 from fpirhc.simulation.clock import most_missed
@@ -131,7 +131,7 @@ class BareStep:
     """
 
     def __init__(self, problem: Problem, controller: Controller, behind: Stepper) -> None:
-        composite = compose_seeing(problem, controller)
+        composite = compose_with_sensing(problem, controller)
         self.function, self.memory, self.signals = composite.function, composite.memory, composite.trace
         self.reads = Layout(tuple(behind.reads[name] for name in composite.reads.names))
         self.numbers = behind.numbers

@@ -17,8 +17,8 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
+from fpirhc.review.dead_time_variants import is_late, scaled
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.late import is_late, scaled
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearCycle, LinearLoop
 from fpirhc.simulation.linearise.linear_map import near_fixed_point

@@ -16,7 +16,7 @@ from fpirhc.controllers.gate import BRIDGED, INNER, Gate, across_gaps, gap_of
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.plausible import plausible_range, response_jumps
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.controllers.sensing_chain import compose_seeing, seeing_blocks
+from fpirhc.controllers.sensing_chain import compose_with_sensing, seeing_blocks
 from fpirhc.plant.motion import time_signal
 from fpirhc.simulation.path import acting_blocks, disturbance_signals, moving, outside_blocks, sensing_blocks
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -49,7 +49,7 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
     mover = moving(problem)
     plausible = plausible_range(task) if mover.doubted else {}
-    inner, gap = across_gaps(compose_seeing(problem, ready)), gap_of(task, BRIDGED)
+    inner, gap = across_gaps(compose_with_sensing(problem, ready)), gap_of(task, BRIDGED)
     acting = Gate(task, inner, trusted=("time", "memory"), plausible=plausible, gap=gap)
     disturbed = disturbance_signals(problem)
     seeing = sensing_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)

@@ -18,7 +18,7 @@ from fpirhc.controllers.base import Controller, fed
 from fpirhc.controllers.gate import Gate, across_gaps, gap_of, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.plausible import response_jumps
-from fpirhc.controllers.sensing_chain import compose_seeing, given_states, raw_signal
+from fpirhc.controllers.sensing_chain import compose_with_sensing, given_states, raw_signal
 from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported
@@ -233,7 +233,7 @@ def composed_step(
 
     def compose(problem: Problem, controller: Controller) -> Composite:
         gap = gap_of(live.problem, bridged)
-        inner = across_gaps(compose_seeing(problem, controller))
+        inner = across_gaps(compose_with_sensing(problem, controller))
         gates.append(Gate(live.problem, inner, plausible=plausible, max_age=max_age, gap=gap))
         return machine_step(live.problem, ready, gates[-1], monitor)
 

@@ -36,7 +36,7 @@ from fpirhc.controllers.contract import (
     without_deformation,
 )
 from fpirhc.controllers.mirror import MEASURED
-from fpirhc.controllers.reference_states import command_demand, plan_demand, reference_demand
+from fpirhc.controllers.reference_states import request_along_reference, request_of_commands, request_of_plans
 from fpirhc.controllers.sensing_chain import compose_controller, controller_reads, embedded
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import InvalidField, InvalidValue, NotContractive, NotSupported
@@ -351,7 +351,9 @@ def test_automatic_settings_are_chosen_and_others_kept():
     assert resolved(problem, values) is values
     resolved_controller: Any = resolved(problem, fp.ExactModel(fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5))))
     exact = values.inner_problem(problem)
-    assert resolved_controller.deformation == fp.Sigmoid(gain=-0.5).suited(reference_demand(exact, TRACK))
+    assert resolved_controller.deformation == fp.Sigmoid(gain=-0.5).with_scale_for(
+        request_along_reference(exact, TRACK)
+    )
 
 
 def test_checks_before_a_run():
@@ -377,7 +379,7 @@ def test_checks_before_a_run():
 
 def test_a_reference_asks_for_its_largest_change_in_a_cycle():
     """That of (-4 sin 2t, -cos t): the largest size of (-8 cos 2t, sin t) per second."""
-    demand = reference_demand(masses())
+    demand = request_along_reference(masses())
     assert demand.change == pytest.approx(np.hypot(8 * np.cos(2 * TIMES), np.sin(TIMES)).max() * PERIOD, rel=1e-3)
     assert (demand.sudden, demand.recovery) == (False, 0.0)
 
@@ -385,28 +387,28 @@ def test_a_reference_asks_for_its_largest_change_in_a_cycle():
 def test_a_tracking_law_asks_for_the_basin_of_its_largest_error():
     """What the model does without commands is (0, -3 / 8); the reference asks for (-4 sin 2t, -cos t): the largest distance."""
     largest = np.hypot(-4 * np.sin(2 * TIMES), -np.cos(TIMES) + 3 / 8).max()
-    assert reference_demand(masses(), TRACK).recovery == pytest.approx(
+    assert request_along_reference(masses(), TRACK).recovery == pytest.approx(
         step_for_basin(largest, 3, 2.0, PERIOD), rel=1e-4
     )
     no_gains = fp.Fractional(rate=2.0, order=0.8, memory=1.0)
-    assert reference_demand(masses(), no_gains).recovery == 0.0
+    assert request_along_reference(masses(), no_gains).recovery == 0.0
 
 
 def test_a_plan_asks_for_a_jump_between_the_limits():
     """5 N on 1 kg and 16 N on 8 kg: (5, 2). An input without a limit bounds nothing."""
-    demand = plan_demand(masses(limits=fp.Limits(inputs={"u": (-2.0, 3.0), "w": (-8.0, 8.0)})))
+    demand = request_of_plans(masses(limits=fp.Limits(inputs={"u": (-2.0, 3.0), "w": (-8.0, 8.0)})))
     assert demand.change == pytest.approx(np.hypot(5.0, 2.0))
     assert (demand.sudden, demand.recovery) == (True, 0.0)
     for free in ({"u": (-2.0, 3.0)}, {"u": (-2.0, 3.0), "w": (0.0, np.inf)}):
         with pytest.raises(InvalidValue, match="input 'w' has no finite limits"):
-            plan_demand(masses(limits=fp.Limits(inputs=free)))
+            request_of_plans(masses(limits=fp.Limits(inputs=free)))
     with pytest.raises(InvalidValue, match="input 'u' has no finite limits"):
-        plan_demand(masses())
+        request_of_plans(masses())
 
 
 def test_a_filtered_command_asks_for_its_largest_change_in_a_cycle():
     """With masses of 2 and 4 kg u = (-8 sin 2t, 3 - 4 cos t): the largest size of (-16 cos 2t, 4 sin t) N/s."""
-    demand = command_demand(masses(), np.array([2.0, 4.0]))
+    demand = request_of_commands(masses(), np.array([2.0, 4.0]))
     largest = np.hypot(16 * np.cos(2 * TIMES), 4 * np.sin(TIMES)).max()
     assert demand.change == pytest.approx(largest * PERIOD, rel=1e-3)
     assert not demand.sudden
@@ -415,8 +417,8 @@ def test_a_filtered_command_asks_for_its_largest_change_in_a_cycle():
 def test_demands_count_the_beginning_of_the_reference():
     """Along e^(-3 t) everything is largest at t = 0: 27 per second, and an error of (9, 3 / 8); with 2 kg u falls by 54 N/s."""
     problem = replace(masses(), reference=fp.Trajectory(lambda t: {"a": ca.exp(-3 * t), "b": 1 + 0 * t}))
-    assert command_demand(problem, np.array([2.0, 4.0])).change == pytest.approx(54.0 * PERIOD, rel=1e-2)
-    demand = reference_demand(problem, TRACK)
+    assert request_of_commands(problem, np.array([2.0, 4.0])).change == pytest.approx(54.0 * PERIOD, rel=1e-2)
+    demand = request_along_reference(problem, TRACK)
     assert demand.change == pytest.approx(27.0 * PERIOD, rel=1e-2)
     assert demand.recovery == pytest.approx(step_for_basin(np.hypot(9.0, 3 / 8), 3, 2.0, PERIOD), rel=1e-9)
 
@@ -424,7 +426,7 @@ def test_demands_count_the_beginning_of_the_reference():
 def test_a_small_error_asks_for_a_small_step():
     """At rest only the model's 3 / 8 is to be recovered from."""
     problem = replace(masses(), reference=fp.Trajectory(lambda t: {"a": 0 * t, "b": 1 + 0 * t}))
-    demand = reference_demand(problem, TRACK)
+    demand = request_along_reference(problem, TRACK)
     assert demand.change == 0.0
     assert demand.recovery == pytest.approx(step_for_basin(3 / 8, 3, 2.0, PERIOD), rel=1e-9)
 
@@ -440,7 +442,7 @@ def test_a_jump_is_that_of_the_slope_between_the_limits():
     )
     reference, limits = fp.Trajectory(lambda t: {"y": 4 * t**2}), fp.Limits(inputs={"u": (1.0, 3.0)})
     problem = fp.Problem(plant, reference, start={"y": 0.0}, period=PERIOD, duration=1.0, limits=limits)
-    assert plan_demand(problem).change == pytest.approx(12.0)
+    assert request_of_plans(problem).change == pytest.approx(12.0)
 
 
 # What a form believes
@@ -539,7 +541,7 @@ def test_a_reference_that_jumps_asks_for_its_largest_change_in_a_cycle():
     """A set-point of 2 m through a filter of rate 3 and the plant's order: its response jumps by 3^2 x 2 m at once."""
     aims = fp.Setpoint({"a": 2.0, "b": 0.0}, rate=3.0, order=2, start={"a": 0.0, "b": 0.0})
     jump = replace(masses(), reference=aims, start={"a": 0.0, "b": 0.0})
-    assert reference_demand(jump).change == pytest.approx(18.0, rel=1e-9)
+    assert request_along_reference(jump).change == pytest.approx(18.0, rel=1e-9)
     moves = {0.0: 1.0, 7.0: 3.0, 7.2: -6.0}  # s, m: each adds 3^2 e^(-3 t) (1 - 3 t) per metre from its time on
     aims = replace(aims, values={"a": [(0.0, 1.0), (7.0, 4.0), (7.2, -2.0)], "b": 0.0})
 
@@ -548,4 +550,4 @@ def test_a_reference_that_jumps_asks_for_its_largest_change_in_a_cycle():
         return np.sum(kicks, axis=0)
 
     largest = np.abs(response(TIMES + PERIOD) - response(TIMES))[TIMES < 9.9].max()
-    assert reference_demand(replace(jump, reference=aims)).change == pytest.approx(largest, rel=2e-2)  # sampled
+    assert request_along_reference(replace(jump, reference=aims)).change == pytest.approx(largest, rel=2e-2)  # sampled

@@ -13,7 +13,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.gate import AGAIN, Gap, across_gaps, gap_of
-from fpirhc.controllers.sensing_chain import compose_seeing
+from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.status import Status
 from fpirhc.symbolic.block import LONG, Block, compose
 from fpirhc.symbolic.layout import Layout, scalar
@@ -98,7 +98,7 @@ def test_the_counter_of_a_problem():
 def test_a_step_reads_the_gap_where_a_block_knows_it():
     """A step without such a block stays the same object."""
     problem = replace(two_masses(), sensing=fp.Sensing(estimator=fp.PositionDifference()))
-    step = compose_seeing(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)))
+    step = compose_with_sensing(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)))
     assert "gap" not in step.reads
     assert "gap" in across_gaps(step).reads
     block = Block("b", Layout((scalar("a"),)), Layout((scalar("c"),)), lambda s: {"c": s.a})

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import brentq
 
 import fpirhc as fp
-from fpirhc.deformation.base import Deformation, Demand, Reach, automatic
+from fpirhc.deformation.base import Deformation, Reach, RequestChange, automatic
 from fpirhc.errors import InvalidValue
 
 
@@ -98,17 +98,17 @@ def test_scale_of_the_sigmoid():
     """The step covers a jump, or twice a change that goes on (S then, 0.81 S the step), the recovery too; S is at least 1."""
     free, step = fp.Sigmoid(gain=-0.5), fp.Sigmoid(gain=-0.5, scale=1.0).largest_step()
     selection = {
-        Demand(50.0, sudden=True): 50.0 / step,
-        Demand(50.0, sudden=False): 100.0,
-        Demand(50.0, sudden=False, recovery=200.0): 200.0 / step,
-        Demand(0.1, sudden=False): 1.0,
-        Demand(0.9, sudden=True): 0.9 / step,
+        RequestChange(50.0, sudden=True): 50.0 / step,
+        RequestChange(50.0, sudden=False): 100.0,
+        RequestChange(50.0, sudden=False, recovery=200.0): 200.0 / step,
+        RequestChange(0.1, sudden=False): 1.0,
+        RequestChange(0.9, sudden=True): 0.9 / step,
     }
     assert step == pytest.approx(0.81, abs=5e-3)  # with the usual shift of 0.3
-    for demand, scale in selection.items():
-        assert free.suited(demand).scale == pytest.approx(scale, rel=5e-3)
+    for request, scale in selection.items():
+        assert free.with_scale_for(request).scale == pytest.approx(scale, rel=5e-3)
     assert (automatic(free), automatic(free.with_scale(2.0))) == (("scale",), ())
-    assert free.with_scale(2.0).suited(Demand(50.0, sudden=True)).scale == 2.0
+    assert free.with_scale(2.0).with_scale_for(RequestChange(50.0, sudden=True)).scale == 2.0
     assert fp.Sigmoid(gain=-0.5, shift=5.0).shift == 5.0
     for wrong in (
         {"shift": 5.01},

@@ -11,7 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.sensing_chain import compose_seeing
+from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.members import FAMILIES, member_classes
 from fpirhc.simulation.loop import close_loop
 
@@ -132,7 +132,7 @@ def test_the_page_on_architecture_names_the_blocks_of_a_cycle_in_their_order_and
     task = fp.load_problem("noisy_motor")
     ready = resolved(task.problem, task.controllers["RHC+FPI"])
     loop = [block.name for block in close_loop(task.problem, ready).blocks]
-    inside = [block.name for block in compose_seeing(task.problem, ready).blocks]
+    inside = [block.name for block in compose_with_sensing(task.problem, ready).blocks]
     cycle = [name for block in loop for name in ([block, *inside] if block == "gate" else [block])]
     assert told == [name for name in cycle if name in told]
     assert {"sense", "plan_every_2", "deform", "advance"} <= set(told)

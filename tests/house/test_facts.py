@@ -156,7 +156,7 @@ def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
 
     @dataclass(frozen=True)
     class Finished(fp.Sigmoid):
-        def suited(self, demand):  # noqa: ARG002
+        def with_scale_for(self, demand):  # noqa: ARG002
             return self
 
     @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.review.grid import review_grid
 from fpirhc.review.questions.reality import LOOP, RESONANCE
-from fpirhc.review.real_pair import extra_modes, real_loops, real_points
+from fpirhc.review.true_plant_loop import extra_modes, real_loops, real_points
 
 K, R, L, MOTOR, LOAD, C, B = 0.05, 1.0, 5e-4, 5e-4, 5e-4, 20.0, 5e-3  # N m/A, ohm, H, kg m^2 twice, N m/rad, N m s
 NAMES = ("motor", "motor_speed", "angle", "load_speed", "current")

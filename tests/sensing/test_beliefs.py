@@ -16,7 +16,7 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.observed_state import free_errors
+from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.sensing.base import StateObserver
 from fpirhc.sensing.observability import unobservable
@@ -191,7 +191,7 @@ def test_a_model_that_runs_by_itself_drifts_without_bound():
     expected = np.concatenate([[0.0], np.cumsum(speed[:-1] * period - 0.2 * command * period**2 / 2)])
     np.testing.assert_allclose((result["state.y"] - result["plant_state.y"]), expected, atol=1e-10)
     assert abs(expected[-1]) > 0.5
-    assert not free_errors(problem).decays
+    assert not unobservable_errors(problem).decays
 
 
 # Kalman's filter
@@ -400,10 +400,10 @@ def test_motion_can_show_what_rest_hides():
 
 def test_errors_that_decay_are_allowed_and_known():
     """The effect site follows the plasma and shows nowhere; its error decays with ke0 of the model, 0.26 / min."""
-    free = free_errors(infusion(KALMAN))
+    free = unobservable_errors(infusion(KALMAN))
     assert free.states == ("Ce",)
     assert free.pole == pytest.approx(-0.26, rel=1e-9)
-    assert free_errors(infusion(fp.ModelStates())).states == ("C2", "C3", "Ce")
+    assert unobservable_errors(infusion(fp.ModelStates())).states == ("C2", "C3", "Ce")
 
 
 def test_a_state_that_cannot_be_observed_is_named_before_the_run():

@@ -18,7 +18,7 @@ from gaps import gone_on
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.observed_state import free_errors
+from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.sensing.base import StateObserver
 from fpirhc.simulation.sample import raw_measurements
@@ -309,7 +309,7 @@ def test_a_review_says_what_cannot_be_observed() -> None:
         answers = fp.review(problem, {"CTC": PLAIN}, mismatch=0.0, seed=0).problem
         return next(a for a in answers if a.question == "Are the believed states right after a while?")
 
-    assert free_errors(sedated(FILTER)).states == ()
+    assert unobservable_errors(sedated(FILTER)).states == ()
     assert "show in depth" in answer(sedated(FILTER)).evidence
     of_model = answer(sedated(fp.ModelStates()))
     assert of_model.verdict == "yes"

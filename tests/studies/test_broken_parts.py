@@ -16,7 +16,7 @@ from fpirhc.review.questions.commands import COMMANDS
 from fpirhc.review.questions.gain import GAIN
 from fpirhc.simulation import run_signals
 from fpirhc.studies.comparison import compare as comparing
-from fpirhc.studies.comparison import side_by_side
+from fpirhc.studies.comparison import pairwise
 
 TASK = fp.load_problem("two_mass")
 CONTROLLERS = {name: TASK.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")}
@@ -72,7 +72,7 @@ def test_a_part_of_a_comparison_that_breaks_loses_no_run(part, name, monkeypatch
 
 def test_a_null_test_that_breaks_loses_no_comparison(monkeypatch):
     """It stands with the sentences about what is known."""
-    monkeypatch.setattr(side_by_side, "null_test", breaks)
+    monkeypatch.setattr(pairwise, "null_test", breaks)
     result = fp.compare(task(), seed=0, compiled=False)
     assert result.null is None
     assert any(s.startswith("the null test could not be computed (LinAlgError") for s in result.information)

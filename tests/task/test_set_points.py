@@ -15,7 +15,7 @@ from scipy.special import comb
 import fpirhc as fp
 from fpirhc.cli.verbs.run import by_kind
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.reference_states import reference_demand
+from fpirhc.controllers.reference_states import request_along_reference
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue, NotSupported
 from fpirhc.report.terminal import set_points_in_force
 from fpirhc.simulation.loop import close_loop
@@ -336,11 +336,11 @@ def test_a_higher_filter_makes_a_step_smooth():
 def test_automatic_scale_covers_the_jump_of_the_response():
     """A step moves the desired response at once by a^2 change, which no derivative shows: 2-norm over the coordinates."""
     problem = two_mass(values={"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": [(0.0, 5.4), (0.1, 5.7)]})
-    assert reference_demand(problem).change == pytest.approx(
+    assert request_along_reference(problem).change == pytest.approx(
         10.0**2 * np.hypot(0.2, 0.3)
     )  # and not more in a short run
     smooth = replace(problem, reference=replace(problem.reference, order=3))
-    assert reference_demand(smooth).change < 5.0
+    assert request_along_reference(smooth).change < 5.0
     ready = resolved(problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5)))
     assert ready.deformation.largest_step() > 10.0**2 * np.hypot(0.2, 0.3)
 

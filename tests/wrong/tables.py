@@ -79,7 +79,7 @@ MAP_MEMBERS = {
     "secant_gain": "secant is bounded",
     "shown": "shown is remembered",
     "step": "fixed point stays",
-    "suited": "automatic settings are chosen",
+    "with_scale_for": "automatic settings are chosen",
     "with_effective_gain": "gain can be set",
 }
 LOUD = "wrong start is corrected", "does not converge"  # a gain with which every correction is worse than the error

@@ -12,7 +12,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, bounded, commanding_blocks, desired_blocks, like
 from fpirhc.controllers.contract import Deforms, PlantModel
-from fpirhc.controllers.reference_states import command_demand
+from fpirhc.controllers.reference_states import request_of_commands
 from fpirhc.deformation.base import Deformation, automatic
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import finite_number
@@ -42,8 +42,8 @@ class ForceMRAC(Controller):
     def with_defaults(self, problem: Problem) -> ForceMRAC:
         if not automatic(self.deformation):
             return self
-        demand = command_demand(problem, self.plant_model(problem).parameters(problem.plant))
-        return replace(self, deformation=self.deformation.suited(demand))
+        request = request_of_commands(problem, self.plant_model(problem).parameters(problem.plant))
+        return replace(self, deformation=self.deformation.with_scale_for(request))
 
     def plant_model(self, problem: Problem) -> PlantModel:
         return PlantModel(problem.plant, problem.signals, given=self.model)

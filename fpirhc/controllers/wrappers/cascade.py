@@ -17,7 +17,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, like, reference_block
 from fpirhc.controllers.contract import Deforms, without_deformation
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
-from fpirhc.deformation.base import Deformation, Demand, automatic
+from fpirhc.deformation.base import Deformation, RequestChange, automatic
 from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.fields.checked import Checked
@@ -295,17 +295,17 @@ class Cascade(Controller):
         return replace(
             self,
             paired=None if paired is None else paired.stated(problem),
-            deformation=map_.suited(self._demand(problem)) if automatic(map_) else map_,
+            deformation=map_.with_scale_for(self._request_change(problem)) if automatic(map_) else map_,
         )
 
-    def _demand(self, problem: Problem) -> Demand:
+    def _request_change(self, problem: Problem) -> RequestChange:
         """Return the size of the reference's controlled quantities, which the shift may have to make up for at once."""
         plant, function = problem.plant, problem.reference.function(problem.plant)
         times = np.linspace(0.0, problem.duration, _SAMPLES)
         motion = np.array([np.asarray(function(t)[0].full()).ravel() for t in times])
         places = [plant.output.elements.index(n) for n in plant.controlled_names]
         outputs = np.vstack([problem.start_output[places], motion[:, places]])
-        return Demand(float(np.linalg.norm(np.ptp(outputs, axis=0))), sudden=True)
+        return RequestChange(float(np.linalg.norm(np.ptp(outputs, axis=0))), sudden=True)
 
     def check(self, problem: Problem) -> None:
         """Raise if the inner controller, the map or the pairing does not fit the problem.

@@ -11,8 +11,8 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict, duration, per_cycle
+from fpirhc.review.dead_time_variants import is_late
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.late import is_late
 from fpirhc.review.loops import Loops, is_planned, loops_over_box
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.zero_dynamics import of_zero_dynamics, zero_dynamics_modes

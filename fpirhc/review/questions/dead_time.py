@@ -12,7 +12,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.late import is_late, scaled
+from fpirhc.review.dead_time_variants import is_late, scaled
 from fpirhc.review.nominal_runs import CYCLES
 from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
 from fpirhc.review.questions.margins import margins

@@ -10,8 +10,8 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import is_planned
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion
-from fpirhc.review.real_pair import real_points
 from fpirhc.review.stages import CYCLE, HORIZON, Place, advice, first_place, step_poles
+from fpirhc.review.true_plant_loop import real_points
 
 DISCRETISATION = "Does the discretisation of the horizon follow the plant?"
 

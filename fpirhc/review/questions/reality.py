@@ -14,7 +14,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.speed import law_of
-from fpirhc.review.real_pair import Extra, extra_modes, real_loops, real_points
+from fpirhc.review.true_plant_loop import Extra, extra_modes, real_loops, real_points
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL
 
 LOOP = "Does the loop with the reality converge?"

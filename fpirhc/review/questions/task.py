@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.controllers.observed_state import FreeErrors, free_errors
+from fpirhc.controllers.observed_state import UnobservableErrors, unobservable_errors
 from fpirhc.errors import NotSupported
 from fpirhc.plant.chain import relative_order
 from fpirhc.plant.motion import outside_names
@@ -143,7 +143,7 @@ def right_after_a_while(grid: ReviewGrid) -> Answer | None:
     if not believed:
         return None
     try:
-        free = free_errors(problem)
+        free = unobservable_errors(problem)
     except NotSupported:
         return None
     measured = ", ".join(problem.sensing.measures(problem.plant))
@@ -156,7 +156,7 @@ def right_after_a_while(grid: ReviewGrid) -> Answer | None:
     return Answer(BELIEVED, decided(free.decays), text, change, {"pole": free.pole})
 
 
-def _decay(problem: Problem, free: FreeErrors) -> str:
+def _decay(problem: Problem, free: UnobservableErrors) -> str:
     if free.decays:
         return f"they decay by themselves, with a time constant of {-1 / free.pole:.3g} {problem.time_unit} or less"
     return f"they do not decay by themselves (pole {free.pole:.3g} {problem.rate_unit})"

@@ -39,7 +39,7 @@ from fpirhc.studies.comparison.information import information, sentences
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
-from fpirhc.studies.comparison.side_by_side import Built, beside_each_other, null_tests, with_reviewed_causes
+from fpirhc.studies.comparison.pairwise import Built, beside_each_other, null_tests, with_reviewed_causes
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.studies.tuning.objective import objective

@@ -20,7 +20,7 @@ from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.null_test import null_test
 from fpirhc.studies.comparison.outcome import Outcome
-from fpirhc.studies.comparison.side_by_side import with_causes
+from fpirhc.studies.comparison.pairwise import with_causes
 from fpirhc.studies.comparison.verdict import judge
 from fpirhc.task.problem import Problem
 

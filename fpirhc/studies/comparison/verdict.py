@@ -13,10 +13,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fpirhc.plant.motion import with_space
+from fpirhc.studies.comparison.beyond_headline import remarks
 from fpirhc.studies.comparison.causes import causes, effort_cause, movement, stuck_cause
 from fpirhc.studies.comparison.caveats import Yardstick, caveats, leaves_reference, left_alone_is_better, not_followed
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
-from fpirhc.studies.comparison.other_rows import remarks
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.tuning.objective import Objective
 from fpirhc.summary import written_out

@@ -18,10 +18,10 @@ from fpirhc.review.recommended_gain import reviewed_gain
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.stepper import Stepper
+from fpirhc.studies.comparison.beyond_headline import beaten_by
 from fpirhc.studies.comparison.causes import grows
 from fpirhc.studies.comparison.entry import no_bound_because
 from fpirhc.studies.comparison.null_test import NullTest, null_test
-from fpirhc.studies.comparison.other_rows import beaten_by
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.timing import measure_price
 from fpirhc.task.problem import Problem
