@@ -125,7 +125,9 @@ def test_errors_of_rounding_are_called_so():
     task = fp.load_problem("noisy_motor")
     found = answer(task.problem, task.controllers["RHC+FPI"], "right model alone")
     assert found.verdict == Verdict.YES
-    assert found.evidence == "run on its own model, rms error of speed 0 to rounding without adaptation and with it"
+    assert found.evidence == (
+        "run on its own model, rms error of speed 0 to rounding without adaptation and with it, without noise and disturbances"
+    )
 
 
 def test_targets_that_cure_more_than_they_spoil_do_no_harm():

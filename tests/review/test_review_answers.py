@@ -195,6 +195,7 @@ def test_a_loop_that_changes_on_line_is_unknown(grid):
     tuned = fp.Tuned(fp.Sigmoid(gain=-0.5, scale=20.0), largest_gain=1.0)
     for one, name in (
         (convergence(grid, loops(0.5), tuned), "Tuned changes its map"),
+        (convergence(grid, loops(0.5), fp.Increment(tuned, cycles=2)), "Tuned changes its map"),
         (convergence(grid, loops(0.5, learns=True)), "ComputedTorque changes its model"),
     ):
         assert (one.verdict, one.change) == ("unknown", f"{name} on line; the factor is that of the first cycle.")

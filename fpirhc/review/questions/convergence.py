@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict, duration, per_cycle
 from fpirhc.review.dead_time_variants import is_late
 from fpirhc.review.grid import ReviewGrid
@@ -51,7 +52,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
         what = (
             f"{type(controller).__name__} changes its model"
             if loops.learns
-            else f"{type(deformation).__name__} changes its map"
+            else f"{_changing(deformation)} changes its map"
         )
         change = f"{what} on line; the factor is that of the first cycle."
         return Answer(CONVERGES, Verdict.UNKNOWN, text, change, numbers)
@@ -70,6 +71,13 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
             CONVERGES, Verdict.UNKNOWN, f"{text}, but {'; '.join(against)}", "See the questions named.", numbers
         )
     return Answer(CONVERGES, Verdict.YES, text, "", numbers)
+
+
+def _changing(deformation: Deformation) -> str:
+    """The name of the innermost part that changes on line."""
+    while deformation.inner is not None and not deformation.inner.iteration.constant:
+        deformation = deformation.inner
+    return type(deformation).__name__
 
 
 def box_converges(case: Case) -> Answer:

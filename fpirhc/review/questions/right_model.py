@@ -23,6 +23,7 @@ from fpirhc.review.questions.form import form_of, forms_of
 from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
 from fpirhc.simulation.model_as_plant import with_believed_way
 from fpirhc.summary import beside
+from fpirhc.task.problem import Problem
 
 PAYS = "Does adaptation lower the response error?"
 _HARM = 0.5  # share of the error without adaptation that adaptation may make of a model that is right
@@ -133,7 +134,7 @@ def leaves_right_model_alone(case: Case) -> Answer:
         return Answer(NULL_TEST, Verdict.UNKNOWN, f"{text}no run of the model: {error}", "", numbers)
     worst = runs.worst
     numbers |= {"without": runs.without[worst], "with": runs.adapted[worst], "added": runs.added(worst)}
-    text += runs.text
+    text += f"{runs.text}{_left_out(case.problem)}"
     if runs.stuck:
         return Answer(
             NULL_TEST, Verdict.UNKNOWN, f"{text}; {runs.stuck}", "Run it where the commands are free.", numbers
@@ -146,6 +147,13 @@ def leaves_right_model_alone(case: Case) -> Answer:
     verdict = Verdict.NO if harmful else Verdict.UNKNOWN
     change, more = _remedy(case, runs, predicted)
     return Answer(NULL_TEST, verdict, text, change, numbers | more)
+
+
+def _left_out(problem: Problem) -> str:
+    """What the run of the model is without, in words; empty where nothing is left out."""
+    noisy = any(sensor.noise is not None for sensor in problem.sensing.sensors.values())
+    parts = ["noise"] * noisy + ["disturbances"] * bool(problem.disturbances)
+    return f", without {' and '.join(parts)}" if parts else ""
 
 
 def _cures_more(case: Case, runs: ErrorPair, nominal: NominalRun | None, predicted: float | None) -> bool:
