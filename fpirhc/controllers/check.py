@@ -249,8 +249,8 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
         check_gain_size(problem, ready.deformation)
         return ready
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-    if late or problem.reality or not problem.sensing.ideal:
-        what = "dead time" if late else "the reality" if problem.reality else "sensing"
+    if late or not problem.sensing.ideal:
+        what = "dead time" if late else "sensing"
         raise NotSupported(
             f"{type(ready).__name__} reads responses of its own, without delay and noise; leave {what} out of the problem"
         )

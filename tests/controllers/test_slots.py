@@ -292,6 +292,44 @@ def test_one_slot_is_computed_torque(integral, deformation):
         np.testing.assert_allclose(slots[name], torque[name], rtol=1e-7, atol=1e-9, err_msg=name)
 
 
+def masses_by_states() -> fp.Plant:
+    """The two masses as first-order equations in another order, with extension and sum as states."""
+    plant = MASSES.problem.plant
+
+    def rates(x, u, p):
+        low, pull = (x.total - x.between) / 2, p.k2 * x.between
+        return {
+            "w2": (u.F - pull - p.b2 * x.w2) / p.m2,
+            "w1": (pull - p.k1 * low - p.b1 * x.w1) / p.m1,
+            "between": x.w2 - x.w1,
+            "total": x.w2 + x.w1,
+        }
+
+    outputs = {"q1": lambda x, p: (x.total - x.between) / 2, "q2": lambda x, p: (x.total + x.between) / 2}
+    return fp.Plant.of_states(
+        states={"w2": "m/s", "w1": "m/s", "between": "m", "total": "m"},
+        inputs=plant.inputs,
+        parameters=plant.parameters,
+        rates=rates,
+        outputs={name: fp.Output("m", one) for name, one in outputs.items()},
+        controlled=("q2",),
+    )
+
+
+@pytest.mark.parametrize("name", ["slots", "slots+FPI"])
+@pytest.mark.parametrize("reality", [MASSES.problem.plant, masses_by_states()], ids=["same", "by states"])
+def test_slots_read_their_responses_from_a_reality(name, reality):
+    """A reality that is the plant itself, or its equations in other states, is the plant: over a switch, with a wrong model."""
+    problem = replace(MASSES.problem, duration=1.5, measure_from=0.0)
+    plain = run(problem, MASSES.controllers[name])
+    real = run(replace(problem, reality=fp.Reality(reality)), MASSES.controllers[name])
+    assert len(switches(real)) == 1
+    for signal in ("state", "command", "realised", "deformed"):
+        scale = np.abs(plain[signal]).max()
+        np.testing.assert_allclose(real[signal] / scale, plain[signal] / scale, atol=1e-9, err_msg=signal)
+    assert "a reality moves" in MASSES.controllers[name].notes(replace(problem, reality=fp.Reality(reality)))[0]
+
+
 # Switches
 
 

@@ -80,12 +80,9 @@ class Slotted(Controller):
         return next((s.deformation for s in self.slots if s.adapts), Identity())
 
     def response(self, problem: Problem) -> Response:
-        """Return the response y^(r) of every slot's coordinate."""
+        """Return the response y^(r) of every slot's coordinate, of the plant that moves."""
         channels = self.channels(problem)
-        x, u, p = problem.plant.symbols()
-        w = ca.SX.sym("w", len(problem.plant.names))
-        responses = ca.vertcat(*(c.chain.response(x, u, p, w) for c in channels))
-        return Response(by_slot(channels, "realised"), ca.Function("fpirhc_slots_realised", [x, u, p, w], [responses]))
+        return Response(by_slot(channels, "realised"), _response(problem, channels))
 
     def with_deformation(self, deformation: Deformation) -> Slotted:
         return replace(self, slots=tuple(replace(slot, deformation=deformation) for slot in self.slots))
@@ -121,7 +118,11 @@ class Slotted(Controller):
         Raises:
             InvalidProblem: mistakes of slots and schedule, all together; a slot that lasts too long.
             NotContractive: the gain of a deformation has the wrong sign or is too large at the start.
+            NotSupported: an external plant.
         """
+        problem.require_equations(
+            "Slotted reads the responses of its slots from equations, and a plant outside has none; leave it out of the problem"
+        )
         mistakes = Mistakes("Slotted")
         names = [s.coordinate for s in self.slots]
         if not names:
@@ -194,11 +195,20 @@ def _check_slot(problem: Problem, slot: Slot, mistakes: Mistakes) -> None:
         )
 
 
+def _response(problem: Problem, channels: Sequence[Channel]) -> ca.Function:
+    """Function (state, input, parameters, forcing) of what moves -> y^(r) of every slot."""
+    return problem.truth.function([c.chain.coordinate + "'" * c.chain.order for c in channels])
+
+
 def _check_gain(problem: Problem, one: Channel) -> None:
     """Raise NotContractive where the deformation does not converge with J = beta of the plant / beta of the model, at the start."""
     if not one.slot.adapts:
         return
-    exact = float(one.chain.gain(problem.start_state, np.zeros(problem.plant.input.size), problem.plant.exact))
+    truth, place = problem.real_plant, problem.plant.input.elements.index(one.chain.input)
+    x, u, p = truth.symbols()
+    response = _response(problem, [one])(x, u, p, ca.SX.zeros(len(truth.names)))
+    gain = ca.Function("fpirhc_slot_gain", [x, u, p], [ca.jacobian(response, u[place])])
+    exact = float(gain(problem.real_start, np.zeros(u.numel()), problem.real_parameters))
     report = assess_gain(one.slot.deformation, Spectrum(np.array([exact / one.start_gain])))
     if not report.contractive:
         raise NotContractive(f"slot '{one.slot.coordinate}': {report.text}")
@@ -249,7 +259,9 @@ def radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule,
     eigenvalues = {name: mode.eigenvalues for name, mode in zip(names, modes, strict=False)}
     sequence = schedule.sequence(problem)
     period = sum(duration for _, duration in sequence)
-    if not reason and len(problem.plant.inputs) > 1:
+    if problem.reality is not None:
+        reason = "the radius is that of the model's own equations, and a reality moves"
+    elif not reason and len(problem.plant.inputs) > 1:
         reason = "the plant has several inputs, and those that a slot does not use keep their last command"
     if reason or not sequence:
         return Floquet(None, period, eigenvalues, reason or "the schedule is not periodic")
