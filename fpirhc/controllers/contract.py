@@ -125,6 +125,10 @@ class Planner:
         """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""
         return self.adapts or without_disturbances(plant) is not plant
 
+    def feeds_back(self, plant: Plant) -> bool:
+        """Return whether a law or a correction of the response takes back what outputs of order 0 are away from a plan."""
+        return self.tracking is not None or self.corrects(plant)
+
     def starts_consistent(self, plant: Plant) -> bool:
         """Return whether plans start where the model has the measured outputs (`fpirhc.horizon.consistent_state`)."""
         return len(measured_signals(plant)) > 1 and (

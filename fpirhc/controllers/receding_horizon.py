@@ -38,7 +38,6 @@ from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
-from fpirhc.plant.plant import Plant
 from fpirhc.status import STOPPED, Status
 from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
@@ -162,7 +161,11 @@ class RecedingHorizon(Controller):
             InvalidProblem: horizon or cost missing.
             NotSupported: the optimiser cannot keep the problem's bounds; references of states are needed that no output gives.
         """
-        _check_states_of_plans(problem.plant, self.on_failure)
+        if self.on_failure.uses_feedforward and not known_on_reference(problem.plant):
+            raise NotSupported(
+                f"RecedingHorizon does not cover outputs that are expressions of the state ({', '.join(problem.plant.chains)}): "
+                f"{type(self.on_failure).__name__} needs references of states that no output gives; use HoldPlan"
+            )
         if problem.horizon is None:
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
@@ -193,21 +196,6 @@ class RecedingHorizon(Controller):
         if room is not None:
             delays.append(Delay(replace(command_before(problem), name=_PLANNED_BEFORE), "planned"))
         return blocks, delays
-
-
-def _check_states_of_plans(plant: Plant, on_failure: OnFailure) -> None:
-    """Raise where a way of failing needs states that the outputs do not give."""
-    reason = ""
-    instant = [name for name, order in plant.equations.output_orders.items() if not order]
-    if instant:
-        reason = f"{', '.join(instant)} depends on the command too (order 0), and plans are for functions of the state"
-    elif on_failure.uses_feedforward and not known_on_reference(plant):
-        reason = f"{type(on_failure).__name__} needs references of states that no output gives; use HoldPlan"
-    if reason:
-        what = ", ".join(plant.chains)
-        raise NotSupported(
-            f"RecedingHorizon does not cover outputs that are expressions of the state ({what}): {reason}"
-        )
 
 
 def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
@@ -286,8 +274,8 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         motion = () if preview is None else preview(*own)
         data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, optimiser, ocp, s))
         for seen in measured_signals(plant)[1:] if restarts else ():  # outputs that are given beside the state
-            shifted = shifted_reference(plant, ocp.data, ocp.stages + 1)
-            data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters)
+            shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=controller.planner.feeds_back(plant))
+            data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters, s._command_before)
         if horizon.measured:
             data = offset_limits(plant, horizon, ocp.data)(data, s._plan_state, s.state)
         if room is None:

@@ -190,6 +190,11 @@ class Quadratic(Cost):
                     )
         if not any(w for weights, _ in groups.values() for w in weights.values()):
             mistakes.add("every weight is zero, so every plan is optimal; weigh at least one state")
+        for name in terminal:
+            if plant.equations.output_orders.get(name) == 0:
+                mistakes.add(
+                    f"terminal: the command moves '{name}' at once (order 0), and the end of a horizon has none; leave it out"
+                )
         mistakes.raise_if_any()
 
     def _check_kind(self, plant: Plant, mistakes: Mistakes) -> None:
@@ -227,9 +232,11 @@ class Quadratic(Cost):
     def terminal_cost(
         self, view: View, plant: Plant, linearise: Callable[[], Linearisation], step: float
     ) -> Expression:
-        """Return the terminal cost (x - x^N)' P (x - x^N)."""
+        """Return the terminal cost (x - x^N)' P (x - x^N); without outputs of order 0, for which the end has no command."""
         if self.terminal is None:
-            return step * _squares(self._errors, view.output, view.reference)
+            at_once = [name for name, order in plant.equations.output_orders.items() if not order]
+            weights = {n: w for n, w in self._errors.items() if n not in at_once}
+            return step * _squares(weights, view.output, view.reference)
         if isinstance(self.terminal, Mapping):
             return _squares(self.terminal, view.output, view.reference)
         error = view.state.vector[: plant.state.size] - view.reference.vector

@@ -125,27 +125,29 @@ def stage_data(
     return ca.Function("fpirhc_horizon_data", [start, *tables, parameters, *settings], [table], names, ["data"])
 
 
-def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
-    """Function (data, state, measured outputs, parameters) -> data whose reference is less the distance of the outputs.
+def shifted_reference(plant: Plant, layout: Layout, nodes: int, *, corrected: bool) -> ca.Function:
+    """Function (data, state, measured outputs, parameters, command that acts) -> data whose reference is less their distance.
 
-    The distance d = y - h(x, p) of the measured outputs from the model's, at the state from which the plan starts, is held over the
-    horizon. That of the derivatives is not extrapolated: a polynomial is the motion of a chain of integrators, and no other model
-    stays on it. Behind a deformation the plan starts where there is no distance (see `consistent_state`).
+    The distance d = y - h(x, u, p) of the measured outputs from the model's, at the state from which the plan starts, is held over
+    the horizon. That of the derivatives is not extrapolated: a polynomial is the motion of a chain of integrators, and no other
+    model stays on it. Behind a deformation the plan starts where there is no distance (see `consistent_state`).
 
     Args:
         plant: the model, with outputs.
         layout: of one stage's data.
         nodes: number of columns of the data.
+        corrected: whether a law or a deformation behind the plan takes back the distance of outputs of order 0.
     """
     x, u, p = plant.symbols()
     y, column = ca.SX.sym("y", plant.output.size), ca.SX.sym("data", layout.size)
-    error = y - plant.equations.output(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names)))
+    error = y - plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
     place, difference = layout.slice("reference"), ca.SX.zeros(layout.size)
     for k, element in enumerate(plant.output.elements):
-        if not element.endswith("'"):
+        order = plant.equations.output_orders.get(element)  # None: of a derivative
+        if order or (order == 0 and not corrected):
             difference[place.start + k] = error[k]
-    one = ca.Function("fpirhc_shifted_column", [column, x, y, p], [ca.densify(column - difference)])
-    sizes = {"x": x.numel(), "y": y.numel(), "p": p.numel()}
+    one = ca.Function("fpirhc_shifted_column", [column, x, y, p, u], [ca.densify(column - difference)])
+    sizes = {"x": x.numel(), "y": y.numel(), "p": p.numel(), "u": u.numel()}
     data, arguments = ca.MX.sym("data", layout.size, nodes), [ca.MX.sym(name, size) for name, size in sizes.items()]
     repeated = [ca.repmat(v, 1, nodes) for v in arguments]
     return ca.Function("fpirhc_shifted_reference", [data, *arguments], [one.map(nodes)(data, *repeated)])

@@ -203,9 +203,10 @@ def _stage_expressions(
         if horizon.blocks:
             # Inputs that have no effect are drawn to those that are held, so that a plan states what is applied.
             terms["held"] = (1 - data["free"]) * ca.sumsqr((u - before) / _reach(limits, plant))
-        terminal = cost.terminal_cost(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.last)
-        end = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
-        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.last * end
+        end = replace(view, output=_outputs(plant, x, ca.SX.nan(plant.input.size), view.parameters.vector))
+        terminal = cost.terminal_cost(end, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.last)
+        kept = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
+        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.last * kept
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
     binding = hard(written, soft_names(limits, plant))
@@ -315,7 +316,7 @@ def _view(
         feedforward=Named(inputs, feedforward, "input"),
         parameters=Named(plant.parameter.elements, data["parameters"], "parameter"),
         time=data["time"],
-        output=_outputs(plant, s[:nx], data["parameters"]),
+        output=_outputs(plant, s[:nx], u, data["parameters"]),
         outside=outside_of(plant, data["parameters"]),
     )
 
@@ -326,10 +327,11 @@ def _hastened(view: View, factor: Expression) -> View:
     return replace(view, input_before=Named(tuple(before), u.vector - factor * (u.vector - before.vector), "input"))
 
 
-def _outputs(plant: Plant, x: Expression, p: Expression) -> Named:
+def _outputs(plant: Plant, x: Expression, u: Expression, p: Expression) -> Named:
     """The model's outputs and their derivatives at a stage; the state without outputs."""
-    still = ca.SX.zeros(plant.input.size), ca.SX.zeros(len(plant.names))  # neither reaches these derivatives
-    return Named(plant.output.elements, plant.equations.output(x, still[0], p, still[1]), plant.output.name)
+    return Named(
+        plant.output.elements, plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names))), plant.output.name
+    )
 
 
 def _advance(plant: Plant, horizon: Horizon) -> ca.Function:

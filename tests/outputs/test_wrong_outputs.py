@@ -20,8 +20,8 @@ def test_a_plan_along_the_models_own_outputs_stays_at_the_wrong_one(name, descri
     A plan from the state at which the model has the measured outputs does not: there d is zero.
     """
 
-    def unshifted(*arguments):
-        function = shifted_reference(*arguments)
+    def unshifted(*arguments, **settings):
+        function = shifted_reference(*arguments, **settings)
         symbols = [ca.MX.sym(function.name_in(k), *function.size_in(k)) for k in range(function.n_in())]
         return ca.Function("unshifted", symbols, symbols[:1])
 

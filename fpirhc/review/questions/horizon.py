@@ -19,8 +19,8 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
+from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.maps import growth_of, step_of
-from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
@@ -97,11 +97,15 @@ def plan_gain(
     ocp = transcribe(plant, problem.reference, horizon, problem.cost, Limits(), start=problem.start_state)
     data = np.asarray(stage_data(plant, problem.reference, horizon, problem.cost)(0.0, believed).full())
     clock = horizon.nodes
-    followed, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(n)(clock[None, :-1]))
-    wanted = responses[controlled_places(plant)]
+    t = ca.MX.sym("t")
+    outputs, responses = problem.reference.function(plant)(t)
+    motion = ca.Function("fpirhc_nominal_motion", [t], [outputs, nominal_responses(plant, outputs, responses)])
+    followed, wanted = (np.asarray(v.full()) for v in motion.map(n)(clock[None, :-1]))
     if plant.outputs and states_at is not None:
         begin = states_at(clock[:1])[0]
-        data = np.asarray(shifted_reference(plant, ocp.data, n + 1)(data, begin, followed[:, 0], believed).full())
+        command = plant.equations.inverse(begin, wanted[:, 0], believed)
+        shifted = shifted_reference(plant, ocp.data, n + 1, corrected=False)
+        data = np.asarray(shifted(data, begin, followed[:, 0], believed, command).full())
         states, inputs = _motion(ocp, plant.equations.inverse, begin, wanted, data, believed)
     else:
         states = data[ocp.data.slice("reference")] if states_at is None else states_at(clock).T

@@ -90,7 +90,8 @@ def measure_optimality(
         return None
     data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost, signals=ahead)
     beside = measured_signals(planned.plant)[1:]  # outputs that are given beside the state
-    shifts = [shifted_reference(planned.plant, ocp.data, ocp.stages + 1) for _ in beside]
+    corrected = planner.feeds_back(planned.plant)
+    shifts = [shifted_reference(planned.plant, ocp.data, ocp.stages + 1, corrected=corrected) for _ in beside]
     offset = offset_limits(planned.plant, planned.horizon, ocp.data) if planned.horizon.measured else None
     begin = consistent_state(planned.plant) if planner.starts_consistent(planned.plant) else None
     stride = cycles_per_plan(problem.horizon, problem.period)
@@ -106,7 +107,7 @@ def measure_optimality(
         first = ocp.start(state, run["command"][row - 1] - shift).full().ravel()
         data = np.asarray(data_of(times[row], parameters[row]).full())
         for shift_of in shifts:
-            data = np.asarray(shift_of(data, state, seen[row], parameters[row]).full())
+            data = np.asarray(shift_of(data, state, seen[row], parameters[row], run["command"][row - 1]).full())
         if offset is not None:
             data = np.asarray(offset(data, state, states[row]).full())
         best, cost_of_plan = solve(first, data, lower, upper), run["solve.cost"][row]
