@@ -174,6 +174,33 @@ INNER = "controller_memory"  # in the memory: that of a graph as one signal
 
 
 @dataclass(frozen=True, eq=False)
+class _Judged:
+    """What a sample and the gate's memory say.
+
+    Args:
+        fits: whether the sample fits.
+        held: the last command.
+        stored: of the last good sample, which may be this one.
+        doubted: count of doubted samples of the next cycle.
+        counts: of gaps, by name; none where no sample can be lost.
+        told: what the step is told, by name.
+        passes: whether a cycle without a sample is one of a gap.
+    """
+
+    fits: ca.SX
+    held: ca.SX
+    stored: ca.SX
+    doubted: ca.SX
+    counts: Counts
+    told: Counts
+    passes: Expression
+
+
+def _scalar(name: str, symbols: Sequence[ca.SX], results: Sequence[Expression]) -> ca.Function:
+    return ca.Function(f"fpirhc_gate_{name}", [*symbols], ca.cse([ca.densify(r) for r in results]))
+
+
+@dataclass(frozen=True, eq=False)
 class Gate:
     """The gate around a controller's step.
 
@@ -213,7 +240,12 @@ class Gate:
 
     @property
     def memory(self) -> Layout:
-        """The last command, what is kept of the last good sample, the count of doubted ones, and the controller's memory."""
+        """What the gate keeps, and the controller's memory."""
+        return self.kept + self.controller_memory
+
+    @cached_property
+    def kept(self) -> Layout:
+        """The last command, what is kept of the last good sample, and the counts of doubted samples, failed steps and gaps."""
         plant = self.problem.plant
         starts = {plant.output.name: tuple(map(float, self.problem.start_output)), TAKEN: (-FINITE,)}
         starts[plant.state.name] = tuple(map(float, self.problem.start_state))
@@ -223,7 +255,7 @@ class Gate:
         doubted = [scalar(DOUBTED)] if self.plausible else []
         failed = [] if "memory" in self.trusted else [scalar(FAILED)]
         counts = self.gap.memory if self.gap is not None else ()
-        return Layout((held, *good, *doubted, *failed, *counts)) + self.controller_memory
+        return Layout((held, *good, *doubted, *failed, *counts))
 
     @cached_property
     def controller_memory(self) -> Layout:
@@ -240,43 +272,27 @@ class Gate:
 
     def block(self) -> Block:
         """Return the step behind the gate as one block: (sample, parameters) -> the controller's trace."""
-        choose = self._switched if self.inner.opaque else self._selected
-        trace = self.inner.trace
-
-        entry = self._entry()
+        trace, before, after = self.inner.trace, self._before(), self._after()
+        status = ["status"] if "status" in trace else []
 
         def step(s: Signals) -> dict[str, Expression]:
-            now = [getattr(s, n) for n in self.sample.names]
-            good = [getattr(s, f"good_{n}") for n in self.stored.names]
-            before = getattr(s, DOUBTED) if self.plausible else expression(0.0)
-            fits, held, good_next, doubted = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good), before)
-            last_good = self.stored.split(good_next)
-            seen = last_good if self.inner.opaque else {}
-            gap, counts = self.gap, {} if self.gap is None else self.gap.counts(s, trusted="memory" in self.trusted)
-            told = gap.seen(counts) if gap is not None else {}
-            seen = {**seen, **told}
-            sample = [seen[r] if r in seen else getattr(s, r) for r in self.inner.reads.names]
-            memory = self.controller_memory.join({m: getattr(s, m) for m in self.controller_memory.names})
-            usable, failed = expression(1.0), None
+            now, own = ca.vertcat(*(getattr(s, n) for n in self.sample.names)), self.kept.join(vars(s))
+            fits, column, passes = before(now, own, s.time if self.gap is not None else 0)
+            told = self._told.split(column)
+            sample = [told[r] if r in told else getattr(s, r) for r in self.inner.reads.names]
+            memory = self.controller_memory.join(vars(s))
+            usable = expression(1.0)
             if "memory" not in self.trusted:
-                failed = getattr(s, FAILED)
-                usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(is_trial(failed)))
-            passes = gap.passes(counts, s.time) if gap is not None else None
-            memory_next, shown, command, fine = choose(fits, usable, memory, sample, held, passes)
+                failed = is_trial(getattr(s, FAILED))
+                usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(failed))
+            memory_next, shown, command, fine = self._stepped(fits, usable, memory, sample, passes)
             values = trace.split(shown)
-            if gap is not None and "status" in trace:
-                values["status"] = gap.status(values["status"], told)
-            if "status" in trace:
-                status = ca.if_else(usable, values["status"], int(Status.RESTARTED))
-                status = ca.if_else(fine, status, int(Status.NON_FINITE))
-                values["status"] = ca.if_else(fits, status, int(Status.BAD_SAMPLE))
-            remembered = {**self.controller_memory.split(memory_next), HELD: command}
-            remembered |= {FAILED: counted(failed, fits, fine)} if failed is not None else {}
-            remembered |= {f"good_{n}": ca.if_else(fine, v, getattr(s, f"good_{n}")) for n, v in last_good.items()}
-            remembered |= {DOUBTED: doubted} if self.plausible else {}
-            if gap is not None and passes is not None:
-                remembered |= gap.remembered(ca.logic_and(fits, fine), passes, counts, told)
-            return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
+            said = ca.vertcat(*(values[n] for n in status))
+            ended, own_next = after(now, own, s.time if self.gap is not None else 0, usable, fine, said, command)
+            kept = self.kept.split(own_next)
+            remembered = {**self.controller_memory.split(memory_next), **kept}
+            values |= dict.fromkeys(status, ended)
+            return {**values, "command": kept[HELD], **{f"{m}_next": v for m, v in remembered.items()}}
 
         derived = self._derived if self.inner.derived_if_any else None
         opaque, inside = self.inner.opaque, self.inner
@@ -289,23 +305,54 @@ class Gate:
             return inner
         return replace(inner, memory=lambda: {INNER: self.inner.memory.pack(inner.memory())})
 
-    def _entry(self) -> ca.Function:
-        """Function (sample, held, stored, doubted) -> (whether the sample fits, held, to store, doubted).
+    @cached_property
+    def _told(self) -> Layout:
+        """What the step is told in place of what it reads: the last good sample where it is a graph, and how long a gap was."""
+        last = self.stored.signals if self.inner.opaque else ()
+        return Layout((*last, *(GAPS if self.gap is not None else ())))
 
-        It is scalar code: a graph would pass over these few numbers one operation after the other.
+    def _before(self) -> ca.Function:
+        """Function (sample, kept, time) -> (whether the sample fits, what the step is told, whether time passes).
+
+        This and `_after` are scalar code: a graph would pass over these few numbers one operation after the other.
         """
-        inputs, stored = self.problem.plant.input.size, self.stored
-        sample, good, held = (
-            ca.SX.sym("sample", self.sample.size),
-            ca.SX.sym("good", stored.size),
-            ca.SX.sym("held", inputs),
+        symbols, judged = self._judged()
+        return _scalar("before", symbols, [judged.fits, self._told.join(judged.told), judged.passes])
+
+    def _after(self) -> ca.Function:
+        """Function (sample, kept, time, usable, fine, status, command) -> (status, kept one cycle later)."""
+        symbols, judged = self._judged()
+        own, status, gap = self.kept.split(symbols[1]), ca.SX.sym("status", int("status" in self.inner.trace)), self.gap
+        usable, fine, command = (
+            ca.SX.sym(n, k) for n, k in (("usable", 1), ("fine", 1), ("command", judged.held.numel()))
         )
-        doubted = ca.SX.sym("doubted")
-        command, last, count = held, good, doubted
-        if "memory" not in self.trusted:
-            names = (HELD, *(f"good_{n}" for n in stored.names))
-            start = ca.DM([*np.concatenate([self.memory[n].start_vector() for n in names]), 0.0])
-            column = ca.vertcat(held, good, doubted)
+        fits, ran = judged.fits, ca.logic_and(judged.fits, fine)
+        following = {HELD: ca.if_else(ran, command, judged.held), DOUBTED: judged.doubted}
+        following |= {
+            f"good_{n}": ca.if_else(fine, v, own[f"good_{n}"]) for n, v in self.stored.split(judged.stored).items()
+        }
+        following |= {FAILED: counted(own[FAILED], fits, fine)} if FAILED in own else {}
+        ended = status
+        if gap is not None:
+            ended = gap.status(status, judged.told) if status.numel() else status
+            following |= gap.remembered(ran, judged.passes, judged.counts, judged.told)
+        ended = ca.if_else(usable, ended, int(Status.RESTARTED))
+        ended = ca.if_else(fits, ca.if_else(fine, ended, int(Status.NON_FINITE)), int(Status.BAD_SAMPLE))
+        return _scalar("after", [*symbols, usable, fine, status, command], [ended, self.kept.join(following)])
+
+    def _judged(self) -> tuple[list[ca.SX], _Judged]:
+        """Symbols of (sample, kept, time), and what they say."""
+        inputs = self.problem.plant.input.size
+        sample, own, time = ca.SX.sym("sample", self.sample.size), ca.SX.sym("kept", self.kept.size), ca.SX.sym("time")
+        values = self.kept.split(own)
+        held, count = values[HELD], values.get(DOUBTED, ca.SX(0))
+        good = ca.vertcat(ca.SX(0, 1), *(values[f"good_{n}"] for n in self.stored.names))
+        command, last = held, good
+        trusted = "memory" in self.trusted
+        if not trusted:
+            names = (HELD, *(f"good_{n}" for n in self.stored.names))
+            start = ca.DM([*np.concatenate([self.kept[n].start_vector() for n in names]), 0.0])
+            column = ca.vertcat(held, good, count)
             column = ca.if_else(every_finite(column), column, start)
             command = clip(column[:inputs], *self.problem.limits.input_bounds(self.problem.plant))
             last, count = column[inputs:-1], column[-1]
@@ -314,10 +361,13 @@ class Gate:
         believed = ca.logic_and(count > _DOUBTED - 0.5, self._inside(sample, _WIDER))
         fits = ca.logic_and(possible, ca.logic_or(inside, believed))
         strange = ca.logic_and(possible, ca.logic_not(inside))
-        count_next = ca.if_else(strange, count + (count < _DOUBTED - 0.5), ca.if_else(possible, 0, count))
-        now = ca.vertcat(*(sample[self.sample.slice(n)] for n in stored.names))
-        results = [fits, command, ca.if_else(fits, now, last), count_next]
-        return ca.Function("fpirhc_gate_entry", [sample, held, good, doubted], [ca.densify(r) for r in results])
+        doubted = ca.if_else(strange, count + (count < _DOUBTED - 0.5), ca.if_else(possible, 0, count))
+        now = ca.vertcat(ca.SX(0, 1), *(sample[self.sample.slice(n)] for n in self.stored.names))
+        stored = ca.if_else(fits, now, last)
+        counts: Counts = {} if self.gap is None else self.gap.counts(Signals(values), trusted=trusted)
+        told = self.stored.split(stored) | ({} if self.gap is None else self.gap.seen(counts))
+        passes = ca.SX(0) if self.gap is None else self.gap.passes(counts, time)
+        return [sample, own, time], _Judged(fits, command, stored, doubted, counts, told, passes)
 
     def _possible(self, sample: Expression, good: Expression) -> Expression:
         """Whether every entry is finite, and the time stamp is new."""
@@ -343,59 +393,36 @@ class Gate:
                 inside = ca.logic_and(inside, sample[k] <= upper) if np.isfinite(upper) else inside
         return inside
 
-    def _selected(
-        self,
-        fits: Expression,
-        usable: Expression,
-        memory: Expression,
-        sample: Sequence[Expression],
-        held: Expression,
-        passes: Expression | None,
+    def _stepped(
+        self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], passes: Expression
     ) -> tuple[Expression, Expression, Expression, Expression]:
-        """(memory, trace, command, whether the step is fine) of scalar code: it is evaluated, and its results are selected."""
-        remembered = ca.if_else(usable, memory, ca.DM(self.inner.memory.start()))
-        memory_next, trace, command = self.inner.function(remembered, *sample)
-        skipped = self._waited(memory, sample, passes)
-        after, fine = outcome(memory_next, skipped, command, trace, self.inner.trace, fits, opaque=False)
-        return after, trace, ca.if_else(ca.logic_and(fits, fine), command, held), fine
+        """(memory to keep, trace, command, whether the step is fine); scalar code is evaluated, and its results are selected."""
+        inner, opaque, remembered = self.inner, self.inner.opaque, memory
+        if "memory" not in self.trusted:
+            remembered = ca.if_else(
+                usable, memory, ca.DM(inner.memory.start()), opaque
+            )  # of a graph it is copied as a whole
+        memory_next, trace, command = inner.function.call([remembered, *sample], opaque, False)
+        skipped = memory if opaque else self._waited(memory, sample, passes)
+        after, fine = outcome(memory_next, skipped, command, trace, inner.trace, fits, opaque=opaque)
+        if opaque and self.gap is not None and inner.waits is not None:
+            after = self._waiting()(ca.logic_and(fits, fine), after, passes, memory, *sample)
+        return after, trace, command, fine
 
-    def _switched(
-        self,
-        fits: Expression,
-        usable: Expression,
-        memory: Expression,
-        sample: Sequence[Expression],
-        held: Expression,
-        passes: Expression | None,
-    ) -> tuple[Expression, Expression, Expression, Expression]:
-        """The same of a graph: one of three branches is evaluated, so that a long memory is not selected entry by entry."""
+    def _waiting(self) -> ca.Function:
+        """Function (whether the step was kept, its memory, whether time passes, memory, sample...) -> memory of a graph."""
         step = self.inner.function
-        names = [(step.name_in(k), step.size1_in(k)) for k in range(step.n_in())]
-        symbols = [kind(opaque=True).sym(name, size) for name, size in names]
-        last = kind(opaque=True).sym("held", held.numel())
-        skip = (symbols[0], step(*symbols)[1], last)
-        run = step.call(symbols, True, False)
-        restart = step(ca.DM(self.inner.memory.start()), *symbols[1:])
-        skipped, running, restarted = (
-            ca.Function(f"fpirhc_gate_{name}", [*symbols, last], list(results))
-            for name, results in (("skip", skip), ("run", run), ("restart", restart))
-        )
-        choice = ca.Function.conditional("fpirhc_gate_choice", [skipped, running], restarted)
-        memory_next, trace, command = choice(ca.if_else(fits, 2 - usable, 0), memory, *sample, held)
-        after, fine = outcome(memory_next, memory, command, trace, self.inner.trace, fits, opaque=True)
-        ran = ca.logic_and(fits, fine)
-        if passes is not None and self.inner.waits is not None:
-            new, started = (kind(opaque=True).sym(n, k) for n, k in (("new", memory.numel()), ("passes", 1)))
-            arguments = [new, started, *symbols]
-            takes = ca.Function("fpirhc_gate_takes", arguments, [new])
-            waits = ca.Function("fpirhc_gate_waits", arguments, [self._waited(symbols[0], symbols[1:], started)])
-            after = ca.Function.if_else("fpirhc_gate_kept", takes, waits)(ran, after, passes, memory, *sample)
-        return after, trace, ca.if_else(ran, command, held), fine
+        symbols = [kind(opaque=True).sym(step.name_in(k), step.size1_in(k)) for k in range(step.n_in())]
+        new, passes = (kind(opaque=True).sym(n, k) for n, k in (("new", symbols[0].numel()), ("passes", 1)))
+        arguments = [new, passes, *symbols]
+        takes = ca.Function("fpirhc_gate_takes", arguments, [new])
+        waits = ca.Function("fpirhc_gate_waits", arguments, [self._waited(symbols[0], symbols[1:], passes)])
+        return ca.Function.if_else("fpirhc_gate_kept", takes, waits)
 
-    def _waited(self, memory: Expression, sample: Sequence[Expression], passes: Expression | None) -> Expression:
+    def _waited(self, memory: Expression, sample: Sequence[Expression], passes: Expression) -> Expression:
         """The controller's memory after a cycle without a sample: as it was, but for what is a memory of the passing time."""
         waits = self.inner.waits
-        if passes is None or waits is None:
+        if self.gap is None or waits is None:
             return memory
         known = {**self.inner.memory.split(memory), **dict(zip(self.inner.reads.names, sample, strict=True))}
         following: dict[str, Expression] = {}

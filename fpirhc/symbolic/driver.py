@@ -339,8 +339,10 @@ def kept_if_finite(new: Expression, old: Expression, good: Expression) -> tuple[
 def _kept(size: int) -> ca.Function:
     new, old, good = ca.MX.sym("new", size), ca.MX.sym("old", size), ca.MX.sym("good")
     driver = Driver(_KEPT, {}, {"SIZE": size})
-    fine = ca.mmin(ca.fabs(new) <= FINITE)
-    kept = ca.if_else(ca.logic_and(good, fine), new, old)
+    fine = _none_large(new)
+    kept = ca.if_else(
+        ca.logic_and(good, fine), new, old, True
+    )  # a short circuit copies; else every entry is selected by itself
     return with_driver("fpirhc_kept", driver, lambda name: ca.Function(name, [new, old, good], [kept, fine]))
 
 
@@ -348,5 +350,9 @@ def _kept(size: int) -> ca.Function:
 def _function(size: int) -> ca.Function:
     column = ca.MX.sym("column", size)
     driver = Driver(_TEXT, {}, {"SIZE": size})
-    every = ca.mmin(ca.fabs(column) <= FINITE)
-    return with_driver("fpirhc_finite", driver, lambda name: ca.Function(name, [column], [every]))
+    return with_driver("fpirhc_finite", driver, lambda name: ca.Function(name, [column], [_none_large(column)]))
+
+
+def _none_large(column: ca.MX) -> ca.MX:
+    """Whether every entry is finite: a sum of sizes, because the virtual machine then passes over the column once."""
+    return ca.norm_1(column) <= FINITE

@@ -273,11 +273,15 @@ def test_what_is_remembered():
     assert Gate(PROBLEM, inner(False), trusted=("time",)).sample.names == ("state", "realised")
 
 
-@both
-def test_a_graph_evaluates_one_branch_and_scalar_code_has_none(opaque):
-    """A long memory is copied whole by a graph; scalar code selects number by number, which compilers turn into moves."""
-    names = {f.name() for f in Gated(opaque).function.find_functions()}
-    assert ("fpirhc_gate_choice" in names) == opaque
+@pytest.mark.parametrize("trusted", [(), ("time", "memory")], ids=["device", "loop"])
+def test_a_graph_holds_the_step_once(trusted):
+    """It may hold an optimiser: a second place, for bad samples or for a restart, would double the code of a device."""
+    gated = Gated(opaque=True, trusted=trusted).function
+    graphs = [f for f in (gated, *gated.find_functions()) if f.is_a("MXFunction")]
+    calls = [
+        f.instruction_MX(k) for f in graphs for k in range(f.n_instructions()) if f.instruction_id(k) == ca.OP_CALL
+    ]
+    assert [c.which_function().name() for c in calls].count("fpirhc_inside") == 1
 
 
 @both
