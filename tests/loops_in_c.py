@@ -37,7 +37,6 @@ class Pair:
 
     @property
     def size(self) -> int:
-        """Of the memory."""
         return int(self.graph.size1_in(4))
 
     def both(self, *arguments) -> Iterator[list[np.ndarray]]:

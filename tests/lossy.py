@@ -82,7 +82,6 @@ class Lossy:
         return np.array(commands)
 
     def statuses(self) -> list[Status]:
-        """Those of the last run."""
         return [Status(int(row["status"][0])) for row in self.trace]
 
     def _measured(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:

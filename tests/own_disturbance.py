@@ -13,5 +13,4 @@ class Sawtooth(Disturbance):
     jump, slew = 1.5, 3.0
 
     def values(self, times, random):  # noqa: ARG002
-        """Return the values."""
         return 3.0 * np.mod(times + 1e-12, 0.5)

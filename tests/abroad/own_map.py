@@ -25,24 +25,19 @@ class InverseTangent(Deformation):
     width: float
 
     def step(self, request, response, desired, memory):
-        """Return r - a w tan^-1((f - d) / w)."""
         del memory
         return request - self.gain * self.width * ca.atan((response - desired) / self.width), {}
 
     def effective_gain(self):
-        """Return the slope at zero."""
         return self.gain
 
     def secant_gain(self):
-        """Return the slope at zero, which is the steepest secant."""
         return self.gain
 
     def largest_step(self):
-        """Return a w pi / 2."""
         return abs(self.gain) * self.width * math.pi / 2
 
     def with_effective_gain(self, gain):
-        """Return the map with another slope."""
         return replace(self, gain=gain)
 
 

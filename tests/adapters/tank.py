@@ -30,16 +30,13 @@ class Tank:
 
     @property
     def clock(self) -> RealTime:
-        """The clock that moves it."""
         return RealTime(lambda: self.now, self.sleep)
 
     def begin(self) -> None:
-        """Full to a metre."""
         self.level = 1.0
         self.show(self.level)
 
     def sleep(self, seconds: float) -> None:
-        """Move on."""
         self.now += seconds
         self.level += seconds * (self.inflow() - 0.5 * self.level)
         self.show(self.level)

@@ -25,19 +25,16 @@ class Buses:
         self.tank, self.sent = Tank(self.inflow, self.show), 0.0
 
     def inflow(self) -> float:
-        """What arrived last."""
         while (message := self.other.recv(timeout=0)) is not None:
             (self.sent,) = struct.unpack_from("<f", message.data, 1)
         return self.sent
 
     def show(self, level: float, age: float = 0.0, **message: Any) -> None:
-        """Send the level in um."""
         data = bytes(2) + struct.pack("<i", round(1e6 * level))
         stamp = {"arbitration_id": 0x181, "data": data, "is_extended_id": False, "timestamp": time.time() - age}
         self.other.send(can.Message(**(stamp | message)))
 
     def body(self, **settings: Any) -> Any:
-        """The tank as a reality."""
         every: dict[str, Any] = {"measures": {"h": LEVEL}, "inputs": {"q": INFLOW}, "clock": self.tank.clock} | settings
         return can_body(self.own, TANK, period=PERIOD, **every)
 

@@ -37,20 +37,17 @@ class Served:
         self.tank, self.count = Tank(self.inflow, self.show), 0
 
     def inflow(self) -> float:
-        """What was written last."""
         words = self.client.read_holding_registers(6, count=2).registers
         value: Any = self.client.convert_from_registers(words, self.client.DATATYPE.FLOAT32)
         return float(value)
 
     def show(self, level: float) -> None:
-        """Write the level in um, and count."""
         self.count += 1
         words = self.client.convert_to_registers(round(1e6 * level), self.client.DATATYPE.INT32)
         self.client.write_registers(2, words)
         self.client.write_registers(9, [self.count])
 
     def body(self, **settings: Any) -> Any:
-        """The tank as a reality."""
         every: dict[str, Any] = {"measures": {"h": LEVEL}, "inputs": {"q": INFLOW}, "clock": self.tank.clock} | settings
         return modbus_body("127.0.0.1", TANK, period=PERIOD, port=self.port, **every)
 

@@ -36,7 +36,6 @@ class Server:
         self.names: dict[str, Any] = {"measures": {"h": level}, "inputs": {"q": inflow}}
 
     def body(self, **settings) -> fp.ExternalPlant:
-        """The server as a reality."""
         return opcua_body(ADDRESS, TANK, period=PERIOD, clock=self.tank.clock, **self.names, **settings)
 
 

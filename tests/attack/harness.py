@@ -71,7 +71,6 @@ class Bench:
     """A controller on its plant, ready for any number of faults."""
 
     def __init__(self, problem: fp.Problem, controller: Controller) -> None:
-        """Build stepper and plant in the virtual machine."""
         self.problem, plant = problem, problem.plant
         self.stepper = fp.Stepper(problem, controller, compiled=False)
         self.limits = problem.limits.input_bounds(plant)
@@ -88,7 +87,6 @@ class Bench:
         self.movement = np.maximum(usual, 1e-6 * np.abs(self.clean).max() + 1e-12)
 
     def outcome(self, fault: Fault) -> Outcome:
-        """Run the loop with the fault and judge it."""
         result = Outcome()
         try:
             result.differs = fault.single and self._differs(fault)

@@ -37,7 +37,6 @@ class Kills:
 
     @property
     def wrong(self) -> int:
-        """Everything together."""
         return self.lost + self.doubled + self.changed + self.failed
 
 

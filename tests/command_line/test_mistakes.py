@@ -197,24 +197,19 @@ class ExternalPlant(Deformation):
     spans: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def step(self, request, response, desired, memory):
-        """Pass the desired response on."""
         del request, response
         return desired, memory
 
     def effective_gain(self):
-        """None."""
         return 0.0
 
     def secant_gain(self):
-        """None."""
         return 0.0
 
     def largest_step(self):
-        """No bound."""
         return math.inf
 
     def with_effective_gain(self, gain):
-        """The same."""
         del gain
         return self
 

@@ -251,11 +251,9 @@ class Telling(Controller):
     feeds = MappingProxyType({"state": "predicted"})
 
     def blocks(self, problem):  # noqa: ARG002
-        """None: only its facts are asked for."""
         return [], []
 
     def plant_model(self, problem):
-        """Another first mass."""
         return PlantModel(problem.plant, problem.signals, given={"m": 2.0})
 
     def with_defaults(self, problem):
@@ -273,11 +271,9 @@ class Telling(Controller):
         )
 
     def notes(self, problem):
-        """Name the mass."""
         return (f"mass {problem.plant.approximate[0]}",)
 
     def check(self, problem):
-        """Refuse, naming the mass."""
         raise InvalidValue(f"mass {problem.plant.approximate[0]}")
 
 

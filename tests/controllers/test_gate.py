@@ -78,7 +78,6 @@ class Gated:
         return np.concatenate([self.memory[s.name] for s in self.gate.controller_memory.signals]).tolist()
 
     def remembered(self):
-        """A copy of the memory."""
         return {name: value.copy() for name, value in self.memory.items()}
 
 

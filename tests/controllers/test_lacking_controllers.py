@@ -25,7 +25,6 @@ class Around(Controller):
     other: Controller
 
     def blocks(self, problem):
-        """Those of the other one."""
         return self.other.blocks(problem)
 
 
@@ -36,7 +35,6 @@ class Alone(Controller):
     rate: float = 1.0
 
     def blocks(self, problem):
-        """None, in a wrong form."""
         del problem
         return []
 
@@ -52,7 +50,6 @@ class Whole(Around):
 
     @property
     def deformation(self):
-        """That of the inner one."""
         return self.inner.deformation
 
 
@@ -86,17 +83,14 @@ class Doubled(Deformation):
     map: Deformation
 
     def step(self, request, response, desired, memory):
-        """That of the other one."""
         return self.map.step(request, response, desired, memory)
 
     def effective_gain(self):
-        """Twice the other one's."""
         return 2 * self.map.effective_gain()
 
     secant_gain = largest_step = effective_gain
 
     def with_effective_gain(self, gain):
-        """The same around a map with half of it."""
         return Doubled(self.map.with_effective_gain(gain / 2))
 
 

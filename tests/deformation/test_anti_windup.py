@@ -40,7 +40,6 @@ class Altered(fp.ComputedTorque):
     changes: tuple[Any, ...] = ()
 
     def blocks(self, problem):
-        """The blocks and delays, changed."""
         parts = super().blocks(problem)
         for change in self.changes:
             parts = change(*parts)

@@ -42,7 +42,6 @@ class Softly(Limit):
     uses_rate = True
 
     def value(self, view):
-        """Return the growth."""
         return view.input.torque**2 - view.input_before.torque**2
 
 

@@ -89,12 +89,10 @@ class Altered(fp.Exponential):
     change: str = ""
 
     def feedback(self, order):
-        """As the contract says, but for the change."""
         law_facts = super().feedback(order)
         return replace(law_facts, rate=2 * self.rate) if self.change == "tells another rate" else law_facts
 
     def law(self, plant, period):
-        """As the contract says, but for the change."""
         block = super().law(plant, period)
         reads = Layout((*block.reads.signals, scalar("cycle_time"))) if self.change == "reads" else block.reads
 
@@ -117,7 +115,6 @@ class Altered(fp.Exponential):
         return Block(block.name, reads, block.writes, step, block.memory)
 
     def update(self, plant, period):
-        """As the contract says, but for the change."""
         block = super().update(plant, period)
 
         def step(s):
@@ -135,15 +132,12 @@ class Thawed(Tracking):
     rate: float = 6.0
 
     def law(self, plant, period):
-        """As the contract says, but for the change."""
         return fp.Exponential(self.rate).law(plant, period)
 
     def update(self, plant, period):
-        """As the contract says, but for the change."""
         return fp.Exponential(self.rate).update(plant, period)
 
     def delays(self, plant):
-        """As the contract says, but for the change."""
         return fp.Exponential(self.rate).delays(plant)
 
 
@@ -202,11 +196,9 @@ class Dishonest(Optimiser):
     within: Optimiser = SETTLED
 
     def memory(self, ocp):
-        """As that of the optimiser inside."""
         return self.within.memory(ocp)
 
     def shifted(self, ocp, memory):
-        """As that of the optimiser inside."""
         return self.within.shifted(ocp, memory)
 
     def converging(self, ocp):
@@ -214,7 +206,6 @@ class Dishonest(Optimiser):
         return self.within.converging(ocp) if self.change == "one step OK" else self.step(ocp)
 
     def step(self, ocp):
-        """As the contract says, but for the change."""
         size = self.within.memory(ocp).size
         sizes = {"s": ocp.state.size, "data": (ocp.data.size, ocp.stages + 1), "l": 1, "u": 1, "memory": size}
         s, data, lower, upper, memory = symbols = [ca.MX.sym(n, *np.atleast_1d(k).tolist()) for n, k in sizes.items()]
@@ -325,12 +316,10 @@ class Faulty(fp.ComputedTorque):
 
     @property
     def planner(self):
-        """None, unless it tells of a plan that it does not make."""
         nothing: Any = None
         return Planner(nothing, None, restarts=True, tracking=None) if self.change == "tells a plan" else None
 
     def blocks(self, problem):
-        """As the contract says, but for the change."""
         blocks, delays = super().blocks(problem)
         at = next(k for k, b in enumerate(blocks) if b.name == "limit")
         limit = blocks[at]
@@ -377,15 +366,12 @@ class Backwards(Tracking):
     """A law that pushes the plant away."""
 
     def law(self, plant, period):
-        """As the contract says, but for the change."""
         return Altered(change="pushes away", rate=1.0, integral=False).law(plant, period)
 
     def update(self, plant, period):
-        """As the contract says, but for the change."""
         return TRACKING.update(plant, period)
 
     def delays(self, plant):
-        """As the contract says, but for the change."""
         return TRACKING.delays(plant)
 
 
@@ -436,7 +422,6 @@ class HastyEquations(Equations):
 
     @property
     def forced_rate(self):
-        """Wrong."""
         inner = super().forced_rate
         symbols = inner.sx_in()
         return ca.Function("hasty", symbols, [inner(*symbols) * ca.DM([2, 1])])
@@ -447,7 +432,6 @@ class Hasty(fp.Plant):
 
     @property
     def equations(self):
-        """Wrong."""
         return HastyEquations(self)
 
 
@@ -530,7 +514,6 @@ def test_what_a_class_raises_is_noted():
     @dataclass(frozen=True)
     class Broken(fp.ComputedTorque):
         def blocks(self, problem):
-            """Fail."""
             return len(problem.plant.names) / 0
 
     with pytest.raises(ZeroDivisionError) as raised:

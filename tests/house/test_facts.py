@@ -55,19 +55,15 @@ class Gentle(Deformation):
         return request + 0.5 * self.gain * (response - desired), {}
 
     def effective_gain(self):
-        """-gain / 2."""
         return -0.5 * self.gain
 
     def secant_gain(self):
-        """The same."""
         return -0.5 * self.gain
 
     def largest_step(self):
-        """No bound."""
         return float("inf")
 
     def with_effective_gain(self, gain):
-        """Return the map with that gain."""
         return replace(self, gain=-2 * gain)
 
 
@@ -80,16 +76,13 @@ class Named(Controller):
 
     @property
     def inner(self):
-        """What is wrapped."""
         return self.wrapped
 
     @property
     def deformation(self):
-        """What is wrapped has it."""
         return self.wrapped.deformation
 
     def blocks(self, problem):
-        """The blocks of what is wrapped."""
         return self.wrapped.blocks(problem)
 
 
@@ -100,7 +93,6 @@ class Follower(Controller):
     deformation: Deformation = field(default_factory=fp.Identity)
 
     def blocks(self, problem):
-        """Blocks reference, nominal, desired, and the closing ones."""
         response = problem.plant.response_signal
         closing, delays = closing_blocks(problem, self.deformation)
         copies = [rename(n, response("_reference_response"), response(n)) for n in ("nominal", "desired")]

@@ -112,7 +112,6 @@ def test_a_controller_that_knows_the_exact_parameters_may_say_so():
 
     class Honest(controllers.KnowsThePlant):
         def plant_model(self, problem):
-            """Says that it knows them."""
             return replace(super().plant_model(problem), exact=True)
 
     check_controller(Honest(6.0, DEFORMATION))

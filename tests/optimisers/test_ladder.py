@@ -28,15 +28,12 @@ class Never(Optimiser):
     """An optimiser whose solver always fails: the remembered plan, NON_FINITE."""
 
     def memory(self, ocp):
-        """The plan."""
         return Layout((Signal("plan_inputs", tuple(f"u@{k}" for k in range(ocp.stages))),))
 
     def shifted(self, ocp, memory):  # noqa: ARG002
-        """The same plan."""
         return memory
 
     def step(self, ocp):
-        """No solution."""
         symbols = [ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, ocp.stages + 1)]
         symbols += [ca.MX.sym("lower", 1), ca.MX.sym("upper", 1), ca.MX.sym("memory", ocp.stages)]
         diagnostics = ca.vertcat(ca.MX.zeros(4), int(fp.Status.NON_FINITE))

@@ -23,14 +23,12 @@ class Body:
     noise: float = 0.0
 
     def reset(self, seed: int) -> np.ndarray:
-        """Begin at rest."""
         n = len(self.gains)
         self.random, self.queue = np.random.default_rng(seed), [np.zeros(n)] * self.dead
         self.q, self.v, self.acting = np.zeros(n), np.zeros(n), np.zeros(n)
         return np.zeros(3 * n)
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
-        """Move for a period in ten steps."""
         self.queue.append(command)
         now, h = self.queue.pop(0), PERIOD / 10
         for i in range(10):

@@ -200,7 +200,6 @@ class Untouched:
     """A body that fails the test where it is asked anything."""
 
     def reset(self, *_: object) -> list[float]:
-        """Not to be called."""
         raise AssertionError("a recording needs no run")
 
     step = reset

@@ -32,14 +32,12 @@ class Wrapped:
         self.problem, self.measures = problem, measures
 
     def reset(self, seed):
-        """The start of the problem."""
         del seed
         self.calls = 0
         self.x = np.array(self.problem.start_state)
         return self._answer(np.array(self.problem.inputs_before))
 
     def step(self, time, command):
-        """One step of the classical Runge-Kutta method."""
         self.calls, h = self.calls + 1, self.problem.period
         assert time == pytest.approx((self.calls - 1) * h)
         k1 = self._rate(self.x, command)
@@ -65,7 +63,6 @@ class Faulty(Wrapped):
         self.bad, self.at = bad, at
 
     def step(self, time, command):
-        """The answer, or a bad one."""
         good = super().step(time, command)
         return self.bad(good) if self.calls in self.at else good
 
@@ -227,12 +224,10 @@ class Blocking(Wrapped):
         self.released, self.resets = threading.Event(), 0
 
     def reset(self, seed):
-        """The start."""
         self.resets += 1
         return super().reset(seed)
 
     def step(self, time, command):
-        """The answer, which may never come."""
         good = super().step(time, command)
         if self.calls == 100 and not self.released.is_set():
             self.released.wait()
@@ -255,7 +250,6 @@ class Reluctant(Blocking):
     """The same, and its reset waits until it is released."""
 
     def reset(self, seed):
-        """The start, which may never come."""
         self.released.wait()
         return super().reset(seed)
 
@@ -294,17 +288,14 @@ class Hostile:
         self.names = names
 
     def __array__(self, *arguments, **named):
-        """What numpy asks for."""
         self._raise("array")
         return np.zeros(3)
 
     def __len__(self):
-        """Its length."""
         self._raise("len")
         return 3
 
     def __repr__(self):
-        """Its words."""
         self._raise("repr")
         return "Hostile()"
 
@@ -317,7 +308,6 @@ class Speechless(Exception):
     """An exception whose words raise."""
 
     def __str__(self):
-        """No words."""
         raise ZeroDivisionError
 
 
@@ -330,11 +320,9 @@ class WithoutLength:
     """A sequence that has no length."""
 
     def __len__(self):
-        """No length."""
         raise ZeroDivisionError
 
     def __getitem__(self, place):
-        """No entry."""
         raise ZeroDivisionError
 
 

@@ -223,13 +223,11 @@ class Patient:
         self.names = names
 
     def reset(self, seed: int) -> list[float]:
-        """The start of the problem."""
         del seed
         self.x = np.array(list(FIRST.values()))
         return self.shown(np.zeros(1))
 
     def step(self, time: float, command: np.ndarray) -> list[float]:
-        """One step of the classical Runge-Kutta method."""
         del time
         h, x = PERIOD, self.x
         f = lambda x: np.array(moved(x, command[0], 0.2))  # noqa: E731
@@ -298,13 +296,11 @@ def test_a_body_that_measures_states_and_outputs():
         """The model's plant with its exact parameters."""
 
         def reset(self, seed: int) -> np.ndarray:
-            """The start of the problem."""
             del seed
             self.x = problem.start_state
             return np.asarray(shown(self.x, problem.inputs_before, plant.exact).full()).ravel()
 
         def step(self, time: float, command: np.ndarray) -> np.ndarray:
-            """One period."""
             del time
             self.x = np.asarray(move(self.x, command, plant.exact, np.zeros(2)).full()).ravel()
             return np.asarray(shown(self.x, command, plant.exact).full()).ravel()

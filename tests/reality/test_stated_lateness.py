@@ -26,13 +26,11 @@ class Cart:
         self.late, self.lag = late, lag
 
     def reset(self, seed):
-        """Stand still."""
         del seed
         self.waiting, self.x, self.v, self.u = [0.0] * self.late, 0.0, 0.0, 0.0
         return [0.0, 0.0, 0.0]
 
     def step(self, time, command):
-        """Move for one period."""
         del time
         self.waiting.append(float(command[0]))
         wanted, before = self.waiting.pop(0), self.v

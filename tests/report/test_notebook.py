@@ -91,12 +91,10 @@ class Tags(HTMLParser):
         self.text = ""
 
     def handle_starttag(self, tag, attrs):
-        """Note the tag and its attributes."""
         self.tags.add(tag)
         self.attributes |= {name for name, _ in attrs}
 
     def handle_data(self, data):
-        """Collect what is seen."""
         self.text += data
 
 

@@ -35,7 +35,6 @@ class Boastful(ModelStates):
     """Believes what does not exist."""
 
     def believes(self, plant: Any, known: Any) -> tuple[str, ...]:
-        """One state too many."""
         return (*ModelStates().believes(plant, known), "c")
 
 

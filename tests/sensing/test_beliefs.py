@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from gaps import gone_on
 from plants import linear, pendulum
 
 import fpirhc as fp
@@ -21,7 +20,6 @@ from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupporte
 from fpirhc.sensing.base import StateObserver
 from fpirhc.sensing.observability import unobservable
 from fpirhc.simulation.sample import raw_measurements
-from fpirhc.status import Status
 
 CTC = fp.ComputedTorque(fp.Exponential(rate=0.5))
 FPI = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.Affine(gain=-0.5))
@@ -324,41 +322,6 @@ def test_adaptation_works_on_believed_states(observer):
         problem = infusion(observer, duration=60.0, measure_from=20.0)
         errors[name] = fp.measure(problem, run(problem, controller)).rms_error["C1"]
     assert errors["with"] < 0.1 * errors["without"]
-
-
-# One step with the controller
-
-
-BELIEFS: dict[str, tuple[Callable[..., fp.Problem], StateObserver]] = {
-    "model": (infusion, fp.ModelStates()),
-    "Kalman": (infusion, KALMAN),
-    "late servo": (servo, fp.KalmanFilter(measured={"motor": 1e-3}, noise={"load": 1.0, "motor": 1.0})),
-    "tanks": (tanks, fp.KalmanFilter(measured={"h1": 1e-2, "h2": 1e-2}, noise={"h3": 0.01, "h4": 0.01, "h1": 0.01})),
-}
-
-
-def case(name: str) -> tuple[fp.Problem, Controller]:
-    make, observer = BELIEFS[name]
-    controllers = {"tanks": abroad.load("quadruple_tank").controllers["RHC"], "late servo": CTC}
-    return make(observer), controllers.get(name, FPI)
-
-
-@pytest.mark.parametrize("name", BELIEFS)
-def test_a_stepper_believes_as_the_loop_does(name):
-    """Raw measurements of a run give its commands bit by bit; a bad one is a prediction, and changes no more than its memory."""
-    problem, controller = case(name)
-    result = run(problem, controller)
-    anything = dict.fromkeys(problem.sensing.measures(problem.plant), (-np.inf, np.inf))
-    stepper = fp.Stepper(problem, controller, compiled=False, plausible=anything)
-    memory, measured = stepper.start(), raw_measurements(result)
-    for k in range(result.cycles):
-        if k == 10:
-            held, after = stepper.step_measured(float(result.time[k]), measured[k] * np.nan, memory)
-            assert Status(int(stepper.trace()["status"][0])) == Status.BAD_SAMPLE
-            assert all(n.startswith(("observer_", "estimate_")) for n in gone_on(stepper, memory, after))
-            assert np.array_equal(held, result["command"][k - 1])
-        command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
-        assert np.array_equal(command, result["command"][k])
 
 
 def test_a_model_referenced_form_passes_the_null_test_on_believed_states():

@@ -46,7 +46,6 @@ class Alone:
         self.memory: dict[str, Any] = {s.name: s.start_vector() for s in self.block.memory.signals}
 
     def fed(self, cycle: int, gap: float = 0.0, degree: int = 2) -> np.ndarray:
-        """State and response from the sample of a cycle."""
         motion = motion_at(cycle * self.period, degree)
         sample = {"seen": np.array([motion[n] for n in self.names]), "gap": gap}
         results: Any = self.block.function(*(sample[r] for r in self.block.reads.names), *self.memory.values())
@@ -55,7 +54,6 @@ class Alone:
         return np.concatenate([np.asarray(v.full()).ravel() for v in (state, response)])
 
     def waits(self, gap: float) -> None:
-        """A cycle without a sample."""
         block: Block | None = self.block.waits
         if block is not None:
             after = block.function(*({"gap": gap}[r] for r in block.reads.names), *self.memory.values())

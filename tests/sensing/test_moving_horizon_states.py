@@ -116,8 +116,6 @@ class Window:
         self.root = np.linalg.inv(np.linalg.cholesky(self.covariance))
 
     def advanced(self, x: Any, u: float, w: Any) -> Any:
-        """The state one cycle later, by Runge and Kutta."""
-
         def rate(x: Any) -> Any:
             return np.array([x[1], (u - 0.1 * x[1]) / (1.3 * 0.6**2) - 9.81 / 0.6 * np.sin(x[0]) + w])
 
@@ -129,7 +127,6 @@ class Window:
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
     def motion(self, unknown: np.ndarray) -> list[Any]:
-        """States of the window from its unknowns."""
         states = [unknown[:2]]
         for u, w in zip(self.commands[1:], unknown[2:], strict=True):
             states.append(self.advanced(states[-1], u, w))
@@ -245,17 +242,14 @@ class Batch:
     """The reactor outside, by its exact solution A(t) = 3 / (1 + 6 k t); its gauge shows the sum."""
 
     def reset(self, seed: int) -> np.ndarray:
-        """The pressure at the start."""
         del seed
         return self.shown(0.0)
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
-        """The pressure one cycle later."""
         del command
         return self.shown(time + 0.1)
 
     def shown(self, time: float) -> np.ndarray:
-        """The pressure."""
         a = 3 / (1 + 6 * 0.16 * time)
         return np.array([a + 1 + (3 - a) / 2])
 

@@ -310,7 +310,6 @@ class Rooted(Wrapper):
     """A map that has no number for a negative number of its memory."""
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The number, and the memory of the map."""
         return Layout((scalar("rooted", start=1.0),)) + self.map.memory(elements)
 
     def step(

@@ -1,6 +1,7 @@
 """One symbolic step: the loop and a Stepper, in the virtual machine and in C, give the same commands for the same measurements.
 
-The laws of controllers say so of every controller on two masses between springs; here every kind of problem does.
+The laws of controllers say so of every controller on two masses between springs; here every kind of problem does, and none of
+them remembers a bad sample or a poisoned memory.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 import abroad
 import numpy as np
 import pytest
+from gaps import gone_on
 from plants import pendulum
 
 import fpirhc as fp
@@ -19,12 +21,14 @@ from fpirhc.conformance.controller import same_command_everywhere
 from fpirhc.conformance.laws import keep
 from fpirhc.conformance.loops import Trial
 from fpirhc.controllers.base import Controller
+from fpirhc.members import examples
+from fpirhc.simulation.sample import raw_measurements
+from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 
 Loop = tuple[fp.Problem, Controller]
 FPI = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.Affine(gain=-0.5))
-SCALED = fp.Sigmoid(gain=-0.5, scale=50.0)
-REFERENCED = fp.ModelReferenced(SCALED, lag=(1e-3, 0.0))
+REFERENCED = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.ModelReferenced(fp.Affine(gain=-0.05), lag=(1e-3, 0.0)))
 CYCLES = 40
 
 
@@ -83,13 +87,11 @@ class Swing:
     """A pendulum outside."""
 
     def reset(self, seed: int) -> Any:
-        """At rest."""
         del seed
         self.x = np.zeros(2)
         return np.array([0.0, 0.0, 0.0])
 
     def step(self, time: float, command: Any) -> Any:
-        """One Euler step."""
         del time
         acceleration = command[0] / 0.36 - 16.35 * np.sin(self.x[0])
         self.x = self.x + 0.01 * np.array([self.x[1], acceleration])
@@ -122,9 +124,6 @@ LOOPS: dict[str, Callable[[], Loop]] = {
     "prediction": shipped("delayed_mass", "RHC+FPI"),
     "slots": shipped("cart_pole_slots", "slots+FPI"),
     "learning": shipped("turbojet", "RHC offset-free"),
-    "position difference": sensed(fp.PositionDifference(), fp.ComputedTorque(fp.Exponential(rate=6.0), SCALED)),
-    "polynomials": sensed(fp.SavitzkyGolay(window=7, degree=4), fp.ComputedTorque(fp.Exponential(rate=6.0), SCALED)),
-    "twin": sensed(fp.StateVariableFilter(bandwidth=300.0), fp.ComputedTorque(fp.Exponential(rate=6.0), REFERENCED)),
     "model's states": believing("drug_infusion", fp.ModelStates(), fp.VelocityDifference(), "C1", FPI),
     "Kalman": believing(
         "flexible_servo",
@@ -133,20 +132,97 @@ LOOPS: dict[str, Callable[[], Loop]] = {
         "motor",
         FPI,
     ),
+    "plans of believed tanks": believing(
+        "quadruple_tank",
+        fp.KalmanFilter(measured={"h1": 1e-2}, noise=dict.fromkeys(("h1", "h3", "h4"), 0.01)),
+        fp.VelocityDifference(),
+        "h1",
+        "RHC",
+    ),
     "outside": outside,
-}
+} | {str(e): sensed(e, REFERENCED) for e in examples("derivative estimators")}
+GO_ON = ("observe", "estimate_", "filter_", "mirror_", "queue_", "pair_", "delay_", "sent")  # without a sample
 
 
-@pytest.mark.parametrize("name", LOOPS)
-def test_every_kind_of_problem_has_one_step(name):
-    """Bit by bit, but for C, which orders sums in its own way: the loop in C and a Stepper in C to 1e-9."""
-    problem, controller = LOOPS[name]()
+@pytest.fixture(scope="module", params=LOOPS)
+def trial(request) -> Trial:
+    """A short loop of every kind."""
+    problem, controller = LOOPS[request.param]()
     problem = replace(problem, duration=CYCLES * problem.period, measure_from=0.0)
-    trial = Trial(controller, problem, seed=1, left=1.0, compiled=True)
-    keep(controller, trial, [same_command_everywhere], seed=1)
-    run = fp.simulate(problem, controller, seed=1)
+    return Trial(controller, problem, seed=1, left=1.0, compiled=True)
+
+
+class Fed:
+    """The stepper of a trial, given the samples of its run one after the other."""
+
+    def __init__(self, trial: Trial, memory: np.ndarray | None = None) -> None:
+        self.stepper, self.run, self.measured = trial.stepper, trial.run, raw_measurements(trial.run)
+        self.memory = self.stepper.start() if memory is None else memory
+
+    def __call__(self, cycle: int, factor: float = 1.0) -> np.ndarray:
+        """The command of a cycle, the first number of its sample multiplied by a factor."""
+        sample = self.measured[cycle].copy()
+        sample[0] = factor * sample[0] if np.isfinite(factor) else factor
+        command, self.memory = self.stepper.step_measured(float(self.run.time[cycle]), sample, self.memory)
+        return command
+
+    @property
+    def status(self) -> Status:
+        return Status(int(self.stepper.trace()["status"][0]))
+
+
+def test_every_kind_of_problem_has_one_step(trial):
+    """Bit by bit, but for C, which orders sums in its own way: the loop in C and a Stepper in C to 1e-9."""
+    keep(trial.controller, trial, [same_command_everywhere], seed=1)
+    run = fp.simulate(trial.problem, trial.controller, seed=1)
     assert run.compiled == (find_compiler() is not None)
     assert run.cycles == trial.run.cycles == CYCLES
     for signal in ("command", "state", "desired"):
         scale = np.abs(trial.run[signal]).max(initial=1e-300)
         np.testing.assert_allclose(run[signal], trial.run[signal], rtol=0, atol=1e-9 * scale)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_sample_is_a_skipped_tick(trial, bad):
+    """The command is the last one. Estimators and queues go on, and everything is as if the tick had been missed."""
+    fed = Fed(trial)
+    command = [fed(k) for k in range(12)][-1]
+    missed = Fed(trial, fed.memory)
+    assert np.array_equal(fed(12, bad), command)
+    assert fed.status == Status.BAD_SAMPLE
+    assert trial.stepper.trace()["skipped"] == 1
+    changed = gone_on(trial.stepper, missed.memory, fed.memory)
+    assert all(name.startswith(GO_ON) for name in changed), changed
+    assert all(np.array_equal(fed(k), missed(k)) for k in range(13, 25))
+
+
+def test_a_run_begins_at_the_first_good_sample(trial):
+    """Bad samples before it leave no trace but their count."""
+    fresh, late = Fed(trial), Fed(trial)
+    assert all(np.isfinite(late(k, np.nan)).all() for k in range(5))
+    assert all(np.array_equal(fresh(k), late(k)) for k in range(5, 20))
+
+
+def test_a_poisoned_memory_is_that_of_the_start(trial):
+    """The first good sample is then the first cycle of a run; with a bad one the start's command is held."""
+    poisoned = np.full(trial.stepper.memory.size, np.nan)
+    fresh, fed = Fed(trial), Fed(trial, poisoned)
+    expected, begun = fresh(3), fresh.status
+    assert np.array_equal(fed(3), expected)
+    assert fed.status == max(Status.RESTARTED, begun, key=lambda s: s.severity)
+    assert np.array_equal(fed.memory, fresh.memory)
+    fed = Fed(trial, poisoned)
+    assert np.isfinite(fed(3, np.nan)).all()
+    assert np.array_equal(fed(4), Fed(trial)(4))
+
+
+def test_one_poisoned_number_never_stays(trial):
+    """One NaN anywhere in the memory, such as in the plan's counter."""
+    before = Fed(trial)
+    for k in range(5):
+        before(k)
+    for place in range(1, before.memory.size):
+        fed = Fed(trial, before.memory.copy())
+        fed.memory[place] = np.nan
+        assert np.isfinite(fed(5)).all()
+        assert np.isfinite(fed.memory).all(), trial.stepper.memory.columns[place]

@@ -10,7 +10,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.contract import named_in_task
-from fpirhc.errors import FpirhcError, InvalidShape
+from fpirhc.errors import InvalidShape
 from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 
@@ -85,28 +85,6 @@ def test_the_command_is_that_of_the_law():
     assert command == pytest.approx([1.2 * (wanted + 2.0 * 0.1)])
     far, _ = one.step(0.01, np.array([1.6, 0.3]), SAMPLE[2], memory)
     assert far == pytest.approx([-20.0])
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        (True, *SAMPLE[1:]),
-        (np.bool_(False), *SAMPLE[1:]),
-        ("0", *SAMPLE[1:]),
-        (0.0, np.zeros(3), SAMPLE[2]),
-        (0.0, np.ma.masked_array([0.1, 0.3], [True, False]), SAMPLE[2]),
-        (0.0, SAMPLE[1], np.array(["a"])),
-    ],
-    ids=["true", "false", "text", "shape", "masked", "no number"],
-)
-def test_a_wrong_argument_is_refused_and_the_stepper_stays_usable(wrong):
-    """Its only token is back: the next call is not taken for another thread's."""
-    one = plain()
-    expected = one.step(*SAMPLE, one.start())[0]
-    with pytest.raises(FpirhcError):
-        one.step(wrong[0], wrong[1], wrong[2], one.start())
-    np.testing.assert_array_equal(one.step(*SAMPLE, one.start())[0], expected)
-    one.trace()
 
 
 def test_a_solver_that_fails_holds_the_command():

@@ -126,12 +126,10 @@ class _Interrupts(ca.Callback):
     """Ctrl-C in the middle of a Function."""
 
     def __init__(self) -> None:
-        """Construct it as CasADi wants."""
         ca.Callback.__init__(self)
         self.construct("interrupts", {})
 
     def eval(self, arguments):
-        """Raise the signal."""
         signal.raise_signal(signal.SIGALRM)
         return [arguments[0]]
 

@@ -135,12 +135,10 @@ class _Still:
     """A body that does not move."""
 
     def reset(self, seed):
-        """What it measures."""
         del seed
         return [0.0, 3.0, 0.0]
 
     def step(self, time, command):
-        """The same."""
         del time, command
         return [0.0, 3.0, 0.0]
 

@@ -25,7 +25,6 @@ class Gentle(Controller):
     limit: float = 40.0
 
     def blocks(self, problem):
-        """Return reference, law and the closing blocks."""
         plant, motion = problem.plant, self.motion(problem.plant)
         size = len(plant.chains)
 
@@ -41,12 +40,10 @@ class Gentle(Controller):
         return [reference_block(problem), Block("law", reads, writes, step), *closing], delays
 
     def check(self, problem):
-        """Refuse plants without velocities."""
         if problem.plant.step is not None or set(problem.plant.chains.values()) != {2}:
             raise NotSupported("Gentle feeds back an error and its derivative: outputs of relative order 2 only")
 
     def motion(self, plant):
-        """What it feeds back: the measured outputs."""
         return plant.output
 
     def changed(self, problem, name, change):
@@ -61,8 +58,6 @@ class KnowsThePlant(Gentle):
     """Inverts the plant and not the model."""
 
     def blocks(self, problem):
-        """Wrong."""
-
         def exact(step, s):
             if hasattr(s, "parameters"):
                 s.parameters = ca.DM(problem.plant.exact)
@@ -75,7 +70,6 @@ class LeavesTheLimits(Gentle):
     """Gives the command before it is limited."""
 
     def blocks(self, problem):
-        """Wrong."""
         return self.changed(problem, "limit", lambda step, s: {**step(s), "command": s.command_unclipped})
 
 
@@ -84,7 +78,6 @@ class SaysItLearns(Gentle):
 
     @property
     def learns(self):
-        """Wrong."""
         return True
 
 
@@ -93,7 +86,6 @@ class SaysItDeformsNoResponse(Gentle):
 
     @property
     def deforms(self):
-        """Wrong."""
         return "command"
 
 
@@ -101,8 +93,6 @@ class DeformsAnotherResponse(Gentle):
     """Deforms another desired response than the one that it logs."""
 
     def blocks(self, problem):
-        """Wrong."""
-
         def louder(step, s):
             s.desired = 1.05 * s.desired
             return step(s)
@@ -114,7 +104,6 @@ class TellsAnotherModel(Gentle):
     """Names a plant as its model that is neither the problem's nor the real one."""
 
     def plant_model(self, problem):
-        """Wrong."""
         return PlantModel(with_exact_parameters(problem.plant, problem.plant.exact * 1.1), problem.signals)
 
 
@@ -122,7 +111,6 @@ class IsGivenTheExactParameters(Gentle):
     """Asks the loop for the exact parameters."""
 
     def plant_model(self, problem):
-        """Wrong."""
         plant = problem.plant
         exact = {name: parameter.exact for name, parameter in plant.parameters.items()}
         return PlantModel(plant, problem.signals, given=exact)
@@ -132,7 +120,6 @@ class AlwaysOk(Gentle):
     """Hides a command that was held."""
 
     def blocks(self, problem):
-        """Wrong."""
         return self.changed(problem, "judge", lambda step, s: {"status": 0 * s._held})
 
 
@@ -140,7 +127,6 @@ class TakesTheStateForTheOutput(Gentle):
     """Feeds back the state, whatever the outputs are."""
 
     def motion(self, plant):
-        """Wrong."""
         return plant.state
 
 
@@ -148,7 +134,6 @@ class IgnoresItsDeformation(Gentle):
     """Builds itself without the deformation that it was given."""
 
     def blocks(self, problem):
-        """Wrong."""
         return Gentle(self.rate).blocks(problem)
 
 
@@ -157,7 +142,6 @@ class NamesAnotherLaw(Gentle):
 
     @property
     def tracking(self):
-        """Wrong."""
         return fp.Exponential(rate=10 * self.rate, integral=False)
 
 
@@ -172,6 +156,5 @@ class NotesAreOneText(Gentle):
     """Its notes are a text, which a report would write letter by letter."""
 
     def notes(self, problem):
-        """Return no tuple."""
         del problem
         return "It feeds back a saturated error."

@@ -20,12 +20,10 @@ class Softsign(Deformation):
     size: float
 
     def step(self, request, response, desired, memory):
-        """Return the next request."""
         error = response - desired
         return request - self.gain * error / ca.sqrt(1 + ca.sumsqr(error) / self.size**2), {}
 
     def effective_gain(self):
-        """The slope at zero error."""
         return self.gain
 
     def secant_gain(self):
@@ -33,11 +31,9 @@ class Softsign(Deformation):
         return self.gain
 
     def largest_step(self):
-        """The step of an infinite error."""
         return abs(self.gain) * self.size
 
     def with_effective_gain(self, gain):
-        """Return the map with another gain."""
         return replace(self, gain=gain)
 
 
@@ -45,7 +41,6 @@ class HalfTheStep(Softsign):
     """Steps are twice as long as it says."""
 
     def largest_step(self):
-        """Wrong."""
         return 0.5 * super().largest_step()
 
 
@@ -53,7 +48,6 @@ class HalfTheSecant(Softsign):
     """Steps per unit are twice as long as it says."""
 
     def secant_gain(self):
-        """Wrong."""
         return 0.5 * self.gain
 
 
@@ -61,7 +55,6 @@ class MovesItsFixedPoint(Softsign):
     """Changes the request where the response is the desired one."""
 
     def step(self, request, response, desired, memory):
-        """Wrong."""
         return super().step(request, response, desired, memory)[0] + 1e-3, {}
 
 
@@ -69,7 +62,6 @@ class DividesByZero(Softsign):
     """Is 0 / 0 where the response is the desired one."""
 
     def step(self, request, response, desired, memory):
-        """Wrong."""
         error = response - desired
         return request - self.gain * error / ca.norm_2(error) * ca.norm_2(error), {}
 
@@ -78,7 +70,6 @@ class OtherSign(Softsign):
     """Tells the gain with the other sign."""
 
     def effective_gain(self):
-        """Wrong."""
         return -self.gain
 
 
@@ -86,7 +77,6 @@ class Kinked(Softsign):
     """Has twice the gain for errors below zero."""
 
     def step(self, request, response, desired, memory):
-        """Wrong."""
         error = response - desired
         bent = ca.if_else(error > 0, error, 2 * error)
         return request - self.gain * bent / ca.sqrt(1 + ca.sumsqr(error) / self.size**2), {}
@@ -96,7 +86,6 @@ class LouderFarOut(Softsign):
     """Has a larger gain for large requests and does not tell their reach."""
 
     def step(self, request, response, desired, memory):
-        """Wrong."""
         step = super().step(request, response, desired, memory)[0] - request
         return request + step * (1 + 0.2 * ca.tanh(ca.sumsqr(request) / 1e6)), {}
 
@@ -105,7 +94,6 @@ class GivesAnotherGain(Softsign):
     """Is asked for a gain and gives twice of it."""
 
     def with_effective_gain(self, gain):
-        """Wrong."""
         return replace(self, gain=2 * gain)
 
 
@@ -114,7 +102,6 @@ class SaysDesiredPassesAtOnce(Softsign):
 
     @property
     def iteration(self):
-        """Wrong."""
         return Iteration(slows_desired=False)
 
 
@@ -123,7 +110,6 @@ class SaysItFilters(Softsign):
 
     @property
     def iteration(self):
-        """Wrong."""
         return Iteration(error_pole=0.9)
 
 
@@ -132,7 +118,6 @@ class SaysItDoesNotAdapt(Softsign):
 
     @property
     def adapts(self):
-        """Wrong."""
         return False
 
 
@@ -141,5 +126,4 @@ class SaysItLeaks(Softsign):
 
     @property
     def iteration(self):
-        """Wrong."""
         return Iteration(leak=0.5)

@@ -24,16 +24,13 @@ class ConstantGain(StateObserver):
         """Accept every plant."""
 
     def believes(self, plant, known):
-        """The whole state."""
         return plant.state.elements
 
     def memory(self, model):
-        """The believed state."""
         state = model.plant.state
         return Layout((Signal("observed_state", state.elements, state.units, tuple(map(float, model.start))),))
 
     def predict(self, model):
-        """One cycle of the model."""
         calm = np.zeros(len(model.plant.names))
         return lambda evidence, memory: model.move(
             memory["observed_state"], evidence.command, evidence.parameters, calm, evidence.moves
@@ -52,7 +49,6 @@ class ConstantGain(StateObserver):
         return corrected
 
     def free(self, slopes, shown, known):
-        """What cannot be observed."""
         return unobservable(slopes, shown)
 
 
@@ -60,7 +56,6 @@ class NothingIsFree(ConstantGain):
     """Says that every error is corrected, also one that never shows."""
 
     def free(self, slopes, shown, known):
-        """Wrong."""
         return np.zeros((len(slopes[0]), 0))
 
 
@@ -69,16 +64,13 @@ class Told(ConstantGain):
     """The observer with evidence that is changed before it is used."""
 
     def evidence(self, evidence, model):
-        """Return other evidence."""
         raise NotImplementedError
 
     def predict(self, model):
-        """From the changed evidence."""
         inner = super().predict(model)
         return lambda evidence, memory: inner(self.evidence(evidence, model), memory)
 
     def correct(self, model):
-        """With the changed evidence."""
         inner = super().correct(model)
         return lambda evidence, memory, predicted: inner(self.evidence(evidence, model), memory, predicted)
 
@@ -87,7 +79,6 @@ class EverySampleCounts(Told):
     """Corrects with samples that were taken before the run."""
 
     def evidence(self, evidence, model):
-        """Wrong."""
         return replace(evidence, counts=ca.SX(1))
 
 
@@ -95,7 +86,6 @@ class EverySampleMoves(Told):
     """Predicts a cycle also where the sample still shows the start."""
 
     def evidence(self, evidence, model):
-        """Wrong."""
         return replace(evidence, moves=ca.SX(1))
 
 
@@ -103,7 +93,6 @@ class KnowsThePlant(Told):
     """Predicts with the exact parameters."""
 
     def evidence(self, evidence, model):
-        """Wrong."""
         return replace(evidence, parameters=ca.DM(model.plant.exact))
 
 
@@ -111,7 +100,6 @@ class ForgetsItsCorrection(ConstantGain):
     """Remembers what it predicted."""
 
     def correct(self, model):
-        """Wrong."""
         inner = super().correct(model)
         return lambda evidence, memory, predicted: (
             inner(evidence, memory, predicted)[0],

@@ -27,21 +27,17 @@ class HeavyBall(Optimiser):
     tolerance: float
 
     def check(self, ocp):
-        """Raise where states are bounded."""
         if ocp.bounds_states:
             raise NotSupported("HeavyBall keeps limits of inputs only")
 
     def memory(self, ocp):
-        """The plan."""
         names = tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements)
         return Layout((Signal("plan_inputs", names),))
 
     def shifted(self, ocp, memory):
-        """The plan one stage later."""
         return ca.vec(shift(ca.reshape(memory, ocp.input.size, ocp.stages), ocp))
 
     def step(self, ocp):
-        """Every call does the same work."""
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
         s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", nu * n)
@@ -61,11 +57,9 @@ class HeavyBall(Optimiser):
         return ca.Function("heavy_ball", [s0, data, lower, upper, memory], list(results))
 
     def slope(self, ocp, plan, s0, data):
-        """Return the reduced gradient."""
         return reduced_gradient(ocp)(s0, plan, data, ca.DM.zeros(ocp.state.size, ocp.stages))[1]
 
     def final(self, plan, diagnostics, memory):
-        """Return plan, diagnostics and memory as they are."""
         return plan, diagnostics, memory
 
 
@@ -73,7 +67,6 @@ class AlwaysOk(HeavyBall):
     """Calls every plan OK."""
 
     def final(self, plan, diagnostics, memory):
-        """Wrong."""
         return plan, ca.vertcat(diagnostics[:4], 0), memory
 
 
@@ -81,7 +74,6 @@ class NoCost(HeavyBall):
     """Reports a cost of zero."""
 
     def final(self, plan, diagnostics, memory):
-        """Wrong."""
         return plan, ca.vertcat(0, diagnostics[1:]), memory
 
 
@@ -89,7 +81,6 @@ class DoesNotShift(HeavyBall):
     """Goes on with the plan of the stage before."""
 
     def shifted(self, ocp, memory):
-        """Wrong."""
         return memory
 
 
@@ -97,7 +88,6 @@ class LeavesTheBox(HeavyBall):
     """Plans inputs outside of their bounds."""
 
     def final(self, plan, diagnostics, memory):
-        """Wrong."""
         return plan * 1.5, diagnostics, ca.vec(plan)
 
 
@@ -105,7 +95,6 @@ class ForgetsItsPlan(HeavyBall):
     """Begins every call with zero inputs."""
 
     def final(self, plan, diagnostics, memory):
-        """Wrong."""
         return plan, diagnostics, memory * 0
 
 
@@ -113,7 +102,6 @@ class CountsThree(HeavyBall):
     """Reports three iterations, whatever it took."""
 
     def final(self, plan, diagnostics, memory):
-        """Wrong."""
         return plan, ca.vertcat(diagnostics[:3], 3, diagnostics[4]), memory
 
 
@@ -121,7 +109,6 @@ class TenthOfTheResidual(HeavyBall):
     """Reports a tenth of the stationarity."""
 
     def final(self, plan, diagnostics, memory):
-        """Wrong."""
         return plan, ca.vertcat(diagnostics[0], 0.1 * diagnostics[1], diagnostics[2:]), memory
 
 
@@ -130,5 +117,4 @@ class SaysItMayTakeAnyTime(HeavyBall):
 
     @property
     def unbounded(self):
-        """Wrong."""
         return "it may take any time"
