@@ -95,13 +95,6 @@ def test_wrong_sign_of_the_gain_is_explained(folder, capsys):
     assert not list(folder.rglob("report.html"))
 
 
-def test_folder_that_cannot_be_written(folder, capsys):
-    """It fails before anything runs, with exit code 3."""
-    (folder / "taken").write_text("a file, not a folder")
-    assert main(["compare", "line.py", "--out", "taken/results"]) == 3
-    assert "cannot write to the folder" in capsys.readouterr().err
-
-
 def test_ended_run_has_its_own_exit_code(folder, capsys):
     """A signal that is not finite ends the run; its name, time and finite part are kept."""
     _write(folder, "- p.k * q.y", "- p.k * q.y + 1e-9 * ca.sqrt(0.9 - q.y)")
@@ -190,22 +183,6 @@ def test_optimisers_are_compared_by_name(folder, capsys):
         "gap: cost above the converged optimum",
     ):
         assert name in printed
-
-
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        (["solve", "line.py", "--optimisers", "ipop"], "Did you mean 'ipopt'"),
-        (["compare", "line.py", "--optimisers", "fixd-point"], "Did you mean 'fixed-point'"),
-        (["compare", "line.py", "--optimisers", "all", "--controllers", "CTC"], "plans with an optimiser"),
-        (["solve", "line.py", "--tolerance", "-1"], "expected a number above 0"),
-    ],
-)
-def test_wrong_optimisers_are_named(folder, capsys, command, message):
-    """One clear line and exit code 2."""
-    _receding(folder)
-    assert main(command) == 2
-    assert message in capsys.readouterr().err
 
 
 def test_solve_without_a_horizon_says_what_is_missing(folder, capsys):

@@ -31,6 +31,8 @@ BESIDE = {
     "empty.csv": "",
     "words.csv": "# of Monday\n\ntime,angle\n0,abc\n",
     "other.csv": "time,phi\n0,1\n0.02,1\n",
+    "short.csv": "a,b\n1\n",
+    "folder.py/kept": "",
 }
 BOTH = '{"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)}'
 
@@ -45,6 +47,7 @@ class Wrong:
         said: what stands in the message, in this order.
         words: of the command line.
         beside: other files of the folder.
+        code: of the exit; None for one of those that say no.
     """
 
     file: str
@@ -52,6 +55,7 @@ class Wrong:
     said: tuple[str, ...]
     words: tuple[str, ...] = REVIEW
     beside: dict[str, str] = field(default_factory=dict)
+    code: ExitCode | None = None
 
 
 def one(file: str, old: str, new: str, *said: str) -> Wrong:
@@ -59,9 +63,9 @@ def one(file: str, old: str, new: str, *said: str) -> Wrong:
     return Wrong(file, ((old, new),), said)
 
 
-def line(words: str, *said: str) -> Wrong:
+def line(words: str, *said: str, code: ExitCode | None = ExitCode.BAD_INPUT) -> Wrong:
     """A wrong command line beside a correct file."""
-    return Wrong(PENDULUM, (), said, tuple(shlex.split(words)), BESIDE)
+    return Wrong(PENDULUM, (), said, tuple(shlex.split(words)), BESIDE, code)
 
 
 PLANTS = {
@@ -573,7 +577,11 @@ LINES = {
         line("run mine.py RHC+FPI --set gain=-2", "Did you mean 'optimiser.map.gain' or 'deformation.map.gain'?"),
         line("run mine.py RHC+FPI --set deformation.gain=-2", "has no 'gain'. Did you mean 'deformation.map.gain'?"),
         line("run mine.py RHC --set mass=2", "Parameters (exact and approximate) and the start are data of every loop"),
-        line("check mine.py", "there is no baseline 'mine.json'; write one: fpirhc accept PROBLEM --reason ..."),
+        line(
+            "check mine.py",
+            "there is no baseline 'mine.json'; write one: fpirhc accept PROBLEM --reason ...",
+            code=None,
+        ),
         # new
         line("new ../my-arm", "'../my-arm' is no name for a problem", "Try 'my_arm'; a folder is given by --dir"),
         line("new class", "'class' cannot be the name of a problem: it is a word of Python. Try 'my_class'"),
@@ -581,7 +589,9 @@ LINES = {
             "new two_mass", "'two_mass' cannot be the name of a problem: a shipped problem has it", "Try 'my_two_mass'"
         ),
         line("new numpy", "a module of that name is installed, which the file would hide from everything beside it."),
-        line("new mine", "'mine.py' exists already and is kept; choose another name or --dir"),
+        line(
+            "new mine", "'mine.py' exists already and is kept; choose another name or --dir", code=ExitCode.NOT_WRITABLE
+        ),
         # review
         line("review folder.py", "'folder.py' is a folder; a problem file ends in .py"),
         line(
@@ -599,7 +609,11 @@ LINES = {
             "review mine.py --mismatch nan", "--mismatch: expected percent from 0 to below 100, such as 20%, got 'nan'."
         ),
         # compare
-        line("compare mine.py --out notes.txt/a", "cannot write to the folder 'notes.txt/a': it is a file"),
+        line(
+            "compare mine.py --out notes.txt/a",
+            "cannot write to the folder 'notes.txt/a': it is a file",
+            code=ExitCode.NOT_WRITABLE,
+        ),
         line("compare mine.py --headline rms_error", "has a number for every coordinate; give one: 'rms_error.NAME'"),
         line("compare mine.py --headline rms_error.angel", "is unknown. Did you mean 'rms_error.angle'?"),
         line(
@@ -611,6 +625,7 @@ LINES = {
         line("compare mine.py --tuned gone.json", "'gone.json': No such file", "'fpirhc tune mine' writes such a file"),
         line("compare mine.py --scenarios 0", "--scenarios: expected a whole number of at least 1, got '0'."),
         line("compare mine.py --processes 2", "--processes needs --scenarios N, the number of scenarios"),
+        line("compare two_mass --optimisers all --controllers CTC", "plans with an optimiser"),
         # run
         line("run mine.py RHC RHC+FPI", "'RHC+FPI' is a word too many; write fpirhc run PROBLEM CONTROLLER [options]."),
         line(
@@ -656,13 +671,17 @@ LINES = {
             "lacks a column for time",
         ),
         # check, accept
-        line("check nofile", "nofile: cannot be run problem 'nofile' is unknown."),
-        line("check .", ".: cannot be run '.' is a folder; a problem file ends in .py, such as mine.py"),
+        line("check nofile", "nofile: cannot be run problem 'nofile' is unknown.", code=None),
+        line("check .", ".: cannot be run '.' is a folder; a problem file ends in .py, such as mine.py", code=None),
         line(
             "check mine.py --ignore-below -1",
             "--ignore-below: expected percent from 0 to below 100, such as 20%, got '-1'",
         ),
-        line("check mine.py --markdown gone/x.md", "cannot write to 'gone/x.md': there is no folder 'gone'"),
+        line(
+            "check mine.py --markdown gone/x.md",
+            "cannot write to 'gone/x.md': there is no folder 'gone'",
+            code=ExitCode.NOT_WRITABLE,
+        ),
         line("accept mine.py --reason ''", "say why the new numbers are right, --reason 'horizon 20 -> 30'"),
         line(
             "accept mine.py --reason x --processes -1", "--processes: expected a whole number of at least 1, got '-1'."
@@ -670,33 +689,154 @@ LINES = {
         line(
             "accept mine.py --reason x --baselines notes.txt",
             "notes.txt' is a file; give another folder by --baselines",
+            code=ExitCode.NOT_WRITABLE,
         ),
         # export, probe, limits
         line("export mine.py RHC", "--out is missing. See fpirhc export --help."),
         line("export mine.py RHC --out o --live optimiser.iterations", "is a whole number or a switch"),
         line("probe mine.py --amplitude -1", "expected a number of at least 0, in the unit of the signal"),
         line("probe mine.py --chatter 0", "expected a number above 0, in the unit of the signal"),
+        line(
+            "export two_mass RHX --out o",
+            "problem 'two_mass': controller 'RHX' is unknown. Did you mean 'RHC'? Valid: 'CTC', 'CTC+FPI (eq 3)'",
+        ),
+        line(
+            "replay two_mass X short.csv",
+            "problem 'two_mass': controller 'X' is unknown. Valid: 'CTC', 'CTC+FPI (eq 3)'",
+        ),
+        line(
+            "probe two_mass --controller X",
+            "problem 'two_mass': controller 'X' is unknown. Valid: 'CTC', 'CTC+FPI (eq 3)'",
+        ),
+        line(
+            "lab two_mass --controllers X",
+            "problem 'two_mass': controller 'X' is unknown. Valid: 'CTC', 'CTC+FPI (eq 3)'",
+        ),
+        line(
+            "limits two_mass --controllers X",
+            "problem 'two_mass': controller 'X' is unknown. Valid: 'CTC', 'CTC+FPI (eq 3)'",
+        ),
+        line(
+            "limits two_mass --over nosuch",
+            "quantity 'nosuch' is unknown. Did you mean 'noise'? Valid: mismatch, latency, ",
+        ),
+        line(
+            "compare two_mass --headline rmse",
+            "metric 'rmse' is unknown. Did you mean 'rms_error'? Valid: relative error, ",
+        ),
+        line(
+            "compare two_mass --optimisers ipot",
+            "optimiser 'ipot' is unknown. Did you mean 'ipopt'? Valid: fixed-point, ipopt, ",
+        ),
+        line(
+            "compare two_mass --cases heavy",
+            "problem 'two_mass' has no cases; add to its file cases = fpirhc.Cases({'heavy': ",
+        ),
+        line(
+            "export two_mass RHC --to matlab --out o",
+            "the target 'matlab' is unknown. Valid: arduino, c, cortex-m, fmu, fmu2, library, ",
+        ),
+        line(
+            "export two_mass CTC --out o --name int",
+            "'int' cannot be the name of a controller in C: expected at most 40 letters, ",
+        ),
+        line(
+            "new 'two mass'",
+            "'two mass' is no name for a problem: it must begin with a letter and go on with letters, digits ",
+        ),
+        line("new 2mass", "Try 'plant_2mass'; a folder is given by --dir"),
+        line("list --x", "the option '--x' is unknown. Valid: --help, --debug. See fpirhc list --help."),
+        line("accept two_mass", "--reason is missing. See fpirhc accept --help."),
+        line(
+            "compare two_mass --scenarios 5",
+            "every scenario would be the same: the problem has no disturbances and no parameter ",
+        ),
+        line("accept two_mass --reason x --seeds 1", "--seeds: expected a whole number of at least 2, got '1'."),
+        line("export two_mass CTC --out o --cycles -3", "--cycles: expected a whole number of at least 1, got '-3'."),
+        line("export two_mass CTC --out o --to fmu --check", "--check is there for c, cortex-m, not for fmu"),
+        line(
+            "probe two_mass --cycles 3",
+            "probe: 3 cycles are too few to tell a gain from noise; expected at least 40, 300 are usual",
+        ),
+        line(
+            "run two_mass RHC+FPI --set deformation.gian=-1",
+            "(Sigmoid) has no 'gian'. Did you mean 'gain'? Valid: gain, shift, scale.",
+        ),
+        line(
+            "run two_mass RHC --set deformation.gain=-1",
+            "setting 'deformation.gain': 'deformation' of the controller (Identity) has no 'gain'.",
+            "It has no settings; the controller has settings in: ",
+        ),
+        line(
+            "run two_mass RHC+FPI --set limits.inputs.Q3=1,2",
+            "setting 'limits.inputs.Q3': 'limits.inputs' of the problem has no 'Q3'. Did you mean 'Q2'? Valid: Q1, Q2.",
+        ),
+        line(
+            "run two_mass CTC --set limits.inputs.Q1=5,-5",
+            "problem: limits: 'Q1' has lower 5.0 above upper -5.0; swap them",
+        ),
+        line(
+            "export two_mass CTC --out o --live gain",
+            "setting 'gain': neither the controller nor the problem's cost, limits, dead_time, reference",
+        ),
+        line("compare two_mass --tuned notes.txt", "'notes.txt' is not a file that 'fpirhc tune' wrote"),
+        line("replay two_mass CTC short.csv", "recording short.csv: line 2 has 1 entries, the line of names 2"),
+        line(
+            "compare two_mass --out notes.txt",
+            "cannot write to the folder 'notes.txt': it is a file; choose another with --out",
+            code=ExitCode.NOT_WRITABLE,
+        ),
+        line(
+            "run two_mass CTC --out notes.txt",
+            "cannot write to the folder 'notes.txt': it is a file; choose another with --out",
+            code=ExitCode.NOT_WRITABLE,
+        ),
+        line(
+            "lab two_mass --out notes.txt/lab.html",
+            "cannot write to the folder 'notes.txt': it is a file; choose another with --out",
+            code=ExitCode.NOT_WRITABLE,
+        ),
+        line(
+            "new arm --dir notes.txt",
+            "cannot write to the folder 'notes.txt': it is a file; choose another with --dir",
+            code=ExitCode.NOT_WRITABLE,
+        ),
+        line(
+            "export two_mass CTC --out folder.py --cycles 1",
+            "'folder.py' is not an empty folder, and nothing in it is replaced; choose another",
+            code=ExitCode.NOT_WRITABLE,
+        ),
         line("probe mine.py --recording words.csv", "recording words.csv: line 4 is not made of numbers: 0, abc"),
     )
 }
 WRONG = {**PLANTS, **PROBLEMS, **CONTROLLERS, **FILES, **{" ".join(words): case for words, case in LINES.items()}}
 
 
+def files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_file_or_command_line_is_explained(name, tmp_path, monkeypatch, capsys):
     wrong = WRONG[name]
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "folder.py").mkdir()
+    Path("folder.py").mkdir()
     text = wrong.file
     for old, new in wrong.changes:
         assert old in text
         text = text.replace(old, new, 1)
     for file, content in {"mine.py": text, **wrong.beside}.items():
         Path(file).write_text(content, encoding="utf-8")
+    before = files(tmp_path)
     code = main(list(wrong.words))
     printed = capsys.readouterr()
     said = " ".join((printed.out + printed.err).split())
-    assert code in (ExitCode.BAD_INPUT, ExitCode.ANSWERED_NO, ExitCode.NO_BASELINE, ExitCode.NOT_WRITABLE)
+    if wrong.code is None:
+        assert code in (ExitCode.BAD_INPUT, ExitCode.ANSWERED_NO, ExitCode.NO_BASELINE)
+    else:
+        assert (code, printed.out) == (wrong.code, "")
+        assert said.startswith("fpirhc: ")
+        assert files(tmp_path) == before
     assert "Traceback" not in said
     assert "an error inside" not in said
     assert "usage:" not in said

@@ -203,24 +203,3 @@ def test_events_are_logged_in_a_run():
     assert not calm["adaptation_event"].any()
     assert calm["gain_factor"].max() > 1.0
     assert np.abs(calm["error"][1500:]).max() < 0.01
-
-
-def test_noise_gain_is_the_predicted_one():
-    """Var r = a/(2 - a) sigma^2 and lag-1 correlation of h of -a/2, on the unit plant, within confidence bounds."""
-    cycles = 40_000
-    for gain in (0.2, 0.5, 1.0):
-        noise = np.random.default_rng(3).standard_normal(cycles)
-        requests, errors, _, _ = run_affine(gain, noise)
-        assert np.var(requests[100:]) == pytest.approx(gain / (2 - gain), rel=0.08)
-        seen = errors[100:] + noise[101:]
-        correlation = np.corrcoef(seen[1:], seen[:-1])[0, 1]
-        assert correlation == pytest.approx(-gain / 2, abs=0.02)
-
-
-def run_affine(gain, noise):
-    """The affine map on f = r, accumulated in one call."""
-    r, w = ca.SX.sym("r"), ca.SX.sym("w")
-    next_memory, _ = fp.Affine(gain=-2 * gain).step(r, r + w, ca.SX(0), {})
-    accumulated = ca.Function("s", [r, w], [next_memory]).mapaccum("run", noise.size - 1)
-    requests = accumulated(0.0, noise[None, 1:]).full().ravel()
-    return requests, np.concatenate([[0.0], requests[:-1]]), None, None

@@ -63,11 +63,12 @@ def test_robust_fixed_point_transformation_of_a_vector(offset, sign):
     assert after(one, r, d, d) == pytest.approx(r, abs=0)
 
 
-def test_settings_of_the_robust_transformation():
+@pytest.mark.parametrize("kind", [fp.RFPT, fp.RFPTVector])
+def test_settings_of_the_robust_transformation(kind):
     """A sign is -1 or 1; offset and gain are not zero."""
     for wrong in ({"sign": 0}, {"sign": 2}, {"sign": -2}, {"offset": 0.0}, {"gain": 0.0}, {"gain": math.nan}):
         with pytest.raises(InvalidValue, match="expected"):
-            fp.RFPT(**{"offset": 10.0, "sign": -1, "gain": 0.1, **wrong})
+            kind(**{"offset": 10.0, "sign": -1, "gain": 0.1, **wrong})
 
 
 @pytest.mark.parametrize(
@@ -113,6 +114,8 @@ def test_scale_of_the_sigmoid():
     for wrong in (
         {"shift": 5.01},
         {"shift": -5.01},
+        {"shift": math.nan},
+        {"gain": math.nan},
         {"scale": 0.0},
         {"scale": -1.0},
         {"scale": math.inf},

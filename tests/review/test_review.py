@@ -346,22 +346,6 @@ def test_journey_with_text(capsys):
     assert predict(task.problem, task.controllers["CTC+FPI increment"]).verdict == "yes"
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["no_such_problem"], "unknown"),
-        (["two_mass", "--controllers", "RCH"], "Did you mean"),
-        (["two_mass", "--mismatch", "250"], "--mismatch: expected percent from 0 to below 100, such as 20%, got '250'"),
-    ],
-)
-def test_bad_input_ends_with_2(words, message, capsys):
-    """Names and values are named; nothing is printed on standard output."""
-    assert main(["review", *words]) == 2
-    printed = capsys.readouterr()
-    assert message in printed.err
-    assert not printed.out
-
-
 def test_slots_are_judged_by_their_schedule():
     """Crane: the published radius; a controller that does not fit is a no with its reason."""
     task = fp.load_problem("crane_slots")
