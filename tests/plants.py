@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import casadi as ca
+
 import fpirhc as fp
 
 
@@ -19,8 +21,6 @@ def linear(gain: float, believed: float) -> fp.Plant:
 
 def pendulum(mass: float = 1.0, believed: float = 1.4) -> fp.Plant:
     """A pendulum with a torque, q measured from hanging down."""
-    import casadi as ca
-
     return fp.Plant(
         coordinates={"angle": "rad"},
         inputs={"torque": "N m"},
@@ -32,6 +32,13 @@ def pendulum(mass: float = 1.0, believed: float = 1.4) -> fp.Plant:
             "angle": (u.torque - 0.1 * v.angle) / (p.m * p.l**2) - 9.81 / p.l * ca.sin(q.angle)
         },
     )
+
+
+def swing(plant: fp.Plant | None = None, /, **settings: Any) -> fp.Problem:
+    """The pendulum along a sine for 3 s."""
+    usual: dict[str, Any] = {"start": {"angle": 0.0}, "period": 1e-3, "duration": 3.0, "measure_from": 1.0}
+    sine = fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)})
+    return fp.Problem(**({"plant": plant or pendulum(), "reference": sine} | usual | settings))
 
 
 def chain(order: int) -> fp.Plant:

@@ -380,9 +380,6 @@ def test_the_regressor_of_a_plant_is_built_once(monkeypatch):
     assert len(built) == 1
 
 
-# Every combination compiles, and runs compiled as it runs interpreted.
-
-
 # What does not fit is refused before the run.
 
 

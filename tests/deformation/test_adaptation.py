@@ -146,17 +146,6 @@ def test_damper_regrows_to_the_own_gain_and_not_beyond():
     assert np.max(factor[1:] / factor[:-1]) < 1.002
 
 
-def test_wrappers_log_in_a_run():
-    """The controller logs both factors by name, and the automatic scale reaches the wrapped map."""
-    from dataclasses import replace
-
-    problem = replace(fp.load_problem("two_mass").problem, duration=0.1, measure_from=0.0)
-    tuned = fp.Tuned(fp.Sigmoid(gain=-0.5), largest_gain=0.6)
-    seen = fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Damped(tuned)), seed=0, compiled=False)
-    assert np.ptp(seen["gain_factor"]) > 0
-    assert seen["damping_factor"].max() == 1.0
-
-
 @pytest.mark.parametrize("map_", [fp.Sigmoid(gain=-1.5, scale=20.0), fp.Affine(gain=-1.0)])
 def test_guard_is_quiet_on_disturbance_steps(map_):
     """100 steps of random size and sign, with noise: not one trip, and the same requests as without the guard."""

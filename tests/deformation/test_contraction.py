@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fpirhc import RFPT, Affine, RFPTVector, Rotation, Sigmoid
-from fpirhc.contraction.gains import assess_gain, check_gain, linear_limit, predicted_factor, sector_limit
+from fpirhc.contraction.gains import assess_gain, check_gain, linear_limit, predicted_factor
 from fpirhc.contraction.measured import identified_factor
 from fpirhc.contraction.spectrum import Spectrum, response_jacobian, spectrum_over_box, spectrum_over_run
 from fpirhc.deformation import Deformation, Identity
@@ -217,14 +217,6 @@ def test_too_large_and_no_gain() -> None:
     with pytest.raises(NotContractive, match="does not iterate"):
         check_gain(Identity(), Spectrum(np.array([[1.5, 1.3]])))
     assert assess_gain(Identity(), Spectrum(np.array([[1.5, 1.3]]))).predicted == 1.0
-
-
-@pytest.mark.parametrize("deformation", MAPS, ids=name_of)
-def test_sector_limit_of_a_report(deformation: Deformation) -> None:
-    """It is that of the map on these eigenvalues."""
-    spectrum = Spectrum(np.array([[1.5, 0.1]]))
-    report = check_gain(deformation, spectrum)
-    assert sector_limit(deformation, spectrum.eigenvalues) == pytest.approx(report.sector_limit)
 
 
 @pytest.mark.parametrize("deformation", MAPS, ids=name_of)

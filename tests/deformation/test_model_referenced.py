@@ -213,17 +213,6 @@ def test_limits_need_no_anti_windup():
     assert overshoot(step_of_two_metres(request_kept, deformation=map)) > 3.8
 
 
-def test_not_a_number_is_not_remembered():
-    """One response that is not a number holds the command for a cycle; the next request is finite."""
-    step, layout = stepping(fp.ModelReferenced(affine(0.5)))
-    memory = layout.start()
-    for response in (1.0, 1.2, np.nan, 1.1, 1.1):
-        request, memory = step(1.0, response, 1.0, memory)
-        memory = memory.full().ravel()
-        assert np.isnan(float(request)) == np.isnan(response)
-    assert np.isfinite(memory).all()
-
-
 MAPS = (
     fp.Sigmoid(gain=-1.2, scale=50.0),
     fp.Sigmoid(gain=-1.2, scale=0.5),

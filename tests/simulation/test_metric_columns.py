@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hand_made_runs import CYCLES, SOLVE, problem, run, step
+from hand_made_runs import CYCLES, SOLVE, problem, run
 from plants import linear
 
 import fpirhc as fp
@@ -149,36 +149,6 @@ def test_end_of_a_run_counts_beside_other_cycles_that_were_not_finite():
     assert metrics.statuses == {"OK": 23, "NON_FINITE": 3}
     always = ("OK", "NOT_CONVERGED", "INFEASIBLE", "HELD", "NON_FINITE")  # the others are statuses of a machine
     assert metrics["status"] == {name: {"OK": 23, "NON_FINITE": 3}.get(name, 0) for name in always}
-
-
-def test_settling_is_the_cycle_after_the_last_one_outside():
-    """Outside up to the last cycle but one: settled in the last; outside in the last: not settled."""
-    assert fp.measure(problem(), run(step(0.5, 0.0, 99))).settling["y"] == pytest.approx(9.9)
-    assert np.isnan(fp.measure(problem(), run(0.5)).settling["y"])
-    assert fp.measure(problem(), run(step(0.5, 0.0, 1))).settling["y"] == pytest.approx(0.1)
-    assert fp.measure(problem(), run(0.0, reference=np.zeros(CYCLES))).settling["y"] == 0.0
-
-
-def test_settling_counts_the_size_of_the_first_error():
-    """From 5 m below the band is 0.1 m as well; a later and larger error does not widen it."""
-    still = np.zeros(CYCLES)
-    assert fp.measure(problem(), run(step(-5.0, 0.099, 20), reference=still)).settling["y"] == pytest.approx(2.0)
-    assert fp.measure(problem(), run(step(-5.0, 0.1, 20), reference=still)).settling["y"] == pytest.approx(2.0)
-    error = np.where(np.arange(CYCLES) == 1, 50.0, step(5.0, 0.101, 20))
-    assert np.isnan(fp.measure(problem(), run(error, reference=still)).settling["y"])
-
-
-def test_settling_of_a_small_motion():
-    """A millimetre: the band is 0.02 mm. The floor of the band is there for a reference that rests and an error of zero."""
-    small, still = np.linspace(0.0, 1e-3, CYCLES), np.zeros(CYCLES)
-    assert fp.measure(problem(), run(step(0.0, 1e-15, 30), reference=still)).settling["y"] == 0.0
-    assert fp.measure(problem(), run(step(5e-4, 1.9e-5, 30), reference=small)).settling["y"] == pytest.approx(3.0)
-    assert np.isnan(fp.measure(problem(), run(step(5e-4, 2.1e-5, 30), reference=small)).settling["y"])
-
-
-def test_a_run_that_ended_early_inside_the_band_has_not_settled():
-    """Nobody knows whether it would have stayed there."""
-    assert np.isnan(fp.measure(problem(), run(1e-3, stop="signal 'x' is not finite")).settling["y"])
 
 
 def test_plans_that_return_are_counted_once():

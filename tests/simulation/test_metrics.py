@@ -34,22 +34,31 @@ def test_iae_is_an_integral_over_time():
     assert fp.measure(problem(), run(-2.0)).units["iae"]["y"] == "m s"
 
 
-@pytest.mark.parametrize(
-    ("after", "settled"), [(0.019, 3.0), (0.021, np.nan)], ids=["inside the band", "outside the band"]
-)
-def test_settling_is_within_two_per_cent_of_the_references_range(after, settled):
-    """The reference moves by 1 m. The band is 0.02 m: an error of 0.019 m has settled, one of 0.021 m has not."""
-    first = step(0.5, after, 30)
-    metrics = fp.measure(problem(), run(first)).settling["y"]
-    assert metrics == pytest.approx(settled, nan_ok=True)
+STILL, SMALL = np.zeros(CYCLES), np.linspace(0.0, 1e-3, CYCLES)
+FIRST_WIDENS = np.where(np.arange(CYCLES) == 1, 50.0, step(5.0, 0.101, 20))
+SETTLING = {
+    "inside the band": (step(0.5, 0.019, 30), None, 3.0),
+    "outside the band": (step(0.5, 0.021, 30), None, np.nan),
+    "outside up to the last cycle but one": (step(0.5, 0.0, 99), None, 9.9),
+    "outside in the last": (0.5, None, np.nan),
+    "outside in the first": (step(0.5, 0.0, 1), None, 0.1),
+    "never outside; the whole run counts": (0.01, None, 0.0),
+    "at rest, the band is that of the first error": (step(5.0, 0.099, 20), STILL, 2.0),
+    "at rest, outside the band": (step(5.0, 0.101, 20), STILL, np.nan),
+    "at rest, from below": (step(-5.0, 0.1, 20), STILL, 2.0),
+    "at rest, a later and larger error does not widen it": (FIRST_WIDENS, STILL, np.nan),
+    "at rest without an error": (0.0, STILL, 0.0),
+    "at rest without a first error, the band has a floor": (step(0.0, 1e-15, 30), STILL, 0.0),
+    "a millimetre": (step(5e-4, 1.9e-5, 30), SMALL, 3.0),
+    "a millimetre, outside": (step(5e-4, 2.1e-5, 30), SMALL, np.nan),
+}
 
 
-def test_settling_takes_the_first_error_where_the_reference_rests():
-    """From 5 m off: the band is 0.1 m. Never having left the band is zero; the whole run counts, not the measured part."""
-    still = np.zeros(CYCLES)
-    assert fp.measure(problem(), run(step(5.0, 0.099, 20), reference=still)).settling["y"] == pytest.approx(2.0)
-    assert np.isnan(fp.measure(problem(), run(step(5.0, 0.101, 20), reference=still)).settling["y"])
-    assert fp.measure(problem(), run(0.01)).settling["y"] == 0.0
+@pytest.mark.parametrize("name", SETTLING)
+def test_settling_is_the_cycle_after_the_last_one_outside_two_per_cent(name):
+    """Of the range of the reference, 1 m; of the first error where it rests."""
+    error, reference, settled = SETTLING[name]
+    assert fp.measure(problem(), run(error, reference=reference)).settling["y"] == pytest.approx(settled, nan_ok=True)
 
 
 def test_at_limit_is_where_a_command_stands_and_of_the_measured_part():
@@ -123,6 +132,7 @@ def test_a_run_that_ended_early_has_no_errors():
     metrics = fp.measure(problem(), run(1.0, stop="signal 'x' is not finite"))
     for numbers in (metrics.rms_error, metrics.max_error, metrics.iae, metrics.settling, metrics.effort):
         assert np.isnan(list(numbers.values())).all()
+    assert np.isnan(fp.measure(problem(), run(1e-3, stop="it ended inside the band")).settling["y"])
     assert metrics.statuses == {"OK": 25, "NON_FINITE": 1}
     assert metrics.worst_status == "NON_FINITE"
 

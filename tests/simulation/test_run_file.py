@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_loop import swing
+from plants import swing
 
 import fpirhc as fp
 from fpirhc.errors import OutputError

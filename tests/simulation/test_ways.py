@@ -9,7 +9,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from plants import pendulum
+from plants import swing
 
 import fpirhc as fp
 from fpirhc.symbolic.native import find_compiler
@@ -24,23 +24,10 @@ MAPS = (
 )
 
 
-def swing(**changes):
-    """A pendulum along a sine."""
-    settings = {
-        "plant": pendulum(),
-        "reference": fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)}),
-        "start": {"angle": 0.1},
-        "period": 1e-3,
-        "duration": 3.0,
-        "measure_from": 2.0,
-    }
-    return fp.Problem(**{**settings, **changes})
-
-
 @pytest.mark.parametrize("deformation", MAPS, ids=lambda m: type(m).__name__)
 def test_every_map_cures_the_wrong_model(deformation):
     """With the same effective gain all maps leave about the same error."""
-    problem = swing()
+    problem = swing(measure_from=2.0)
     errors = [
         fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(TRACK, d), seed=0)).rms_error["angle"]
         for d in (fp.Identity(), deformation, MAPS[0])
@@ -91,7 +78,7 @@ def test_parameters_are_not_compiled_in():
     """Other exact values give another run with the same Function."""
     from fpirhc.simulation.loop import close_loop
 
-    problem = swing()
+    problem = swing(measure_from=2.0)
     heavier = replace(
         problem.plant, parameters={**problem.plant.parameters, "m": fp.Parameter(approximate=1.4, exact=1.2, unit="kg")}
     )

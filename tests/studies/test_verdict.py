@@ -54,23 +54,16 @@ def test_help_is_stated_with_numbers():
     assert "times less" in sentences.verdict[0]
 
 
-def test_too_small_a_scale_is_recognised():
-    """The desired response outruns the map's step limit: the verdict names S and by how much to raise it."""
-    sentences = judged(fp.Sigmoid(gain=-0.5, scale=1e-3))
-    assert "raise its scale S" in sentences.verdict[0]
-
-
-def test_too_large_a_gain_is_recognised():
-    """Beyond the linear limit the iteration is no contraction; the verdict says so and gives admissible gains."""
-    sentences = judged(fp.BeyondLimit(fp.Rotation(fraction=1.4, radius=1e4)))
-    assert "is too large" in sentences.verdict[0]
-    assert sentences["adaptive"].contraction.predicted > 1
-
-
-def test_no_difference_is_said():
-    """With an exact model there is nothing to gain."""
-    sentences = judged(fp.Sigmoid(gain=-0.5, scale=10.0), gain=1.0)
-    assert "no clear difference" in sentences.verdict[0] or "does not help" in sentences.verdict[0]
+@pytest.mark.parametrize(
+    ("deformation", "cause"),
+    [
+        (fp.Sigmoid(gain=-0.5, scale=1e-3), "raise its scale S"),
+        (fp.BeyondLimit(fp.Rotation(fraction=1.4, radius=1e4)), "is too large"),
+    ],
+    ids=["the desired response outruns the largest step", "beyond the linear limit"],
+)
+def test_causes_are_recognised(deformation, cause):
+    assert cause in judged(deformation).verdict[0]
 
 
 def test_controller_that_cannot_serve_is_skipped_with_its_reason():

@@ -184,13 +184,6 @@ def test_changed_equals_rebuilt_without_another_build(controller, compiled, monk
     np.testing.assert_array_equal(first["setpoint"], np.tile([2.2, 5.4], (300, 1)))
 
 
-def test_compiled_equals_virtual_machine():
-    """CTC+FPI with steps is the same, bit by bit."""
-    runs = [fp.simulate(two_mass(), TWO_MASS.controllers["CTC+FPI (eq 6)"], seed=0, compiled=c) for c in (True, False)]
-    assert runs[0].compiled
-    np.testing.assert_array_equal(runs[0].log, runs[1].log)
-
-
 @pytest.mark.parametrize("announced", [False, True])
 def test_stepper_agrees_with_the_loop(announced):
     """Stepped with what the loop saw, and with the set-points when they change, the stepper gives the loop's commands."""

@@ -119,21 +119,6 @@ def test_shortest_memory_runs():
     assert np.isfinite(result["desired"]).all()
 
 
-def test_a_fresh_start_forgets():
-    """Where `started` is zero the past does not count: the command is that of a first cycle."""
-    task = problem(2, duration=0.1)
-    stepper = fp.Stepper(task, fp.ComputedTorque(fp.Fractional(6.0, 0.7, memory=0.2)), compiled=False)
-    state = np.array([-1.0, 0.3])
-    first, memory = stepper.step(0.0, state, np.zeros(1), stepper.start())
-    for k in range(1, 5):
-        running, memory = stepper.step(k * 1e-3, state + 0.1 * k, np.zeros(1), memory)
-    memory[stepper.memory.slice("warm_up")] = 0.0
-    again, after = stepper.step(5e-3, state, np.zeros(1), memory)
-    assert again == first
-    assert running != first
-    assert not after[stepper.memory.slice("decay_past")].any()
-
-
 def test_deformation_serves_the_law():
     """On the seed problem with its wrong model beta = 0.7 leaves less error than the exponential law of the same rate."""
     task = replace(fp.load_problem("two_mass").problem, duration=3.0, measure_from=2.0)
