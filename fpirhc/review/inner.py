@@ -157,6 +157,7 @@ def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Fu
         "max_num_steps": _STEPS,
         "max_step_size": longest,
         "disable_internal_warnings": True,
+        "show_eval_warnings": False,
     }
     system = {"x": inner, "p": p, "t": t, "ode": rate}
     return ca.integrator("fpirhc_inner", "cvodes", system, float(times[0]), [float(v) for v in times[1:]], options)

@@ -169,8 +169,8 @@ def test_states_with_a_task_are_on_their_reference(settings):
     assert (grid.drawn_states[..., 1] == 1.0).all()
 
 
-def test_states_that_leave_every_bound_are_left_on_the_reference():
-    """The motion z' = z^2 + y escapes in finite time."""
+def test_states_that_leave_every_bound_are_left_on_the_reference(capfd):
+    """The motion z' = z^2 + y escapes in finite time, and the integrator tells the terminal nothing of its attempts."""
     plant = fp.Plant(
         coordinates={"y": "m", "z": "m"},
         inputs={"u": "m/s"},
@@ -184,6 +184,7 @@ def test_states_that_leave_every_bound_are_left_on_the_reference():
     grid = review_grid(problem, 0.0, 0)
     assert grid.inner == ()
     assert (grid.states[:, 1] == 0).all()
+    assert capfd.readouterr() == ("", "")
 
 
 def test_currents_of_the_nerve_cell_are_those_of_a_run():
