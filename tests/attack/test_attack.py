@@ -32,7 +32,6 @@ def test_faults_of_the_loop(problem, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("problem", PROBLEMS)
 def test_every_fault_of_the_loop(problem):
-    """The same for every shipped controller of a problem."""
     wrong: dict[str, str] = {}
     for label, task, controller in shipped():
         if label.startswith(f"{problem}/"):
@@ -85,7 +84,6 @@ def test_a_study_survives_its_kills(tmp_path):
 
 @pytest.mark.filterwarnings("ignore")
 def test_random_command_lines(tmp_path):
-    """Each ends with a documented code, and without a traceback."""
     with prepared(tmp_path / "work"):
         ends = [raw_end(random_line(seed)) for seed in range(5000, 5020)]
     assert [end for end in ends if end] == []
@@ -94,7 +92,6 @@ def test_random_command_lines(tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_thousand_random_command_lines(tmp_path):
-    """The same."""
     with prepared(tmp_path / "work"):
         ends = [raw_end(random_line(seed)) for seed in range(1000)]
     assert [end for end in ends if end] == []

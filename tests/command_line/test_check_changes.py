@@ -132,12 +132,10 @@ def test_a_floor_ignores_small_changes_and_nothing_else():
 
 @pytest.mark.parametrize(("text", "value"), [("0.1%", 0.1), ("0.1", 0.1), ("0", 0.0), ("2 %", 2.0)])
 def test_the_floor_is_a_percentage(text, value):
-    """With or without the sign."""
     assert percent(text) == value
 
 
 @pytest.mark.parametrize("text", ["-1%", "a bit", "100%", "nan"])
 def test_a_wrong_floor_is_refused(text):
-    """The message shows how to write one."""
     with pytest.raises(argparse.ArgumentTypeError, match=r"expected percent .* such as 20%"):
         percent(text)

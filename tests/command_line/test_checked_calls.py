@@ -93,7 +93,6 @@ def test_wrong_arguments_are_named(name):
 
 
 def test_all_mistakes_of_a_call_come_at_once():
-    """Two wrong values and a missing one."""
     simulate: Any = fp.simulate
     with pytest.raises(InvalidField, match=r"(?s)3 mistakes.*needs seed.*problem.*controller"):
         simulate("two_mass", "CTC")

@@ -31,7 +31,6 @@ def _write(folder: Path, old: str, new: str) -> None:
 
 
 def test_compare_writes_a_report_and_says_what_it_found(folder, capsys):
-    """A verdict, a table, and one file."""
     assert main(["compare", "line.py", "--no-compile"]) == 0
     printed = capsys.readouterr()
     assert "CTC+FPI lowers the rms error of y" in printed.out.replace("\n", " ")
@@ -63,7 +62,6 @@ def test_controllers_can_be_chosen(folder, capsys):
 
 
 def test_run_saves_every_signal(folder, capsys):
-    """A run is a file that loads again, and a picture."""
     assert main(["run", "line.py", "CTC+FPI", "--out", "kept", "--no-compile"]) == 0
     run = fp.load_run(folder / "kept" / "CTC_FPI.npz")
     assert run.problem == "line"
@@ -73,7 +71,6 @@ def test_run_saves_every_signal(folder, capsys):
 
 
 def test_list_and_help(capsys):
-    """What there is, and how to use it."""
     assert main(["list"]) == 0
     assert "two_mass" in capsys.readouterr().out
     assert main([]) == 0
@@ -121,7 +118,6 @@ def test_ctrl_c_keeps_what_is_finished(folder, capsys, monkeypatch):
 
 
 def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
-    """Slower, and announced."""
     monkeypatch.setitem(os.environ, "FPIRHC_CC", "none")
     _write(folder, "duration=2.0, measure_from=1.0", "duration=0.02")
     assert main(["compare", "line.py"]) == 0

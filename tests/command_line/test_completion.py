@@ -44,7 +44,6 @@ def bash(tmp_path_factory):
 
 
 def test_commands_are_completed(bash):
-    """All of them, and those that begin with what is typed."""
     assert bash("fpirhc ''") >= set(shipped())
     assert bash("fpirhc co") == {"compare", "completion"}
 
@@ -57,21 +56,18 @@ def test_options_are_completed(bash):
 
 
 def test_problems_are_completed(bash):
-    """Shipped ones by name, files of this folder, and folders."""
     assert "two_mass" in bash("fpirhc compare two_")
     assert bash("fpirhc compare ar") >= {"arm.py", "armchair"}
     assert "fpirhc.bash" not in bash("fpirhc compare ''")
 
 
 def test_folders_and_choices_are_completed(bash):
-    """A folder after --out, a shell after completion."""
     assert bash("fpirhc compare arm.py --out ar") == {"armchair"}
     assert bash("fpirhc completion ''") >= set(SHELLS)
 
 
 @pytest.mark.parametrize("shell", SHELLS)
 def test_every_shell_gets_a_script(shell, capsys):
-    """The script names every command."""
     shtab = pytest.importorskip("shtab")
     if shell not in shtab.SUPPORTED_SHELLS:
         pytest.skip(f"this version of shtab does not know {shell}")
@@ -81,7 +77,6 @@ def test_every_shell_gets_a_script(shell, capsys):
 
 
 def test_without_shtab_it_says_what_to_install(monkeypatch):
-    """The package is optional."""
     monkeypatch.setitem(sys.modules, "shtab", None)
     with pytest.raises(NotSupported, match=r"fpirhc\[completion\]"):
         script("bash")

@@ -157,7 +157,6 @@ def test_review_puts_every_no_first_with_what_to_do(file, capsys):
 
 
 def test_a_review_without_a_no_begins_with_its_answers(file, capsys):
-    """Nothing stands before the problem's answers."""
     assert main(["review", "line.py", "--controllers", "CTC+model-referenced"]) == 0
     lines = [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in capsys.readouterr().out.splitlines()]
     assert lines[1] == "  yes     Is the problem well posed?"

@@ -173,7 +173,6 @@ def test_a_compiler_that_computes_wrongly_fails(monkeypatch):
 
 
 def test_a_large_cache_is_a_warning(tmp_path, monkeypatch):
-    """With what to remove."""
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(machine, "_LARGE_CACHE", 10.0)
     (cache_folder() / "old.so").write_bytes(bytes(11))

@@ -135,7 +135,6 @@ def test_seeds_are_varied_only_where_there_is_noise(blessed):
 
 
 def test_every_measured_metric_is_in_the_catalogue(blessed):
-    """And a misspelt one is answered with the nearest."""
     for name in ("line", "noisy"):
         for one in read_baseline(blessed / "baselines" / f"{name}.json").controllers.values():
             assert all(metric_of(metric).compared in KINDS for metric in one.metrics)
@@ -234,7 +233,6 @@ def test_bad_baselines_are_refused(case, folder):
 
 
 def test_a_baseline_that_is_no_text_or_no_file(folder, capsys):
-    """Bytes, and a folder in its place."""
     path = folder / "baselines" / "noisy.json"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(BaselineError, match="is no text"):
@@ -394,7 +392,6 @@ def test_hostile_names_from_file_to_report(tmp_path, monkeypatch, capsys):
 
 
 def test_reports_say_what_changed(folder, capsys):
-    """Old, new, band and verdict in both."""
     text = (folder / "line.py").read_text()
     (folder / "line.py").write_text(text.replace("ca.sin(2 * t)", "1.1 * ca.sin(2 * t)"))
     assert main(["check", "line.py", "--no-compile", "--markdown", "a.md"]) == 5

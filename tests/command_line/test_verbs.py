@@ -170,7 +170,6 @@ def test_examples_are_valid_commands(verb):
 
 @pytest.mark.parametrize("name", ["compare", "solve"])
 def test_help_names_every_optimiser(name, capsys):
-    """The names in the text are those that the study knows."""
     words = " ".join(help_of(name, capsys).split())
     assert f"{', '.join(optimiser_choices())}, or all" in words
 

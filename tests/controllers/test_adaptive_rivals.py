@@ -299,7 +299,6 @@ def test_projection_learns_while_the_command_is_clipped():
 
 
 def test_informed_starts_from_the_exact_parameters():
-    """An estimate starts from what the controller is told."""
     problem = replace(task(poor, 0.05), disturbances={})
     run = fp.simulate(problem, fp.ExactModel(NLMS), seed=0, compiled=False)
     np.testing.assert_allclose(run["estimate"][0], [1.0, 0.5, 20.0, 3.0])
@@ -474,7 +473,6 @@ REFUSED = {
 
 @pytest.mark.parametrize("why", REFUSED)
 def test_what_does_not_fit_is_refused_before_the_run(why):
-    """With the reason, by simulate as by compare."""
     problem, controller, error, reason = REFUSED[why]
     with pytest.raises(error, match=reason):
         fp.simulate(problem, controller, seed=0, compiled=False)
@@ -490,6 +488,5 @@ def test_what_does_not_fit_is_refused_before_the_run(why):
     ],
 )
 def test_settings_out_of_range_are_refused(build, reason):
-    """At construction."""
     with pytest.raises(InvalidValue, match=reason):
         build()

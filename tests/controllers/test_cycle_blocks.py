@@ -137,7 +137,6 @@ def test_a_response_that_is_not_affine_is_evaluated_where_it_was_clipped():
 
 
 def test_clip_takes_one_side_or_both():
-    """A free side leaves the entry as it is."""
     u = ca.SX([-9.0, -9.0, 9.0, 9.0])
     lower, upper = np.array([-1.0, -np.inf, -np.inf, -1.0]), np.array([1.0, 1.0, np.inf, np.inf])
     down, up = (np.asarray(ca.evalf(clip(v, lower, upper)).full()).ravel().tolist() for v in (u, -u))
@@ -154,7 +153,6 @@ def test_the_worst_status_of_a_cycle_counts():
 
 
 def test_warm_up_counts_the_blind_cycles():
-    """One without an estimator; it stops there."""
     running = closing(LIMITED)["running"]
     assert [cycle(running, warm_up=k)["_warm_up_now"].item() for k in (0.0, 1.0, 5.0)] == [1.0, 1.0, 1.0]
 
@@ -512,7 +510,6 @@ def test_a_plan_starts_where_the_model_has_the_measured_outputs(adapts, disturba
 
 
 def test_a_form_with_too_many_dead_times_is_refused():
-    """Two channels, three dead times."""
     three = fp.ComputedTorque(TRACK, fp.Paired(fp.Affine(gain=-0.5), cycles=(1, 2, 3)))
     with pytest.raises(NotSupported, match="3"):
         check_form(masses(), three)

@@ -46,7 +46,6 @@ def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
 
 @pytest.mark.parametrize("gain", [-0.99 * LARGEST, -0.1])
 def test_a_gain_below_the_limit_runs(gain):
-    """Also as a live setting."""
     assert fp.simulate(PROBLEM, affine(-0.5), seed=0, settings={"deformation.gain": gain}).stop is None
 
 

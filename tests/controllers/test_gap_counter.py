@@ -96,7 +96,6 @@ def test_the_counter_of_a_problem():
 
 
 def test_a_step_reads_the_gap_where_a_block_knows_it():
-    """A step without such a block stays the same object."""
     problem = replace(two_masses(), sensing=fp.Sensing(estimator=fp.PositionDifference()))
     step = compose_with_sensing(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)))
     assert "gap" not in step.reads

@@ -83,7 +83,6 @@ class Gated:
 
 @both
 def test_a_good_sample_passes(opaque):
-    """Command, memory and status are those of the step."""
     gated = Gated(opaque)
     assert gated(0.5) == ([7.5, 0.0], Status.NOT_CONVERGED)
     assert gated(1.0) == ([8.5, -1.0], Status.NOT_CONVERGED)
@@ -298,7 +297,6 @@ def test_what_follows_from_live_settings_passes_with_the_memory_of_the_gate(opaq
 
 
 def test_a_step_without_a_status_passes_too():
-    """The gate adds none."""
     block = Gate(PROBLEM, inner(False, with_status=False)).block()
     assert "status" not in block.writes
     assert isinstance(block.writes["command"], Signal)
@@ -306,6 +304,5 @@ def test_a_step_without_a_status_passes_too():
 
 @pytest.mark.parametrize("status", Status)
 def test_cycles_that_were_skipped(status):
-    """Those of a bad sample, of a bad time, and of a step that was not finite."""
     bad = status in {Status.BAD_SAMPLE, Status.BAD_TIME, Status.NON_FINITE}
     assert bool(ca.evalf(was_skipped(ca.SX(int(status))))) == bad

@@ -112,7 +112,6 @@ def test_what_is_lacking_is_told_in_the_line_that_makes_it(make, words):
 
 
 def test_blocks_of_a_wrong_form_are_named():
-    """Two lists are asked for."""
     with pytest.raises(
         InvalidProblem, match=r"Formless.blocks\(problem\) must return two lists \(blocks, delays\), got \[\]"
     ):
@@ -120,6 +119,5 @@ def test_blocks_of_a_wrong_form_are_named():
 
 
 def test_a_whole_wrapper_runs():
-    """It is the inner controller, bit for bit."""
     one, other = (fp.simulate(PROBLEM, c, seed=0, compiled=False) for c in (LAW, Whole(LAW)))
     assert (one["command"] == other["command"]).all()

@@ -122,7 +122,6 @@ def test_one_slot_alone_has_the_radius_of_its_eigenvalues():
 
 
 def test_no_radius_without_a_set_point_or_a_period():
-    """The reason is said."""
     slots = CRANE.controllers["slots"]
     selection = fp.ByError({"cart": 1.0, "angle": 1.0}, dwell=0.5)
     floquet = floquet_radius(CRANE.problem, slots.slots, selection)
@@ -185,7 +184,6 @@ def test_response_of_the_crane():
 
 
 def test_fixed_and_periodic_are_the_same_run():
-    """The same slots in the same cycles: bit by bit."""
     problem, slots = crane({"cart": -1.0}, duration=8.0), CRANE.controllers["slots+FPI"]
     spans = [("cart", 0.0, 1.4), ("angle", 1.4, 5.3), ("cart", 5.3, 6.7), ("angle", 6.7, 8.0)]
     fixed = run(problem, replace(slots, schedule=fp.FixedSchedule(spans)))
@@ -544,7 +542,6 @@ SCHEDULES = {
 
 @pytest.mark.parametrize("name", SCHEDULES)
 def test_mistakes_of_schedules(name):
-    """Each is told what, where, and what to do; all of one schedule at once."""
     schedule, expected = SCHEDULES[name]
     message = refused(CRANE.problem, replace(CRANE.controllers["slots"], schedule=schedule))
     for text in expected:
@@ -682,7 +679,6 @@ def test_a_response_that_is_not_affine_is_refused():
     ],
 )
 def test_numbers_out_of_range(changed):
-    """Told by name where they are given."""
     ((name, value),) = changed.items()
     with pytest.raises(InvalidValue, match=rf"Slotted(\({name}={value!r}\)|\.{name}): expected a"):
         replace(CRANE.controllers["slots"], **changed)

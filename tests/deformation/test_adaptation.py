@@ -66,7 +66,6 @@ def test_tuner_never_exceeds_its_cap():
 
 
 def test_tuner_recovers_from_a_number_that_is_none():
-    """One NaN response spoils one step, not the tuner."""
     step, layout = stepping(fp.Tuned(fp.Affine(gain=-0.5), largest_gain=0.8))
     memory = layout.start()
     for response in (1.0, np.nan, 1.0, 1.0, 1.0):
@@ -178,7 +177,6 @@ def test_guard_tells_what_happened(event, spoil):
 
 
 def test_events_are_logged_in_a_run():
-    """The controller logs what the wrappers show, by name."""
     task = fp.load_problem("two_mass")
     from dataclasses import replace
 

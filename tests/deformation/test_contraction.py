@@ -188,7 +188,6 @@ def test_wrong_sign_says_which_is_right(deformation: Deformation) -> None:
 
 
 def test_wrong_sign_in_words() -> None:
-    """The sentence for the usual mistake, in full."""
     with pytest.raises(NotContractive) as caught:
         check_gain(Sigmoid(gain=0.5), Spectrum(np.array([[1.5, 1.3]])))
     assert str(caught.value) == (

@@ -86,7 +86,6 @@ def test_wrappers_keep_the_laws_of_their_map(deformation: Deformation) -> None:
 
 
 def test_identity_asks_for_what_is_desired() -> None:
-    """Without adaptation the response plays no part."""
     assert advance(Identity(), [1.0, 2.0], [np.nan, 7.0], [3.0, 4.0]).tolist() == [3.0, 4.0]
     with pytest.raises(NotSupported, match="Sigmoid"):
         Identity().with_effective_gain(0.5)

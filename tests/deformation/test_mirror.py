@@ -72,7 +72,6 @@ def test_null_with_a_measured_response_and_dead_time(wait):
 
 @pytest.mark.parametrize("order", [1, 3, 4])
 def test_null_at_other_orders(order):
-    """The twin is moved along polynomials of every order."""
     problem = fp.Problem(
         plant=chain(order),
         reference=fp.Trajectory(lambda t: {"y": ca.sin(t)}),

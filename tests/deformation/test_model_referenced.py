@@ -294,7 +294,6 @@ CASES = (
 
 @pytest.mark.parametrize(("deformation", "sentence"), CASES)
 def test_forms_that_cannot_be_used(deformation, sentence):
-    """Which form, and why."""
     with pytest.raises(NotSupported, match=sentence):
         fp.simulate(short(TWO_MASS.problem, 10), fp.ComputedTorque(LAW, deformation), seed=0)
 

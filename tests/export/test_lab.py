@@ -122,7 +122,6 @@ def test_a_slider_stays_inside_the_bounds_of_its_setting(short):
 
 
 def test_what_has_no_lab(monkeypatch):
-    """A plant outside; a setting that no controller has; no zig."""
     task = fp.load_problem("two_mass")
     chosen = {n: task.controllers[n] for n in CASES["two_mass"]}
     monkeypatch.setitem(__import__("sys").modules, "ziglang", None)

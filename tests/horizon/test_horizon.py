@@ -89,7 +89,6 @@ def test_kkt_matrix_is_symmetric_and_indefinite():
 
 
 def test_terms_add_up_to_the_cost():
-    """V is the sum of the stage terms and the terminal cost."""
     ocp, data = built(COSTS["rate"])
     s0, inputs = point(ocp)
     states, value, terms = rollout(ocp)(s0, inputs, data)
@@ -157,7 +156,6 @@ BAD_COSTS = {
 
 @pytest.mark.parametrize("case", BAD_COSTS)
 def test_mistakes_of_a_cost(case):
-    """What, where, the nearest valid name."""
     cost, message = BAD_COSTS[case]
     horizon = fp.Horizon(stages=3, step=0.1)
     with pytest.raises(InvalidProblem, match=message):

@@ -218,7 +218,6 @@ def columns(ocp):
 
 
 def test_tolerances_below_rounding_are_refused():
-    """With the number that would do."""
     ocp, data, first = horizon_of(fp.Limits(inputs={"torque": (-1e6, 1e6)}))
     with pytest.raises(FpirhcError, match="rounded to 1e-09; use 1e-06"):
         fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-12), first, data)
@@ -278,7 +277,6 @@ def test_prices_are_refused_by_who_cannot_take_them():
 
 
 def test_an_ellipsoid_that_is_none_is_refused():
-    """By what is wrong, with the nearest name."""
     for given, said in (
         ({"axes": {}}, "expected a half axis by name of at least one"),
         ({"axes": {"angle": 0.0}}, r"Ellipsoid\(axes={'angle': 0.0}\): expected a positive number"),

@@ -144,7 +144,6 @@ def test_members_from_abroad_are_found_and_keep_the_laws(abroad: Path) -> None:
 
 
 def test_review_speaks_of_members_from_abroad(abroad: Path) -> None:
-    """Every controller gets answers, none is a stranger."""
     answer = run(abroad, "-m", "fpirhc", "review", "masses.py", "--json")
     assert answer.returncode in (0, 1), answer.stderr
     document = json.loads(answer.stdout)["controllers"]

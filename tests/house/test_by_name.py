@@ -86,12 +86,10 @@ def test_every_mapping_of_a_problem_file_has_one_error_for_a_missing_name():
 
 @pytest.mark.parametrize(("made", "least"), [(measured, 20), (stepped, 4), (compared, 30), (reviewed, 10)])
 def test_every_mapping_of_a_result_has_one_error_for_a_missing_name(made, least):
-    """Nested ones too, and empty ones."""
     holds(made(), least)
 
 
 def test_every_mapping_of_a_study_has_one_error_for_a_missing_name(tmp_path):
-    """Records are those of the file."""
     holds(studied(tmp_path), 20)
 
 
@@ -115,7 +113,6 @@ def tells(mapping: Mapping[str, Any], name: Any) -> bool:
 
 
 def test_the_nearest_name_is_offered():
-    """With the place where it was looked for."""
     name = HEADLINE[1]
     with pytest.raises(
         InvalidName, match=rf"^Task\.controllers has no '{re.escape(name[:-1])}'\. Did you mean '{re.escape(name)}'"

@@ -158,7 +158,6 @@ class Thawed(Tracking):
     ],
 )
 def test_wrong_tracking_laws_are_caught(wrong, law):
-    """One message that names the class and the law."""
     with pytest.raises(AssertionError, match=f"{type(wrong).__name__} {breaks(law)}"):
         check_tracking(wrong, seed=1, period=2e-3, duration=6.0)
 
@@ -247,7 +246,6 @@ class Dishonest(Optimiser):
     ids=lambda v: getattr(v, "change", None),
 )
 def test_wrong_optimisers_are_caught(wrong, law):
-    """Each lie is caught by the law that is about it."""
     with pytest.raises(AssertionError, match=f"Dishonest {breaks(law)}"):
         check_optimiser(wrong, tolerance=FINE, seed=1)
 
@@ -401,7 +399,6 @@ def test_wrong_controllers_are_caught(wrong, law):
 
 @pytest.mark.parametrize("name", shipped_problems())
 def test_plant_laws(name):
-    """Every shipped plant near its start."""
     problem = fp.load_problem(name).problem
     box = {e: (v - 0.1, v + 0.1) for e, v in zip(problem.plant.state.elements, problem.start_state, strict=True)}
     check_plant(problem.plant, seed=1, box=box)

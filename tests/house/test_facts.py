@@ -245,7 +245,6 @@ def test_settings_are_chosen_for_the_problem_that_the_inner_controller_sees():
     ids=["torque", "predicted", "estimating"],
 )
 def test_a_wrapper_of_a_wrapper_is_reviewed_as_what_it_is_made_of(controller, settings):
-    """Two wrappers of a user's own change no answer."""
     problem = mass(**settings)
     plain, wrapped = answers(problem, controller), answers(problem, twice(controller))
     assert {q: (a.verdict, a.evidence.replace("Named", type(controller).__name__)) for q, a in wrapped.items()} == {

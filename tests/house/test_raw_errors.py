@@ -45,7 +45,6 @@ def test_the_rows_of_a_run_are_offered(run):
 
 
 def test_a_layout_packs_numbers_only(run):
-    """By names of its own, of the right number."""
     layout = run.layout
     with pytest.raises(InvalidValue, match="'time' is made of numbers"):
         layout.pack({"time": "now"})
@@ -84,7 +83,6 @@ def pendulum(value):
 
 @pytest.mark.parametrize("value", [HUGE, np.timedelta64(1, "s"), np.bool_(True), "1", None, 1j])
 def test_what_is_no_number_is_no_parameter(value):
-    """A whole number that is no float is none, too."""
     with pytest.raises(
         InvalidField, match=r"(?s)approximate: expected a finite number.*exact: expected a finite number"
     ):
@@ -93,7 +91,6 @@ def test_what_is_no_number_is_no_parameter(value):
 
 @pytest.mark.parametrize("value", [2, np.int64(2), np.float32(2.0), np.uint8(2)])
 def test_every_kind_of_number_is_a_parameter(value):
-    """Whole numbers of numpy as well."""
     assert pendulum(value).exact.tolist() == [2.0]
 
 

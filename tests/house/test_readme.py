@@ -18,7 +18,6 @@ def test_the_readme_says_at_once_what_the_method_asks_for():
 
 
 def test_problem_of_the_readme_runs(tmp_path, monkeypatch, capsys):
-    """Copied into a file, it compares and adaptation helps."""
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     Path("pendulum.py").write_text(code)

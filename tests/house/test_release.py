@@ -109,7 +109,6 @@ UNKNOWN = {"name": "casadi", "skip_reason": "Dependency not found on PyPI"}
     ],
 )
 def test_an_audit_that_reached_no_data_is_no_answer(packages, code, words, tmp_path):
-    """pip-audit finds nothing where its data knows no package."""
     found, said = tmp_path / "found.json", tmp_path / "said.txt"
     said.write_text("ConnectionError: no route to host")
     if packages is not None:

@@ -43,13 +43,11 @@ def check_optimiser(member):
 
 @pytest.mark.parametrize("wrong", CONTROLLERS, ids=lambda c: c.__name__)
 def test_a_wrong_controller_is_caught(wrong):
-    """It cheats, or says of itself what is not so."""
     caught(check_controller, wrong(6.0, DEFORMATION), *CONTROLLERS[wrong])
 
 
 @pytest.mark.parametrize("wrong", MAPS, ids=lambda c: c.__name__)
 def test_a_wrong_map_is_caught(wrong):
-    """Its facts are another map's."""
     caught(lambda m: check_deformation(m, seed=1), wrong(0.3, 5.0), *MAPS[wrong])
 
 

@@ -364,7 +364,6 @@ TWO_TASK = fp.Problem(
     ],
 )
 def test_estimators_that_do_not_fit_are_refused(problem, estimator, error, message):
-    """Before the run, with the reason."""
     with pytest.raises(error, match=message):
         fp.Estimating(RHC, estimator).check(problem)
 

@@ -213,7 +213,6 @@ def test_a_dead_time_is_live_up_to_its_stated_longest():
 
 
 def test_a_device_keeps_its_belief_where_another_is_refused():
-    """The number in force stays, and the refusal counts."""
     controller = fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=5, longest=9))
     stepper = fp.Stepper(LATE.problem, controller, compiled=False, live=["deformation.cycles"])
     assert stepper.change({"deformation.cycles": 7.5})

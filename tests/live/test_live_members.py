@@ -54,7 +54,6 @@ MAPS = [d for d in examples("deformations", SIGMOID) if d.effective_gain() >= 0]
 
 @pytest.mark.parametrize("deformation", MAPS, ids=named(MAPS))
 def test_every_number_of_a_deformation(deformation):
-    """No map loses a number on its way into the loop."""
     check(fp.ComputedTorque(TRACKING, deformation), two_masses())
 
 
@@ -63,7 +62,6 @@ LAWS = examples("tracking laws")
 
 @pytest.mark.parametrize("tracking", LAWS, ids=named(LAWS))
 def test_every_number_of_a_tracking_law(tracking):
-    """No law loses a number on its way into the loop."""
     check(fp.ComputedTorque(tracking, SIGMOID), two_masses())
 
 
@@ -175,7 +173,6 @@ NOISES = [f"sensing.sensors.a.{name}" for name in ("noise.deviation", "dropout")
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["VM", "C"])
 def test_noises_and_sensors_are_live(compiled):
-    """Also numbers of the series that are drawn before a run."""
     tried = check_live(noisy(), fp.ComputedTorque(TRACKING, SIGMOID), paths=NOISES, cycles=60, compiled=compiled)
     assert all(t.factor for t in tried), tried
 

@@ -254,7 +254,6 @@ def test_converging_driver_and_graph_stop_together():
 
 
 def test_functions_without_a_driver_are_left_alone():
-    """Generated C passes through unchanged."""
     (source,) = generate(ca.Function("fpirhc_plain", [x := ca.SX.sym("x")], [ca.sin(x)]))
     assert substitute(source) == (source, [])
 

@@ -66,7 +66,6 @@ def test_the_second_is_asked_where_the_first_has_no_usable_plan_and_counted():
 
 
 def test_the_second_is_left_alone_where_the_first_succeeds():
-    """The first's plan to the last digit, and no count."""
     ocp, data = horizon()
     ladder, first = fp.Ladder(FIXED, NEVER), np.array([0.1, 0.0])
     bounds, memory, own = (ocp.input_lower, ocp.input_upper), ladder.memory(ocp).start(), FIXED.memory(ocp).start()

@@ -54,7 +54,6 @@ def test_such_a_plan_has_no_numbers(plan):
 
 
 def test_the_table_of_plans_shows_none(plan, capsys, tmp_path):
-    """Dashes where other plans have cost and residual."""
     show_plans("exploding", [Solved("FPI", plan, None)], tmp_path / "plan.png")
     row = next(line for line in capsys.readouterr().out.splitlines() if line.strip().startswith("FPI"))
     assert row.split()[1:3] == ["-", "-"]

@@ -59,14 +59,12 @@ def test_all_find_the_same_stationary_plan(optimiser, limits):
 
 
 def test_state_limits_are_refused_by_the_reduced_gradient():
-    """It says who can."""
     ocp, data, first = two_mass(fp.Limits(states={"q1": (2.0, 2.3)}))
     with pytest.raises(NotSupported, match="Ipopt"):
         fp.solve(ocp, GRADIENT, first, data)
 
 
 def test_settings_are_checked():
-    """Numbers that cannot be meant are refused."""
     with pytest.raises(InvalidValue, match=r"ReducedGradient.iterations: expected a whole number from 1"):
         fp.ReducedGradient(iterations=0, tolerance=1e-3)
     with pytest.raises(InvalidValue, match="positive tolerance"):
@@ -143,7 +141,6 @@ def test_failed_solves_are_counted_and_follow_the_policy(policy):
 
 
 def test_stop_run_ends_with_the_reason():
-    """StopRun makes the failed plan visible at once."""
     problem, controller = receding(fp.Ipopt(iterations=2), on_failure=fp.StopRun())
     problem = replace(
         problem,

@@ -151,14 +151,12 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_mistakes_are_named_before_a_run(name):
-    """Names, index and the guess."""
     changes, text = BAD[name]
     with pytest.raises(InvalidProblem, match=text):
         task(clipper(**changes))
 
 
 def test_the_response_takes_the_algebraic_states_last():
-    """A response without them says how it is called."""
     plant = clipper()
     with pytest.raises(InvalidProblem, match=r"called as response\(q, u, p, z\)"):
         replace(plant, response=lambda q, u, p: {"v": -q.v + u.source})

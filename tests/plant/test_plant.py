@@ -40,7 +40,6 @@ def test_inverse_undoes_response(plant):
 
 
 def test_state_is_derivative_major():
-    """Named entries: all q, then all q'."""
     assert two_mass_chain(("b",)).state.elements == ("a", "b", "a'", "b'")
 
 
@@ -67,7 +66,6 @@ def test_non_affine_response_is_inverted_numerically():
 
 
 def test_user_inverse_is_used():
-    """A given inverse replaces the derived one."""
     plant = fp.Plant(
         {"y": "1"},
         {"u": "1"},
@@ -187,7 +185,6 @@ BAD: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("message", BAD)
 def test_mistakes_are_named(message):
-    """Each mistake says what, where, and how to mend it."""
     good: dict[str, Any] = {
         "coordinates": {"y": "m"},
         "inputs": {"u": "N"},
@@ -199,7 +196,6 @@ def test_mistakes_are_named(message):
 
 
 def test_all_mistakes_come_at_once():
-    """A user sees every mistake of the parameters in one error."""
     with pytest.raises(InvalidProblem, match=r"(?s)2 mistakes.*approximate.*unit"):
         fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(float("inf"), 1.0, "")}, lambda q, v, u, p: {"y": u.u})
 

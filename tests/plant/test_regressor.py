@@ -150,7 +150,6 @@ def test_linear_parameters_are_found():
 
 
 def test_parameters_that_enter_nonlinearly_are_refused_by_name():
-    """With the products they appear in, and what to do."""
     with pytest.raises(InvalidValue, match=r"'l' enter\(s\) nonlinearly; in products: 'm' with 'l'.*Combination"):
         Regressor(pendulum(), ("m", "l"))
     plant = fp.load_problem("planar_arm").problem.plant

@@ -95,7 +95,6 @@ def test_disturbances_act_where_they_are_said_to():
     ],
 )
 def test_a_bare_name_is_refused_where_it_is_ambiguous(changes, message):
-    """The message says both names, or the nearest one."""
     with pytest.raises(InvalidProblem, match=message):
         replace(SHARED, **changes)
 
@@ -145,7 +144,6 @@ def test_a_review_weighs_both_disturbances():
 
 
 def test_a_review_is_that_of_other_names():
-    """Every verdict and every number."""
     shared, other = (fp.review(one, {"FPI": CONTROLLER}, mismatch=10.0, seed=0) for one in (SHARED, OTHER))
     for ours, theirs in ((shared.problem, other.problem), (shared.controllers["FPI"], other.controllers["FPI"])):
         assert [one.verdict for one in ours] == [one.verdict for one in theirs]

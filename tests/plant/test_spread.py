@@ -110,6 +110,5 @@ def test_a_range_beyond_the_bounds_is_refused_with_the_largest_inside():
     ],
 )
 def test_wrong_spreads_are_refused(make, message):
-    """Where they are written, with what to write instead."""
     with pytest.raises(fp.FpirhcError, match=message):
         make()

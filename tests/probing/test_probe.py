@@ -215,7 +215,6 @@ class Untouched:
     ],
 )
 def test_a_wrong_recording_says_what_is_wrong(tmp_path, text, words):
-    """Columns, times and entries, by name."""
     (tmp_path / "run.csv").write_text(text)
     with pytest.raises(fp.FpirhcError, match=words):
         fp.probe(body_problem(1.0), RHC, recording=tmp_path / "run.csv")
@@ -236,7 +235,6 @@ def test_a_wrong_recording_says_what_is_wrong(tmp_path, text, words):
     ],
 )
 def test_wrong_arguments_are_refused(arguments, words):
-    """Each with what was expected."""
     with pytest.raises(fp.FpirhcError, match=words):
         fp.probe(body_problem(1.0), RHC, **arguments)
 

@@ -74,7 +74,6 @@ def test_a_lost_sample_skips_its_cycle(tmp_path):
 
 
 def test_a_response_without_a_column_is_a_difference(tmp_path):
-    """That of the velocity; the first cycle has none."""
     columns = recorded(tmp_path / "run.csv", without=("q1''", "q2''"))
     assert "q1''" not in columns
     answer = replay(TASK.problem, TASK.controllers["RHC+FPI"], tmp_path / "run.csv")

@@ -125,7 +125,6 @@ def test_cases_that_do_not_work_are_explained(comparison):
 
 
 def test_headline_is_about_the_named_pair(comparison):
-    """The first sentence compares RHC with RHC+FPI."""
     assert comparison.findings[0].pair == ("RHC", "RHC+FPI")
     assert comparison.verdict[0].startswith("RHC+FPI lowers the rms error of q2 from 0.0422 to")
 

@@ -481,7 +481,6 @@ WRONG: dict[str, tuple[Any, str]] = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_use_says_what_was_expected(name):
-    """What stands there, what was expected, and where it is mended."""
     use, words = WRONG[name]
     with pytest.raises(fp.FpirhcError) as caught:
         use()

@@ -174,7 +174,6 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_are_named(mistake):
-    """What is missing, where, and how it may be believed."""
     make, message = MISTAKES[mistake]
     with pytest.raises(InvalidProblem, match=f"(?s){message}"):
         make()

@@ -77,7 +77,6 @@ def test_noisy_sensor_does_not_end_a_run():
 
 
 def test_mistakes_are_named():
-    """Unknown states, swapped ends, a start outside."""
     with pytest.raises(InvalidProblem, match="Did you mean 'level'"):
         tank(levels=(0.0, 1.0))
     with pytest.raises(InvalidProblem, match=r"\(lowest, highest\), got \(1.0, 0.0\)"):

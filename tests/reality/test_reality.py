@@ -287,7 +287,6 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_are_named(mistake):
-    """A reality that cannot stand for the model is refused with the names, the cause and the cure."""
     make, message = MISTAKES[mistake]
     with pytest.raises(InvalidProblem, match=f"(?s){message}"):
         task(reality=make())

@@ -193,7 +193,6 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_of_a_reality_are_named(mistake):
-    """What is missing, where, and what would do."""
     make, message = MISTAKES[mistake]
     with pytest.raises(InvalidProblem, match=f"(?s){message}"):
         task(reality=make())

@@ -145,12 +145,10 @@ def test_what_is_behind_a_spring_moves_along():
 
 
 def test_no_question_without_a_reality():
-    """A problem as before is asked as before."""
     assert not any(reviewed.answer(task(), adapted(6.0, 0.3), text) for text in (LAG, LOOP, RESONANCE))
 
 
 def test_review_names_an_exact_model_that_cannot_be():
-    """The refusal of a run is the answer of the review."""
     answers = fp.review(quick(resonant(0.3)), {"it": fp.ExactModel(adapted(6.0, 0.01))}, mismatch=0.0, seed=0)
     [only] = answers.controllers["it"]
     assert "the coordinate f, which the controller is not given" in only.evidence

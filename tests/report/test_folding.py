@@ -55,13 +55,11 @@ def test_a_wide_terminal_has_one_table_and_a_narrow_one_repeats_the_names():
 
 
 def test_the_names_of_rows_may_be_two_columns():
-    """Both are repeated."""
     lines = shown(70, names=2)
     assert sum("0.123456" in line for line in lines) == sum(line.strip().startswith("controller") for line in lines) > 1
 
 
 def test_texts_are_literal():
-    """No markup, no escape codes."""
     console = Console(file=io.StringIO(), width=80, color_system=None)
     table = Table("[bold]t[/bold]", [Column("[red]head"), Column("x")])
     table.add(["[i]name\x1b[31m", ":bomb:"])

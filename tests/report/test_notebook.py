@@ -179,7 +179,6 @@ def check_shows_itself(value: Any) -> None:
 
 
 def test_what_is_shown_is_what_was_found(comparison, plan):
-    """Numbers and names, each where it is looked for."""
     result = {kind: read(value._repr_html_()).text for kind, value in shown(comparison, plan).items()}
     rms = f"{comparison[HOSTILE].metrics.rms_error['y']:.4g}"
     assert comparison[HOSTILE].metrics.text("rms_error", "y") in result["comparison"]
@@ -265,7 +264,6 @@ def test_terminal_shows_names_literally(comparison, capsys, monkeypatch):
 
 
 def test_tables_escape_every_part():
-    """Caption, heads, cells and notes."""
     page = table("<a>", ("<b>",), [("<c>", "<d>")], ["<e>"])
     assert read(page).tags == {"div", "table", "caption", "tr", "th", "td", "p"}
     assert read(page).text == "<a><b><c><d><e>"

@@ -76,7 +76,6 @@ def test_an_alternating_command_is_drawn_as_wide_as_it_is():
 
 
 def test_a_portrait_has_a_panel_for_each_run(runs):
-    """Y over x with their units."""
     figure = Figure()
     fp.Portrait("p", x="state.q", y="state.q'").draw(figure, runs)
     assert [a.get_title() for a in figure.axes] == ["slow", "quick"]
@@ -94,7 +93,6 @@ def test_a_raster_counts_passages_upwards(runs):
 
 
 def test_an_unknown_signal_is_named(runs):
-    """With the nearest one."""
     with pytest.raises(InvalidName, match=r"'state\.p'.*state\.q"):
         fp.Portrait("p", x="state.p", y="state.q").draw(Figure(), runs)
 
@@ -116,7 +114,6 @@ pictures = (%s,)
     ],
 )
 def test_mistakes_in_a_file_are_told_when_it_is_loaded(written, message, tmp_path, monkeypatch):
-    """What is no picture, and controllers that are not there."""
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     path = tmp_path / "spring.py"
     path.write_text(FILE % written)
@@ -246,7 +243,6 @@ def test_a_grid_counts_zones_and_leaves_out_the_ends_of_a_run(runs):
 
 
 def test_wrong_edges_of_a_grid_are_told():
-    """Four of them, falling and rising."""
     with pytest.raises(InvalidValue, match=r"Grid\('g', low=\(50, 70, 90, 110\)\): expected 4 falling numbers"):
         fp.Grid("g", what="state.q", low=(50, 70, 90, 110), high=(110, 180, 300, 400))
     with pytest.raises(InvalidValue, match=r"Grid\('g', high=\(110, 180\)\): expected 4 rising numbers"):

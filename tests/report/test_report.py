@@ -175,7 +175,6 @@ def test_page_terminal_notebook_and_json_say_the_same(comparison, whole, capsys,
 
 
 def test_comparison_without_a_pair_has_no_pair_pictures(comparison):
-    """One controller alone is still a report."""
     alone = replace(comparison, entries=comparison.entries[:1])
     assert "Without | with" not in render(alone)
     empty = replace(comparison, entries=(), skipped={"x": "because"})
@@ -183,7 +182,6 @@ def test_comparison_without_a_pair_has_no_pair_pictures(comparison):
 
 
 def test_folder_that_cannot_be_written(comparison, tmp_path, monkeypatch):
-    """One error, nothing half-written."""
     monkeypatch.setattr("fpirhc.report.html.render", lambda _: "a page")
     with pytest.raises(OutputError, match="cannot write the report"):
         write_report(comparison, tmp_path / "missing" / "report.html")

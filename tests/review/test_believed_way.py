@@ -100,7 +100,6 @@ def test_the_form_in_use_is_never_advised():
 
 
 def test_a_comparison_asks_the_same():
-    """The null test of a report has the believed lag as well."""
     adapting = fp.ComputedTorque(LAW, fp.ModelReferenced(MAP, lag=LAG))
     shipped = fp.load_problem("two_mass")
     real = fp.Reality(behind_actuators(plant(1.0), (LAG,)))

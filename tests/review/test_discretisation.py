@@ -54,7 +54,6 @@ def test_poles_of_a_stage(method, verdict, pole):
 
 
 def test_a_problem_without_a_horizon_is_not_asked():
-    """There is nothing to discretise."""
     assert discretisation_follows(review_grid(replace(PROBLEM, horizon=None, cost=None), 0.0, 0)) is None
 
 

@@ -68,7 +68,6 @@ def test_slowest_iteration_solves_its_polynomial():
 
 @pytest.mark.parametrize("arguments", [(0, 6.0, PERIOD), (3, -1.0, PERIOD), (3, 6.0, 0.0)])
 def test_least_product_refuses_what_is_no_loop(arguments):
-    """No poles, no rate, no period."""
     with pytest.raises(InvalidValue, match="expected"):
         least_product(*arguments)
 
@@ -269,7 +268,6 @@ def test_pairing_through_the_lag():
     ],
 )
 def test_lags_and_resonances_refuse_bad_input(call):
-    """Each rule says what it expects."""
     with pytest.raises(InvalidValue, match="expected"):
         call()
 

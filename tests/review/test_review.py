@@ -193,7 +193,6 @@ def test_what_is_wrong_is_answered_no(words, controller, settings):
 
 
 def test_wrong_sign_is_found_before_the_run():
-    """A gain of the wrong sign, which a run refuses."""
     answers_by_question = answers(mass(), torque(gain=0.5))
     assert about(answers_by_question, "Does the deformation converge").verdict == "no"
     gain = about(answers_by_question, "gain admissible")

@@ -520,7 +520,6 @@ def test_effects_of_an_input_are_those_at_the_first_command():
 
 
 def test_at_rest_nothing_is_asked_for():
-    """Neither by the reference nor after the start."""
     still = fp.Trajectory(lambda t: {"q": 0 * t})
     one = slew(replace(mass(start={"q": 0.0}), reference=still), 1.0)
     assert one.verdict == "yes"

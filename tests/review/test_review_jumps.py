@@ -95,5 +95,4 @@ def test_a_review_answers_no_and_gives_a_filtered_set_point_that_is_free_of_jump
 
 @pytest.mark.parametrize("name", shipped_problems())
 def test_shipped_references_have_no_jumps(name):
-    """None of the shipped problems has one."""
     assert jumps(fp.load_problem(name).problem) == []

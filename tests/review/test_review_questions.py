@@ -125,7 +125,6 @@ def test_limits_inside_leave_the_linear_loop_known():
 
 
 def test_without_such_limits_the_question_is_not_asked():
-    """Inputs have a question of their own."""
     assert answer(mass(inputs={"u": (-2.0, 2.0)}), None, KEEPS) is None
 
 

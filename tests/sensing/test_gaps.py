@@ -345,7 +345,6 @@ def test_a_repeated_time_is_no_missing_cycle():
 
 
 def test_nothing_is_bridged_before_the_first_sample():
-    """Bad samples before it leave the start as it is."""
     own = loop("SavitzkyGolay")
     fresh = own.run(30)
     late = own.stepper.start()

@@ -120,7 +120,6 @@ def test_nothing_and_zero_noise_are_the_ideal_loop():
 
 
 def test_quantised_values_are_multiples_of_the_quantum():
-    """And the nearest ones."""
     result = run(swinging(sensing=fp.Sensing({"y": fp.Sensor(quantum=1 / 1024)})))
     counts = result["state.y"] * 1024
     np.testing.assert_array_equal(counts, np.round(counts))
@@ -406,7 +405,6 @@ def test_all_mistakes_of_sensing_are_told_at_once():
     ],
 )
 def test_wrong_values_are_refused(make, message):
-    """Each says what is wrong and what is expected."""
     with pytest.raises(InvalidValue, match=message):
         make()
 

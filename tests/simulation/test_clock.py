@@ -76,7 +76,6 @@ def test_a_skipped_time_changes_nothing():
 
 @pytest.mark.parametrize("jitter", [-0.45, 0.45])
 def test_jitter_within_half_a_period_is_fine(jitter):
-    """Every time is within half a period of the expected one."""
     assert Status.BAD_TIME not in stepped([k * PERIOD + (k % 2) * jitter * PERIOD for k in range(12)])
 
 

@@ -28,7 +28,6 @@ def timed(durations: list[float] | np.ndarray) -> Deadline:
 
 
 def test_late_steps_are_counted_and_told():
-    """Three of seven; the last one was on time."""
     deadline = timed([1e-4, 2e-3, 1e-3, 5e-3, 1e-4, 1.1e-3, 9e-4])
     assert (deadline.cycles, deadline.late, deadline.worst, deadline.last) == (7, 3, 5e-3, 9e-4)
     assert str(deadline) == "deadline 1 ms: 3 of 7 cycles late, worst 5 ms, 99.9 % within 5 ms"
@@ -43,7 +42,6 @@ def test_percentiles_are_those_of_all_steps(percent):
 
 
 def test_memory_does_not_grow():
-    """After any number of steps it is as large as after one."""
     few, many = timed([1e-4]), timed(np.linspace(1e-6, 1e-2, 5000))
     assert sys.getsizeof(few._counts) == sys.getsizeof(many._counts)
     assert len(vars(few)) == len(vars(many))

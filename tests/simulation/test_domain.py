@@ -203,7 +203,6 @@ def test_estimators_of_a_loop_go_over_a_step_that_is_not_finite(estimator, compi
 
 @needs_compiler
 def test_compiled_loop_goes_on_alike():
-    """The same log in C and in the virtual machine."""
     one, other = (noisy_run(fp.ComputedTorque(TRACK, SHAPE), compiled=c) for c in (False, True))
     assert other.compiled
     np.testing.assert_allclose(one.log, other.log, rtol=1e-9, atol=1e-9, equal_nan=False)
@@ -218,7 +217,6 @@ def test_a_plant_that_leaves_its_domain_still_ends_the_run():
 
 
 def test_a_plan_that_stops_still_ends_the_run():
-    """StopRun asks for the end, and says so."""
     stopping = fp.RecedingHorizon(PLAN, SHAPE, on_failure=fp.StopRun())
     run = noisy_run(stopping, compiled=False)
     assert run.stop is not None

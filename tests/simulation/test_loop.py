@@ -92,7 +92,6 @@ def test_disturbances_act_by_name():
 
 
 def test_noise_follows_the_seed():
-    """Runs are reproducible bit for bit, and seeds differ."""
     noisy = swing(disturbances={"torque": fp.Noise(0.1)}, duration=1.5)
     first, again, other = run(noisy, seed=1), run(noisy, seed=1), run(noisy, seed=2)
     assert np.array_equal(first.log, again.log)
@@ -141,7 +140,6 @@ def test_run_stops_where_a_solver_fails(fails, monkeypatch):
 
 
 def test_save_and_load(tmp_path):
-    """A run survives the disk; a damaged file is refused."""
     result = run(swing(duration=0.1, measure_from=0.0))
     result.save(tmp_path / "run.npz")
     again = fp.load_run(tmp_path / "run.npz")
@@ -181,13 +179,11 @@ BAD: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("message", BAD)
 def test_mistakes_of_a_problem(message):
-    """Each mistake says what, where, and how to mend it."""
     with pytest.raises(InvalidProblem, match=message):
         swing(**BAD[message])
 
 
 def test_response_not_invertible_at_the_start():
-    """The input and the state are named."""
     weak = fp.Plant({"y": "m"}, {"u": "N"}, {}, lambda q, v, u, p: {"y": q.y * u.u})
     with pytest.raises(InvalidProblem, match=r"(?s)not invertible at the start \(y = 0, y' = 0\).*'u'"):
         line(1.0, 1.0, plant=weak)

@@ -73,7 +73,6 @@ def test_columns_of_a_report(adaptive):
 
 
 def test_order_of_a_file():
-    """Files list every number, the number of cycles first."""
     assert list(BY_NAME)[:4] == ["cycles", "rms_error", "max_error", "iae"]
     assert list(BY_NAME)[-7:] == [
         "solve.median_iterations",
@@ -123,7 +122,6 @@ def test_numbers_as_texts():
 
 
 def test_a_run_that_ended_at_once_has_no_numbers():
-    """Without a cycle nothing is known but the end."""
     solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
     metrics = fp.measure(problem(), cut(run(1.0, stop="signal 'x' is not finite", solve=solve), 0))
     assert np.isnan([metrics.at_limit, metrics.settling["y"], metrics.effort["u"], metrics.rms_error["y"]]).all()
@@ -135,7 +133,6 @@ def test_a_run_that_ended_at_once_has_no_numbers():
 
 
 def test_one_cycle_is_enough_for_a_solve():
-    """Its plan is one plan."""
     solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
     metrics = fp.measure(problem(measure_from=0.0), cut(run(0.0, solve=solve), 1))
     assert metrics.solve["plans"] == 1
@@ -152,7 +149,6 @@ def test_end_of_a_run_counts_beside_other_cycles_that_were_not_finite():
 
 
 def test_plans_that_return_are_counted_once():
-    """Two plans in turn are two, and one that is held is one."""
     assert of_solves(np.arange(CYCLES) // 10 % 2).solve["plans"] == 2
     assert of_solves(np.zeros(CYCLES)).solve["plans"] == 1
     assert of_solves(np.arange(CYCLES)).solve["plans"] == CYCLES
@@ -184,7 +180,6 @@ def test_a_run_that_ended_early_has_no_cost():
 
 
 def test_contraction_needs_ten_cycles(adaptive):
-    """Fewer say nothing; ten do."""
     task, result = adaptive
     for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.growing", "contraction.measured"})):
         metrics = fp.measure(task, cut(result, cycles))

@@ -194,7 +194,6 @@ def test_every_run_has_the_same_columns(late):
 
 
 def test_a_run_of_an_older_version_gets_its_columns(tmp_path):
-    """A file without them is read as if it had them."""
     result = run(np.linspace(1.0, 0.0, CYCLES))
     old = Layout(tuple(s for s in result.layout.signals if s.name not in ("plant_state", "true_error")))
     replace(result, layout=old, log=result.log[:, : old.size]).save(tmp_path / "old.npz")
@@ -252,7 +251,6 @@ def test_a_metric_is_one_value():
     ],
 )
 def test_a_wrong_metric_is_refused(wrong, message):
-    """One clear error that names the metric."""
     with pytest.raises((InvalidName, InvalidValue), match=message):
         with_own_metrics([fp.Metric(**{"name": "mine", "function": overshoot, **wrong})])
 

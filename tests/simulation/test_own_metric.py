@@ -103,7 +103,6 @@ def test_baselines_have_it(task, folder):
 
 
 def test_a_problem_file_with_something_else_is_refused(tmp_path):
-    """One error that says what is expected."""
     (tmp_path / "line.py").write_text(LINE + "\nmetrics = ('overshoot',)\n")
     with pytest.raises(fp.FpirhcError, match=r"metrics must be a sequence of fpirhc\.Metric"):
         fp.load_problem(str(tmp_path / "line.py"))

@@ -120,7 +120,6 @@ def test_memory_that_is_not_finite_begins_anew():
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 def test_compiled_check_is_the_same():
-    """C and the virtual machine doubt the same samples."""
     task = fp.load_problem("two_mass")
     controller = task.controllers["CTC+FPI (eq 6)"]
     compiled = Closed(task.problem, controller, compiled=True)

@@ -71,6 +71,5 @@ def test_pictures_mark_the_changes(comparison):
 
 
 def test_changes_of_unknown_controllers_are_refused():
-    """The nearest name is offered."""
     with pytest.raises(InvalidProblem, match=r"changes.*eq 6"):
         compare(TASK, seed=0, controllers=["CTC", NAME], changes={"CTC+FPI (eq6)": CHANGES})

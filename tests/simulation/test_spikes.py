@@ -113,7 +113,6 @@ def test_a_run_returns_after_a_spike(law, deformation):
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("deformation", MAPS)
 def test_a_run_returns_after_a_spike_with_every_law_and_map(law, deformation):
-    """The same for every shipped tracking law and deformation."""
     assert stays_away(LAWS[law], MAPS[deformation]) == {}
 
 

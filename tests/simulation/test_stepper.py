@@ -48,7 +48,6 @@ def status(stepper: fp.Stepper) -> Status:
 
 @pytest.mark.parametrize("name", ["computed torque", "plan"])
 def test_compiled_gate_is_the_same(name):
-    """C and the virtual machine skip, hold and restart alike."""
     virtual, run = case(name)
     compiled = fp.Stepper(PROBLEM, CONTROLLERS[name])
     memories = [virtual.start(), compiled.start()]
@@ -294,6 +293,5 @@ def test_stuck_actuator_saturates():
 
 
 def test_every_status_has_a_place_and_a_remedy():
-    """The order from best to worst names each once."""
     assert sorted(s.severity for s in Status) == list(range(len(Status)))
     assert all(s.remedy for s in Status)

@@ -48,7 +48,6 @@ def status(one: fp.Stepper) -> Status:
 
 
 def test_it_says_what_it_is():
-    """Of what, and how it runs."""
     one = plain()
     assert one.compiled is False
     assert repr(one) == f"Stepper({PROBLEM.name}, ComputedTorque, virtual machine)"
@@ -158,7 +157,6 @@ def test_time_stamps_are_read_where_their_age_counts():
 
 
 def test_ranges_of_a_user_replace_the_automatic_ones():
-    """A sample outside of them skips the cycle."""
     one = stepper(plausible={"y": (-0.2, 0.2)})
     one.step(0.0, np.array([0.21, 0.0]), SAMPLE[2], one.start())
     assert status(one) == Status.BAD_SAMPLE

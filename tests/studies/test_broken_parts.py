@@ -71,7 +71,6 @@ def test_a_part_of_a_comparison_that_breaks_loses_no_run(part, name, monkeypatch
 
 
 def test_a_null_test_that_breaks_loses_no_comparison(monkeypatch):
-    """It stands with the sentences about what is known."""
     monkeypatch.setattr(pairwise, "null_test", breaks)
     result = fp.compare(task(), seed=0, compiled=False)
     assert result.null is None

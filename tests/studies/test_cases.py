@@ -297,7 +297,6 @@ def test_the_verdict_of_one_run_speaks_of_it_first(task):
 
 
 def test_groups_are_comparisons_of_their_own(task):
-    """The summary of a group is that of its cases alone."""
     everything, heavy = compared(task, "all"), compared(task, "heavy", folder="heavy")
     assert list(everything.groups) == ["heavy", "light"]
     for alone, one in zip(heavy.summaries, everything.groups["heavy"], strict=True):
@@ -397,7 +396,6 @@ def test_wrong_paths(wrong, task):
 
 @pytest.mark.parametrize("wrong", WRONG_TABLES)
 def test_wrong_tables(wrong, task):
-    """Row and column are named, as a spreadsheet counts them."""
     text, message = WRONG_TABLES[wrong]
     with pytest.raises(InvalidProblem, match=message):
         fp.Cases.from_csv(written(text).resolve()).check(task.problem)

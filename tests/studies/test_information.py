@@ -91,7 +91,6 @@ def test_lines_stand_in_every_form_of_a_comparison(everything):
 
 
 def test_equal_controllers_share_one_line():
-    """Where nothing differs, one line says so."""
     lines = compared(["CTC"]).information
     assert lines[1:] == ("every controller uses y, y'", "every controller acts in every cycle")
 

@@ -166,7 +166,6 @@ def test_any_metric_with_a_direction_may_be_tuned_by(task, tmp_path):
     ],
 )
 def test_a_wrong_metric_is_refused(metric, error, message, task, tmp_path):
-    """Before anything runs, or as soon as a run shows that it has no such number."""
     with pytest.raises(error, match=message):
         fp.tune(task, trials=1, seed=0, folder=tmp_path / "t", metric=metric)
 
@@ -230,7 +229,6 @@ def test_command_line_journey(task, capsys):
 
 
 def test_a_file_of_another_problem_is_refused(task):
-    """And so is one that is not of tuning at all, or is not there."""
     facts = {"format": 1, "problem": "arm", "controllers": {}, "trials": 1, "seed": 0, "conditions": ""}
     Path("t.json").write_text(json.dumps(facts))
     with pytest.raises(ProblemFileError, match="of problem 'arm', not of 'line'"):
@@ -243,7 +241,6 @@ def test_a_file_of_another_problem_is_refused(task):
 
 
 def test_what_cannot_be_tuned_is_said(task, tmp_path, monkeypatch):
-    """Nothing to tune, no search space for a controller, no Optuna: each with what to do."""
     with pytest.raises(InvalidProblem, match="no search space for controller 'CTC exact'"):
         fp.tune(task, trials=1, seed=0, folder=tmp_path, controllers=["CTC exact"])
     with pytest.raises(InvalidProblem, match=r"add to its file, for example, tuning ="):

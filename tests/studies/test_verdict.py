@@ -99,8 +99,6 @@ def test_a_row_without_its_pair_is_judged_beside_itself_without_adaptation():
 
 
 def test_a_deformation_that_cannot_be_left_out_is_not_judged():
-    """The verdict says so by name."""
-
     class Bound(fp.ComputedTorque):
         def with_deformation(self, deformation):  # noqa: ARG002
             raise NotSupported("the map is part of the law")
@@ -137,7 +135,6 @@ class _Still:
 
 
 def test_unknown_entry_offers_the_nearest():
-    """A comparison is read by name."""
     with pytest.raises(fp.FpirhcError, match="Did you mean 'plain'"):
         judged(fp.Sigmoid(gain=-0.5, scale=10.0))["plan"]
 
@@ -258,7 +255,6 @@ def test_steps_of_a_plan_are_followed_until_the_next_plan():
 
 
 def test_without_a_pair_the_smallest_error_is_named(pair):
-    """By the worst coordinate of each."""
     alone = [replace(entry(e, y=v), pair=None) for e, v in zip(pair, (0.25, 0.75), strict=True)]
     assert findings(alone, {}, None)[0].text.startswith("plain has the smallest rms error (0.25)")
 

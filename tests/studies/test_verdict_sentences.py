@@ -473,7 +473,6 @@ def test_a_step_limit_is_the_cause_from_the_largest_change_on():
 
 
 def test_a_run_of_two_cycles_shows_no_slew():
-    """Three cycles do."""
     plain = [entry("RHC", desired=np.arange(CYCLES)[:, None] * [1.0, 0.0], cycles=cycles) for cycles in (2, 3)]
     short, enough = (no_difference(plain=p, settings={"step_limit": 0.5}) for p in plain)
     assert short == ""

@@ -43,7 +43,6 @@ def run(composite, inputs):
 
 
 def test_blocks_are_wired_by_name():
-    """What one writes the next reads."""
     last = Block("add", Layout((Y, U)), Layout((scalar("z"),)), lambda s: {"z": s.y + s.u})
     composite = compose("wired", Layout((U,)), [double(), last], outputs=("z",))
     _, trace, z = composite.function([], 3.0)
@@ -116,7 +115,6 @@ def test_private_wires_are_not_traced():
 
 
 def test_wiring_mistakes():
-    """Each mistake names the block and the signal."""
     with pytest.raises(InvalidName, match="block 'double' reads 'u', which no earlier block writes"):
         compose("bad", Layout((scalar("v"),)), [double()])
     with pytest.raises(InvalidName, match="writes 'y', which is already written"):

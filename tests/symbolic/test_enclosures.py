@@ -33,7 +33,6 @@ def boxes(radius: float, count: int = 60) -> tuple[np.ndarray, Box]:
 @pytest.mark.parametrize("name", VALUES)
 @pytest.mark.parametrize("radius", [0.0, 1e-6, 0.05, 0.4])
 def test_no_value_is_outside(name, radius):
-    """Random points and all corners of random boxes."""
     enclosure, (centres, box) = Enclosure(VALUES[name], X), boxes(radius)
     bounds, random = enclosure.over(box), np.random.default_rng(1)
     corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T

@@ -242,7 +242,6 @@ def test_failing_compiler_falls_back_with_its_message(cache, monkeypatch, tmp_pa
 
 @needs_compiler
 def test_hostile_folder_names_are_only_names(tmp_path, monkeypatch):
-    """Nothing in a path is read as a command."""
     monkeypatch.setattr(module, "_loaded", {})
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "a; touch owned; $(touch owned) b"))
     assert native(model(2.0)).compiled
@@ -251,7 +250,6 @@ def test_hostile_folder_names_are_only_names(tmp_path, monkeypatch):
 
 @needs_compiler
 def test_folder_that_cannot_be_written_is_replaced(tmp_path, monkeypatch):
-    """Without a place for the cache, a temporary one is used."""
     (tmp_path / "taken").write_text("")
     monkeypatch.setattr(module, "_loaded", {})
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "taken" / "cache"))
@@ -396,7 +394,6 @@ def test_folder_is_closed_to_others(cache):
 
 @needs_posix
 def test_folder_of_another_user_is_not_used(cache, monkeypatch):
-    """A temporary folder takes its place."""
     cache.mkdir(parents=True)
     monkeypatch.setattr(module, "_is_own", lambda facts: False)
     assert module.cache_folder() != cache

@@ -46,13 +46,11 @@ def test_noise_and_formulas_tell_nothing():
 
 
 def test_noise_is_drawn_from_the_seed():
-    """The same seed gives the same noise, another seed another."""
     assert np.array_equal(_values(fp.Noise(1.0), 4), _values(fp.Noise(1.0), 4))
     assert not np.array_equal(_values(fp.Noise(1.0), 4), _values(fp.Noise(1.0), 5))
 
 
 def test_formula_must_be_finite():
-    """An expression that is not finite says when."""
     np.testing.assert_allclose(_values(fp.Formula(lambda t: ca.exp(-t))), np.exp(-TIMES), equal_nan=False)
     with pytest.raises(InvalidValue, match="not finite at t = 0"):
         _values(fp.Formula(lambda t: 1 / t))

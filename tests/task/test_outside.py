@@ -300,14 +300,12 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_problem_says_what_is_wrong_with_its_signals(name):
-    """One sentence with the name, before any run."""
     signals, text = BAD[name]
     with pytest.raises(InvalidProblem, match=text):
         task(room(OUTSIDE), signals)
 
 
 def test_samples_say_what_is_wrong_with_them():
-    """Shapes, order, finiteness, hold."""
     with pytest.raises(InvalidShape, match="one value per time"):
         fp.Samples([0.0, 1.0], [1.0])
     with pytest.raises(InvalidShape, match="at least 2"):

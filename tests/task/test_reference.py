@@ -38,7 +38,6 @@ def test_table_is_held_outside():
 
 
 def test_missing_and_unknown_coordinates():
-    """Both mistakes at once."""
     with pytest.raises(InvalidProblem, match=r"(?s)'z' is unknown.*'y' has no nominal motion"):
         fp.Trajectory(lambda t: {"z": t}).function(chain(2))
 

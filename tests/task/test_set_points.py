@@ -238,7 +238,6 @@ def test_a_step_without_set_points_keeps_the_old_ones():
     ],
 )
 def test_bad_set_points_of_a_run(setpoints, error, words):
-    """They are refused before the run, by name."""
     ready = fp.simulator(two_mass(), TWO_MASS.controllers["CTC"], compiled=False)
     with pytest.raises(error, match=words):
         ready.run(seed=0, setpoints=setpoints)

@@ -105,7 +105,6 @@ def test_figures_have_it(case):
 
 
 def test_scenarios_have_it(case, capsys, tmp_path):
-    """The page and the table of scenarios."""
     task, _ = case
     study = compare_scenarios(
         task, count=2, percent=5.0, seed=0, folder=tmp_path, controllers=["RHC", "RHC+FPI"], compiled=False

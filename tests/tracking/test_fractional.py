@@ -114,7 +114,6 @@ def test_memory_is_static_and_bounded():
 
 
 def test_shortest_memory_runs():
-    """A memory of one cycle is one number."""
     result = run(problem(duration=0.2, period=0.01), fp.Fractional(rate=100.0, order=0.9, memory=0.01))
     assert np.isfinite(result["desired"]).all()
 
