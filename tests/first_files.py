@@ -108,3 +108,17 @@ problem = fp.Problem(
 law = fp.ComputedTorque(fp.Exponential(rate=2.0))
 controllers = {"CTC": law, "CTC+FPI": law.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.7)))}
 '''
+
+
+def changes_of(table: str) -> dict[str, tuple[list[tuple[str, str]], tuple[str, ...]]]:
+    """(changes, what must be said) by name: a name stands at the margin, its changes after two spaces, its message after four."""
+    rows: dict[str, tuple[list[tuple[str, str]], list[str]]] = {}
+    for line in table.replace(" ->\n      ", " -> ").strip().splitlines():
+        if line[0] != " ":
+            changes, said = rows[line] = [], []
+        elif line[2] != " ":
+            old, _, new = line[2:].partition(" ->")
+            changes.append((old, new.removeprefix(" ")))
+        else:
+            said.append(line.strip())
+    return {name: (changes, tuple(" ".join(said).split(" ... "))) for name, (changes, said) in rows.items()}

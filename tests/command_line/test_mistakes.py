@@ -18,6 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from first_files import changes_of
 from mutated_problems import SOURCE
 from raw_errors import raw_error
 
@@ -30,115 +31,90 @@ from fpirhc.errors import InvalidField
 from fpirhc.fields.checked import Checked, expects_whole_number
 from fpirhc.symbolic.live import SymbolicNumber
 
-
-@dataclass(frozen=True)
-class Mistake:
-    """A change of the correct file: `old` becomes `new`; the message has the line of `new`, the cause and the mend."""
-
-    old: str
-    new: str
-    cause: str
-    mend: str = ""
-
-
-MISTAKES = {
-    "class without parentheses": Mistake(
-        "fp.Paired(fp.Sigmoid(gain=-0.2, scale=10.0), cycles=1)",
-        "fp.Sigmoid",
-        "ComputedTorque.deformation: expected a Deformation, got the class Sigmoid",
-        "write Sigmoid(gain=...)",
-    ),
-    "optimiser by name": Mistake(
-        "fp.RecedingHorizon(optimiser),",
-        'fp.RecedingHorizon(optimiser="ipopt"),',
-        "expected an Optimiser, got the text 'ipopt'",
-        "write fp.Ipopt()",
-    ),
-    "optimiser by a name of the command line": Mistake(
-        "fp.RecedingHorizon(optimiser),",
-        'fp.RecedingHorizon(optimiser="fixed-point"),',
-        "expected an Optimiser",
-        "write fp.FixedPoint(iterations=..., tolerance=...)",
-    ),
-    "path of two arguments": Mistake(
-        "lambda view: view.state.y + view.state.z", "lambda x, u: x.y", "expected a function of 1 argument"
-    ),
-    "path with its text and function swapped": Mistake(
-        'fp.PathConstraint(lambda view: view.state.y + view.state.z, upper=3.0, unit="m")',
-        'fp.PathConstraint("m", lambda view: view.state.y)',
-        "PathConstraint.expression: expected a function, got the text 'm'",
-    ),
-    "reference that returns a number": Mistake(
-        'lambda t: {"y": ca.sin(t), "z": 0.1 * ca.cos(t)}',
-        "lambda t: 0.5",
-        "reference must return {name: expression}, got 0.5",
-    ),
-    "reference without a coordinate": Mistake(
-        '"z": 0.1 * ca.cos(t)', "", "coordinate 'z' has no nominal motion", "add 'z' to the reference"
-    ),
-    "negative weight": Mistake(
-        '"z": 10.0, "y\'": 0.1}', '"z": -10.0}', "the weight of 'z' must be a finite number of at least 0, got -10.0"
-    ),
-    "limits that no number meets": Mistake(
-        '"force": (-20.0, 20.0)',
-        '"force": (float("inf"), float("inf"))',
-        "'force' has limits (inf, inf) that no number meets",
-        "a free side is -inf below, inf above",
-    ),
-    "limits by one number": Mistake(
-        '"force": (-20.0, 20.0)', '"force": 20.0', "Limits.inputs['force']: expected (a number, a number)"
-    ),
-    "too many cycles": Mistake("duration=0.1", "duration=1e9", "more than 1e+09 cycles", "shorten it"),
-    "comma behind a number": Mistake(
-        "gain=-0.2, scale", "gain=(-0.2,), scale", "Sigmoid.gain: expected a number", "remove the comma"
-    ),
-    "stages with a point": Mistake("stages=4", "stages=4.0", "Horizon.stages: expected a whole number", "write 4"),
-    "zero accuracy": Mistake(
-        "fp.FixedPoint(iterations=1, tolerance=1e-2)",
-        "fp.Ipopt(accuracy=0)",
-        "Ipopt.accuracy: expected a number above 0",
-    ),
-    "if on a symbol": Mistake(
-        "u.lift / p.mass - 9.81",
-        "u.lift / p.mass if q.z > 0 else 0",
-        "a symbol is neither true nor false",
-        "use ca.if_else",
-    ),
-    "max of a symbol": Mistake(
-        "u.lift / p.mass - 9.81", "u.lift / p.mass - max(q.z, 0)", "max() and min() cannot act on it", "ca.fmax"
-    ),
-    "math on a symbol": Mistake("ca.sin(t), ", "math.sin(t), ", "math.sin(...) of a symbol is NaN", "use ca.sin"),
-    "numpy array of symbols": Mistake(
-        "u.lift / p.mass - 9.81",
-        "np.array([u.lift, q.z])",
-        "must be one scalar expression, got an array of the shape (2,)",
-    ),
-    "symbol as a setting": Mistake(
-        "gain=-0.3",
-        'gain=ca.SX.sym("g")',
-        "Affine.gain: expected a number, got a CasADi symbol",
-        "a setting is a number",
-    ),
-    "response that returns nothing": Mistake(
-        'return {"y"', '_ = {"y"', "response must return {name: expression}, got None", "return"
-    ),
-    "misspelt parameter": Mistake(
-        "p.friction", "p.fricton", "parameter 'fricton' is unknown", "Did you mean 'friction'?"
-    ),
-    "headline of one name": Mistake('("CTC", "CTC+FPI")', '"CTC"', "headline must be a pair of names"),
-    "program ended by the file": Mistake(
-        'headline = ("CTC", "CTC+FPI")', "raise SystemExit(0)", "the file ends the program", "leave the exit out"
-    ),
-    "forgotten import": Mistake("import casadi as ca", "import casadi", "name 'ca' is not defined"),
-}
+# The name of a mistake, the old piece of the correct file and the new one, and what must be said: the cause and the mend.
+MISTAKES = changes_of("""
+class without parentheses
+  fp.Paired(fp.Sigmoid(gain=-0.2, scale=10.0), cycles=1) -> fp.Sigmoid
+    ComputedTorque.deformation: expected a Deformation, got the class Sigmoid ... write Sigmoid(gain=...)
+optimiser by name
+  fp.RecedingHorizon(optimiser), -> fp.RecedingHorizon(optimiser="ipopt"),
+    expected an Optimiser, got the text 'ipopt' ... write fp.Ipopt()
+optimiser by a name of the command line
+  fp.RecedingHorizon(optimiser), -> fp.RecedingHorizon(optimiser="fixed-point"),
+    expected an Optimiser ... write fp.FixedPoint(iterations=..., tolerance=...)
+path of two arguments
+  lambda view: view.state.y + view.state.z -> lambda x, u: x.y
+    expected a function of 1 argument
+path with its text and function swapped
+  fp.PathConstraint(lambda view: view.state.y + view.state.z, upper=3.0, unit="m") ->
+      fp.PathConstraint("m", lambda view: view.state.y)
+    PathConstraint.expression: expected a function, got the text 'm'
+reference that returns a number
+  lambda t: {"y": ca.sin(t), "z": 0.1 * ca.cos(t)} -> lambda t: 0.5
+    reference must return {name: expression}, got 0.5
+reference without a coordinate
+  "z": 0.1 * ca.cos(t) ->
+    coordinate 'z' has no nominal motion ... add 'z' to the reference
+negative weight
+  "z": 10.0, "y'": 0.1} -> "z": -10.0}
+    the weight of 'z' must be a finite number of at least 0, got -10.0
+limits that no number meets
+  "force": (-20.0, 20.0) -> "force": (float("inf"), float("inf"))
+    'force' has limits (inf, inf) that no number meets ... a free side is -inf below, inf above
+limits by one number
+  "force": (-20.0, 20.0) -> "force": 20.0
+    Limits.inputs['force']: expected (a number, a number)
+too many cycles
+  duration=0.1 -> duration=1e9
+    more than 1e+09 cycles ... shorten it
+comma behind a number
+  gain=-0.2, scale -> gain=(-0.2,), scale
+    Sigmoid.gain: expected a number ... remove the comma
+stages with a point
+  stages=4 -> stages=4.0
+    Horizon.stages: expected a whole number ... write 4
+zero accuracy
+  fp.FixedPoint(iterations=1, tolerance=1e-2) -> fp.Ipopt(accuracy=0)
+    Ipopt.accuracy: expected a number above 0
+if on a symbol
+  u.lift / p.mass - 9.81 -> u.lift / p.mass if q.z > 0 else 0
+    a symbol is neither true nor false ... use ca.if_else
+max of a symbol
+  u.lift / p.mass - 9.81 -> u.lift / p.mass - max(q.z, 0)
+    max() and min() cannot act on it ... ca.fmax
+math on a symbol
+  ca.sin(t),  -> math.sin(t),
+    math.sin(...) of a symbol is NaN ... use ca.sin
+numpy array of symbols
+  u.lift / p.mass - 9.81 -> np.array([u.lift, q.z])
+    must be one scalar expression, got an array of the shape (2,)
+symbol as a setting
+  gain=-0.3 -> gain=ca.SX.sym("g")
+    Affine.gain: expected a number, got a CasADi symbol ... a setting is a number
+response that returns nothing
+  return {"y" -> _ = {"y"
+    response must return {name: expression}, got None ... return
+misspelt parameter
+  p.friction -> p.fricton
+    parameter 'fricton' is unknown ... Did you mean 'friction'?
+headline of one name
+  ("CTC", "CTC+FPI") -> "CTC"
+    headline must be a pair of names
+program ended by the file
+  headline = ("CTC", "CTC+FPI") -> raise SystemExit(0)
+    the file ends the program ... leave the exit out
+forgotten import
+  import casadi as ca -> import casadi
+    name 'ca' is not defined
+""")
 SOURCES = SOURCE.replace("import casadi as ca\n", "import math\nimport numpy as np\nimport casadi as ca\n")
 
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_typical_mistake_is_explained_in_place(name, tmp_path, monkeypatch, capsys):
-    mistake = MISTAKES[name]
-    assert SOURCES.count(mistake.old) >= 1
-    text = SOURCES.replace(mistake.old, mistake.new, 1)
+    [(old, new)], expected = MISTAKES[name]
+    assert SOURCES.count(old) >= 1
+    text = SOURCES.replace(old, new, 1)
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(text, encoding="utf-8")
     assert main(["compare", "mine.py"]) == ExitCode.BAD_INPUT
@@ -147,12 +123,11 @@ def test_a_typical_mistake_is_explained_in_place(name, tmp_path, monkeypatch, ca
     said = " ".join(printed.err.split())
     assert said.startswith("fpirhc: ")
     assert "mine.py" in said
-    assert mistake.cause in said
-    assert mistake.mend in said
+    assert all(words in said for words in expected)
     assert "Traceback" not in said
     # The line is that of the statement or of the change itself.
     lines = {int(number) for number in re.findall(r"line (\d+)", said)}
-    assert lines & _possible_lines(text, SOURCES.index(mistake.old))
+    assert lines & _possible_lines(text, SOURCES.index(old))
 
 
 def _possible_lines(text: str, place: int) -> set[int]:

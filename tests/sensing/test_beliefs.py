@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
+from filters import extended_filter, runge_kutta
 from plants import linear, pendulum
 
 import fpirhc as fp
@@ -98,44 +99,6 @@ def test_a_right_model_believes_what_is(make, controller, corrected):
     np.testing.assert_allclose(believed[late:], true[: len(true) - late], atol=1e-11 * (1 + np.abs(true).max()))
 
 
-def room(**changes: Any) -> fp.Problem:
-    """A heated room: the walls are believed, the weather is a signal from outside that the model is told."""
-    weather = fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))
-    plant = fp.Plant(
-        coordinates={"air": "K", "walls": "K"},
-        inputs={"heat": "kW"},
-        controlled=("air",),
-        order=1,
-        parameters={"loss": fp.Parameter(0.3, 0.3, "kW/K"), "ambient": fp.outside(nominal=280.0, unit="K")},
-        response=lambda q, u, p: {
-            "air": p.loss * (p.ambient - q.air) + 0.5 * (q.walls - q.air) + u.heat,
-            "walls": 0.1 * (q.air - q.walls) + 0.05 * (p.ambient - q.walls),
-        },
-        time_unit="h",
-    )
-    problem = fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"air": 293.0 + ca.sin(0.3 * t), "walls": 290.0 + 0 * t}),
-        start={"air": 292.0, "walls": 289.0},
-        period=0.25,
-        duration=20.0,
-        signals={"ambient": weather},
-        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["air"], observer=fp.ModelStates()),
-    )
-    return replace(problem, **changes)
-
-
-@pytest.mark.parametrize("late", [0, 3, 0.5, 2.4])
-def test_a_right_model_in_known_weather_believes_what_is(late):
-    """Behind a dead time too: the model then moves in the weather of the time of the samples, which is interpolated as they are."""
-    result = run(room(dead_time=fp.DeadTime(measurement=0.25 * late)), CTC)
-    whole, part = int(late), late % 1
-    true, count = result["plant_state"], len(result.time) - whole - 1
-    assert np.ptp(true[:, 1]) > 1
-    expected = (1 - part) * true[1 : count + 1] + part * true[:count]
-    np.testing.assert_allclose(result["state"][whole + 1 :], expected, atol=1e-10)
-
-
 @pytest.mark.parametrize("observer", [fp.ModelStates(), fp.ModelStates(corrected=False), KALMAN], ids=str)
 def test_samples_that_are_late_by_a_fraction_are_those_of_a_linear_model(observer):
     """Commands 1.25 and samples 2.4 cycles late: every believed state is interpolated as the measured one is, to rounding."""
@@ -195,49 +158,16 @@ def test_a_model_that_runs_by_itself_drifts_without_bound():
 # Kalman's filter
 
 
-def recursion(problem: fp.Problem, result: fp.Run, filter: fp.KalmanFilter) -> tuple[np.ndarray, np.ndarray]:
-    """The extended filter of the pendulum in numpy, with rates by hand and Jacobians by the complex step."""
-    m, length, step = 1.0, 0.6, problem.period
-    believed = problem.plant.parameters["m"].approximate
-
-    def rate(x, u, w):
-        torque = (u - 0.1 * x[1]) / (believed * length**2)
-        return np.array([x[1], torque - 9.81 / length * np.sin(x[0]) + w])
-
-    def advance(x, u, w):
-        k1 = rate(x, u, w)
-        k2 = rate(x + step / 2 * k1, u, w)
-        k3 = rate(x + step / 2 * k2, u, w)
-        k4 = rate(x + step * k3, u, w)
-        return x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-    def slopes(x, u):
-        tiny = 1e-30j
-        columns = [advance(x + tiny * e, u, 0.0).imag / 1e-30 for e in np.eye(2)]
-        return np.column_stack(columns), (advance(x.astype(complex), u, tiny).imag / 1e-30)[:, None]
-
-    x, c = problem.start_state.copy(), np.array([[1.0, 0.0]])
-    p = np.diag([0.05**2, 0.1**2])
-    states, measured = [], raw_measurements(result)
-    for k in range(result.cycles):
-        if k:
-            u = result["command"][k - 1, 0]
-            a, b = slopes(x, u)
-            x, p = advance(x, u, 0.0), a @ p @ a.T + 0.5**2 * b @ b.T
-        gain = p @ c.T / (c @ p @ c.T + 2e-3**2)
-        x = x + gain @ (measured[k] - c @ x)
-        p = p - gain @ c @ p
-        states.append(x)
-    assert m == problem.plant.parameters["m"].exact
-    assert filter is problem.sensing.observer
-    return np.array(states), p
-
-
 def test_it_is_the_extended_filter_of_the_books():
     """Against an independent recursion in numpy on the nonlinear pendulum, with a wrong mass, to 1e-10."""
     problem = swing(ANGLE, believed=1.3)
     result = run(problem, TRACK)
-    states, covariance = recursion(problem, result, ANGLE)
+
+    def rate(x, u, w):
+        return np.array([x[1], (u - 0.1 * x[1]) / (1.3 * 0.6**2) - 9.81 / 0.6 * np.sin(x[0]) + w[0]])
+
+    step, start = runge_kutta(rate, problem.period), (problem.start_state, np.array([0.05, 0.1]))
+    states, covariance = extended_filter(result, step, lambda x: x[:1], start, np.array([0.5]), 2e-3)
     np.testing.assert_allclose(result["state"], states, atol=1e-10)
     stepper = fp.Stepper(problem, TRACK, compiled=False)
     memory = stepper.start()

@@ -8,13 +8,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from filters import extended_filter
 from plants import linear
 
 import fpirhc as fp
 from fpirhc.conformance.live import check_live
 from fpirhc.errors import NotSupported
 from fpirhc.sensing.base import StateObserver
-from fpirhc.simulation.sample import raw_measurements
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=0.2))
 T = 2.0  # s, one step of the map
@@ -65,17 +65,14 @@ def test_the_right_map_believes_what_is(observer: StateObserver) -> None:
 def test_a_filter_of_a_map_is_that_of_the_books() -> None:
     """Against a recursion in numpy with a wrong birth rate; noise adds T w to the next state, as a disturbance does."""
     result = run(fishery(FILTER, birth=3.0, noise=0.02))
-    x, p, c = np.array([0.9, 0.7]), np.diag([0.01, 0.01]), np.array([[0.0, 1.0]])
-    w = T**2 * np.diag([0.02, 0.01]) ** 2
-    for k, measured in enumerate(raw_measurements(result)):
-        if k:
-            y, a = x
-            slope = np.array([[0.0, 3.0 * (1 - a) * np.exp(-a)], [0.4, 0.5]])
-            x = np.array([3.0 * a * np.exp(-a), 0.5 * a + 0.4 * y - result["command"][k - 1, 0]])
-            p = slope @ p @ slope.T + w
-        gain = p @ c.T / (c @ p @ c.T + 0.02**2)
-        x, p = x + gain @ (measured - c @ x), p - gain @ c @ p
-        np.testing.assert_allclose(result["state"][k], x, atol=1e-12)
+
+    def step(x: Any, u: float, w: Any) -> Any:
+        young, adult = x
+        return np.array([3.0 * adult * np.exp(-adult), 0.5 * adult + 0.4 * young - u]) + T * w
+
+    start, noise = (np.array([0.9, 0.7]), np.array([0.1, 0.1])), np.array([0.02, 0.01])
+    states, _ = extended_filter(result, step, lambda x: x[1:], start, noise, 0.02)
+    np.testing.assert_allclose(result["state"], states, atol=1e-12)
 
 
 # Algebraic states
@@ -176,7 +173,7 @@ def test_an_output_of_order_zero_shows_what_is_believed() -> None:
 
 
 def room(observer: StateObserver) -> fp.Problem:
-    """A heated room in known weather: its air is an output that is measured, late by two cycles; its walls are believed."""
+    """A heated room in known weather: what is felt is measured, air and walls are believed."""
     plant = fp.Plant.of_states(
         states={"air": "K", "walls": "K"},
         inputs={"heat": "kW"},
@@ -195,7 +192,6 @@ def room(observer: StateObserver) -> fp.Problem:
         period=0.25,
         duration=10.0,
         signals={"ambient": fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))},
-        dead_time=fp.DeadTime(measurement=0.5),
         sensing=fp.Sensing({}, fp.PositionDifference(), measured=["felt"], observer=observer),
     )
 
@@ -204,16 +200,23 @@ ROOM: dict[str, Any] = {"measured": {"felt": 0.1}, "noise": {"air": 0.1, "walls"
 
 
 @pytest.mark.parametrize(
-    "observer",
-    [fp.ModelStates(), fp.KalmanFilter(**ROOM), fp.MovingHorizonStates(**ROOM, window=5)],
-    ids=lambda b: type(b).__name__,
+    ("observer", "late"),
+    [
+        *((fp.ModelStates(), late) for late in (0, 3, 0.5, 2.4)),
+        (fp.KalmanFilter(**ROOM), 2),
+        (fp.MovingHorizonStates(**ROOM, window=5), 2),
+    ],
+    ids=lambda v: type(v).__name__ if isinstance(v, StateObserver) else str(v),
 )
-def test_states_behind_an_output_are_believed_in_known_weather(observer: StateObserver) -> None:
-    """The model moves in the weather of the time of the samples, in every cycle of a window too."""
-    result = run(room(observer), fp.ComputedTorque(fp.Exponential(rate=0.5)))
+def test_a_right_model_in_known_weather_believes_what_is(observer: StateObserver, late: float) -> None:
+    """The model moves in the weather of the time of the samples, in every cycle of a window too, interpolated as they are."""
+    problem = replace(room(observer), dead_time=fp.DeadTime(measurement=0.25 * late))
+    result, whole, part = run(problem, fp.ComputedTorque(fp.Exponential(rate=0.5))), int(late), late % 1
     true = result["plant_state"]
+    count = len(true) - whole - 1
     assert np.ptp(true[:, 1]) > 0.5
-    np.testing.assert_allclose(result["state"][2:], true[:-2], atol=1e-9)
+    expected = (1 - part) * true[1 : count + 1] + part * true[:count]
+    np.testing.assert_allclose(result["state"][whole + 1 :], expected, atol=1e-9)
 
 
 # Live settings

@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from filters import extended_filter, runge_kutta
 from gaps import gone_on
 
 import fpirhc as fp
@@ -92,33 +93,15 @@ def test_a_filter_of_an_output_is_that_of_the_books() -> None:
     sensors = {"depth": fp.Sensor(noise=fp.Noise(0.3))}
     sensing = fp.Sensing(sensors, fp.PositionDifference(), measured=["depth"], observer=FILTER)
     problem = sedated(FILTER, believed=5.0, sensing=sensing, duration=8.0)
-    result, h = run(problem, PLAIN), 1 / 12
+    result = run(problem, PLAIN)
 
     def rate(x: Any, u: float, w: Any) -> Any:
         c, r, e = x
         return np.array([u - c - 0.5 * (c - r), 0.1 * (c - r), 0.5 * (c - e)]) + w
 
-    def advance(x: Any, u: float, w: Any) -> Any:
-        k1 = rate(x, u, w)
-        k2 = rate(x + h / 2 * k1, u, w)
-        k3 = rate(x + h / 2 * k2, u, w)
-        k4 = rate(x + h * k3, u, w)
-        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-    def slope(function: Callable[[Any], Any], at: np.ndarray) -> np.ndarray:
-        return np.column_stack([np.atleast_1d(function(at + 1e-30j * e)).imag / 1e-30 for e in np.eye(3)])
-
-    def moved(x: np.ndarray, p: np.ndarray, u: float) -> tuple[np.ndarray, np.ndarray]:
-        a, b = slope(lambda z: advance(z, u, 0.0), x), slope(lambda w: advance(x, u, w), np.zeros(3))
-        return advance(x, u, 0.0), a @ p @ a.T + b @ np.diag([0.05, 0.02, 0.05]) ** 2 @ b.T
-
-    x, p = np.array([1.5, 1.5, 1.5]), np.diag([0.2, 0.1, 0.2]) ** 2  # C, R, E
-    for k, measured in enumerate(raw_measurements(result)):
-        x, p = moved(x, p, result["command"][k - 1, 0]) if k else (x, p)
-        c = slope(lambda z: curve(z[2], 5.0), x)
-        gain = p @ c.T / (c @ p @ c.T + 0.3**2)
-        x, p = x + gain @ (measured - curve(x[2], 5.0)), p - gain @ c @ p
-        np.testing.assert_allclose(result["state"][k], x, atol=1e-10)
+    start, noise = (np.full(3, 1.5), np.array([0.2, 0.1, 0.2])), np.array([0.05, 0.02, 0.05])  # C, R, E
+    states, _ = extended_filter(result, runge_kutta(rate, 1 / 12), lambda x: curve(x[2:], 5.0), start, noise, 0.3)
+    np.testing.assert_allclose(result["state"], states, atol=1e-10)
     assert np.abs(result["state"] - result["plant_state"]).max() > 0.3
 
 
