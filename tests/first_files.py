@@ -122,3 +122,9 @@ def changes_of(table: str) -> dict[str, tuple[list[tuple[str, str]], tuple[str, 
         else:
             said.append(line.strip())
     return {name: (changes, tuple(" ".join(said).split(" ... "))) for name, (changes, said) in rows.items()}
+
+
+def messages_of(table: str) -> dict[str, str]:
+    """What must be said by the words of a command line: 'words => message', which goes on in indented lines."""
+    rows = [row.partition(" =>") for row in table.replace("\n    ", " ").strip().splitlines()]
+    return {words: said.strip() for words, _, said in rows}

@@ -17,66 +17,50 @@ from fpirhc.fields.expected import Anything
 TASK = fp.load_problem("two_mass")
 PROBLEM, CTC = TASK.problem, TASK.controllers["CTC"]
 
-CALLS: dict[str, tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] = {
+ANY: Any = fp  # a type checker would refuse these calls
+CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a name of a controller": (
-        fp.simulate,
-        (PROBLEM, "RHC"),
-        {"seed": 0},
+        lambda: ANY.simulate(PROBLEM, "RHC", seed=0),
         "simulate.controller: expected a Controller, got the text 'RHC'; write controllers['RHC'] of a loaded problem file",
     ),
     "a name of a problem": (
-        fp.simulate,
-        ("two_mass", CTC),
-        {"seed": 0},
+        lambda: ANY.simulate("two_mass", CTC, seed=0),
         "simulate.problem: expected a Problem, got the text 'two_mass'; write fp.load_problem('two_mass').problem",
     ),
     "a loaded file": (
-        fp.simulate,
-        (TASK, CTC),
-        {"seed": 0},
+        lambda: ANY.simulate(TASK, CTC, seed=0),
         "simulate.problem: expected a Problem, got a value of the class Task; give its .problem",
     ),
-    "all controllers": (fp.simulate, (PROBLEM, {"CTC": CTC}), {"seed": 0}, "give one of its entries, such as ['CTC']"),
+    "all controllers": (
+        lambda: ANY.simulate(PROBLEM, {"CTC": CTC}, seed=0),
+        "give one of its entries, such as ['CTC']",
+    ),
     "a forgotten argument": (
-        fp.simulate,
-        (PROBLEM, CTC),
-        {},
+        lambda: ANY.simulate(PROBLEM, CTC),
         "simulate needs seed; write simulate(problem=..., controller=..., seed=...)",
     ),
     "a misspelt argument": (
-        fp.simulate,
-        (PROBLEM, CTC),
-        {"seed": 0, "compile": False},
+        lambda: ANY.simulate(PROBLEM, CTC, seed=0, compile=False),
         "simulate has no argument 'compile'. Did you mean 'compiled'?",
     ),
     "a seed that is no number": (
-        fp.simulate,
-        (PROBLEM, CTC),
-        {"seed": "a"},
+        lambda: ANY.simulate(PROBLEM, CTC, seed="a"),
         "simulate.seed: expected a whole number of at least 0, got the text 'a'",
     ),
     "a problem in place of its file": (
-        fp.compare,
-        ("two_mass",),
-        {"seed": 0},
+        lambda: ANY.compare("two_mass", seed=0),
         "compare.task: expected a Task, got the text 'two_mass'; write fp.load_problem('two_mass')",
     ),
     "one controller for a review": (
-        fp.review,
-        (PROBLEM, CTC),
-        {"seed": 0, "mismatch": 0.0},
+        lambda: ANY.review(PROBLEM, CTC, seed=0, mismatch=0.0),
         "review.controllers: expected {name: a Controller}, got a value of the class ComputedTorque",
     ),
     "a file of a run": (
-        fp.measure,
-        (PROBLEM, "run.npz"),
-        {},
+        lambda: ANY.measure(PROBLEM, "run.npz"),
         "measure.run: expected a Run, got the text 'run.npz'; write fp.load_run('run.npz')",
     ),
     "a stepper of a name": (
-        fp.Stepper,
-        (PROBLEM, "CTC"),
-        {},
+        lambda: ANY.Stepper(PROBLEM, "CTC"),
         "Stepper.controller: expected a Controller, got the text 'CTC'; write controllers['CTC'] of a loaded problem file",
     ),
 }
@@ -85,9 +69,9 @@ CALLS: dict[str, tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]
 @pytest.mark.parametrize("name", CALLS)
 def test_wrong_arguments_are_named(name):
     """The place is that of the caller."""
-    function, arguments, named, words = CALLS[name]
+    call, words = CALLS[name]
     with pytest.raises(InvalidField) as caught:
-        function(*arguments, **named)
+        call()
     assert words in str(caught.value)
     assert caught.value.place.startswith("test_checked_calls.py, line")
 

@@ -13,7 +13,7 @@ from inspect import signature
 from pathlib import Path
 
 import pytest
-from first_files import PENDULUM, REACTOR, TANKS, changes_of
+from first_files import PENDULUM, REACTOR, TANKS, changes_of, messages_of
 
 import fpirhc as fp
 from fpirhc.cli.main import main
@@ -481,11 +481,9 @@ check . => .: cannot be run '.' is a folder; a problem file ends in .py, such as
 
 
 def lines(table: str, code: ExitCode | None) -> dict[str, Wrong]:
-    """The rows of a table by their words; what goes on in further lines is indented."""
-    rows = [row.partition(" =>") for row in table.replace("\n    ", " ").strip().splitlines()]
     return {
-        words: Wrong(PENDULUM, (), tuple(said.strip().split(" ... ")), tuple(shlex.split(words)), BESIDE, code)
-        for words, _, said in rows
+        words: Wrong(PENDULUM, (), tuple(said.split(" ... ")), tuple(shlex.split(words)), BESIDE, code)
+        for words, said in messages_of(table).items()
     }
 
 

@@ -6,6 +6,7 @@ import re
 import shutil
 
 import pytest
+from first_files import messages_of
 
 from fpirhc.cli.main import main
 
@@ -14,81 +15,55 @@ IPOPT = """import fpirhc as fp
 problem = fp.load_problem("two_mass").problem
 controllers = {"ipopt": fp.RecedingHorizon(fp.Ipopt(1e-6), fp.Sigmoid(gain=-0.5, scale=50.0))}
 """
-PLAN = "two_mass RHC+FPI"
-ROWS = {
-    "target unknown": (
-        ["two_mass", "RHC+FPI", "--to", "cc"],
-        "the target 'cc' is unknown. Did you mean 'c'? "
-        "Valid: arduino, c, cortex-m, fmu, fmu2, library, ros2_control, simulink, wasm.",
-    ),
-    "problem unknown": (
-        ["two_mas", "RHC+FPI"],
-        "problem 'two_mas' is unknown. Did you mean 'two_mass'? Give the path of a problem file, or a name from 'fpirhc list'",
-    ),
-    "controller not exportable": (
-        ["own.py", "ipopt"],
-        "'ipopt' cannot be exported: it calls a solver that cannot be written as C: its own library is needed "
-        "(coin-or/IpStdCInterface.h). In place of Ipopt use FixedPoint(iterations=1, tolerance=...), which is C of its own",
-    ),
-    "no zig": (
-        ["two_mass", "RHC+FPI", "--to", "wasm"],
-        "the target wasm needs ziglang, which is not installed: pip install 'fpirhc[compiler]'",
-    ),
-    "no zig for boards": (
-        ["two_mass", "RHC+FPI", "--to", "cortex-m"],
-        "the target cortex-m needs ziglang, which is not installed: pip install 'fpirhc[cortex]'",
-    ),
-    "no headers of FMI": (
-        ["two_mass", "RHC+FPI", "--to", "fmu"],
-        "the target fmu needs fmpy, which is not installed: pip install 'fpirhc[fmu]'",
-    ),
-    "no compiler": (
-        ["two_mass", "RHC+FPI", "--check"],
-        "a program of this machine needs a C compiler: install gcc or clang, or name one by FPIRHC_CC",
-    ),
-    "folder not empty": (
-        ["two_mass", "RHC+FPI", "--out", "full"],
-        "'full' is not an empty folder, and nothing in it is replaced; choose another one with --out",
-    ),
-    "no name in C": (
-        ["two_mass", "RHC+FPI", "--name", "2nd"],
-        "'2nd' cannot be the name of a controller in C: expected at most 40 letters, digits and underscores, a letter first, "
-        "and no word of C or of the files beside it. Did you mean 'c_2nd'?",
-    ),
-    "bare and live": (
-        ["two_mass", "RHC+FPI", "--bare", "--live", "deformation.gain"],
-        "--bare has no live settings, since nothing checks them: leave out 'deformation.gain' or --bare",
-    ),
-    "own functions in float": (
-        ["two_mass", "RHC+FPI", "--to", "arduino", "--libm", "own"],
-        "the target arduino computes in float, and --libm own in double; leave --libm out",
-    ),
-    "fits no board": (
-        ["two_mass", "RHC+FPI", "--to", "arduino"],
-        f"'{PLAN}' fits no board: Uno lacks N bytes of flash and N bytes of RAM; Mega 2560 lacks N bytes of RAM. "
-        "Use --bare, fewer stages, or --to cortex-m",
-    ),
-}
+ROWS = messages_of("""
+two_mass RHC+FPI --to cc =>
+    the target 'cc' is unknown. Did you mean 'c'? Valid: arduino, c, cortex-m, fmu, fmu2, library, ros2_control, simulink, wasm.
+two_mas RHC+FPI =>
+    problem 'two_mas' is unknown. Did you mean 'two_mass'? Give the path of a problem file, or a name from 'fpirhc list'
+own.py ipopt =>
+    'ipopt' cannot be exported: it calls a solver that cannot be written as C: its own library is needed
+    (coin-or/IpStdCInterface.h). In place of Ipopt use FixedPoint(iterations=1, tolerance=...), which is C of its own
+two_mass RHC+FPI --to wasm =>
+    the target wasm needs ziglang, which is not installed: pip install 'fpirhc[compiler]'
+two_mass RHC+FPI --to cortex-m =>
+    the target cortex-m needs ziglang, which is not installed: pip install 'fpirhc[cortex]'
+two_mass RHC+FPI --to fmu =>
+    the target fmu needs fmpy, which is not installed: pip install 'fpirhc[fmu]'
+two_mass RHC+FPI --check =>
+    a program of this machine needs a C compiler: install gcc or clang, or name one by FPIRHC_CC
+two_mass RHC+FPI --out full =>
+    'full' is not an empty folder, and nothing in it is replaced; choose another one with --out
+two_mass RHC+FPI --name 2nd =>
+    '2nd' cannot be the name of a controller in C: expected at most 40 letters, digits and underscores, a letter first, and no
+    word of C or of the files beside it. Did you mean 'c_2nd'?
+two_mass RHC+FPI --bare --live deformation.gain =>
+    --bare has no live settings, since nothing checks them: leave out 'deformation.gain' or --bare
+two_mass RHC+FPI --to arduino --libm own =>
+    the target arduino computes in float, and --libm own in double; leave --libm out
+two_mass RHC+FPI --to arduino =>
+    'two_mass RHC+FPI' fits no board: Uno lacks N bytes of flash and N bytes of RAM; Mega 2560 lacks N bytes of RAM. Use --bare,
+    fewer stages, or --to cortex-m
+""")
 
 
 @pytest.mark.parametrize("row", ROWS)
 def test_what_is_refused_says_why_and_what_to_do(row, tmp_path, monkeypatch, capsys):
     """Exit code 2, or 3 for a folder; one line, and nothing is written."""
-    if row == "fits no board" and shutil.which("avr-gcc") is None:
+    if row == "two_mass RHC+FPI --to arduino" and shutil.which("avr-gcc") is None:
         pytest.skip("no avr-gcc (packages gcc-avr and avr-libc)")
-    words, message = ROWS[row]
+    words = row.split()
     (tmp_path / "own.py").write_text(IPOPT)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     monkeypatch.chdir(tmp_path)
     for module in ("ziglang", "fmpy"):
         monkeypatch.setitem(__import__("sys").modules, module, None)
-    if row == "no compiler":
+    if "--check" in words:
         monkeypatch.setenv("FPIRHC_CC", "none")
     out = [] if "--out" in words else ["--out", "new"]
     code = main(["export", *words, *out, "--cycles", "1"])
     said = re.sub(r"\d+ bytes", "N bytes", capsys.readouterr().err)
-    assert said == f"fpirhc: {message}\n"
-    assert code == (3 if row == "folder not empty" else 2)
+    assert said == f"fpirhc: {ROWS[row]}\n"
+    assert code == (3 if "full" in words else 2)
     assert not (tmp_path / "new").exists()
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]

@@ -321,21 +321,20 @@ def test_a_review_says_whether_believed_states_become_right():
     assert texts["servo"].verdict in ("yes", "no")
 
 
+def shown(*measured: str, observer: StateObserver | None = None, **sensors: fp.Sensor) -> fp.Problem:
+    """The infusion where this is measured."""
+    return infusion(KALMAN, sensing=fp.Sensing(sensors, fp.VelocityDifference(), measured=measured, observer=observer))
+
+
 BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
     "unknown quantity": (
-        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["c1"], observer=KALMAN)),
+        lambda: shown("c1", observer=KALMAN),
         InvalidProblem,
         "measured: quantity 'c1'.*Did you mean 'C1'",
     ),
-    "nothing measured": (
-        lambda: infusion(
-            KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=[], observer=fp.ModelStates())
-        ),
-        InvalidProblem,
-        "name at least one quantity",
-    ),
+    "nothing measured": (lambda: shown(observer=fp.ModelStates()), InvalidProblem, "name at least one quantity"),
     "no observer": (
-        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["C1"])),
+        lambda: shown("C1"),
         InvalidProblem,
         "VelocityDifference also needs C2, C3, Ce; measure it, or state how it is believed",
     ),
@@ -355,23 +354,13 @@ BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         "noise: coordinate 'C22'.*Did you mean 'C2'",
     ),
     "sensor of a believed state": (
-        lambda: infusion(
-            KALMAN,
-            sensing=fp.Sensing(
-                {"C2": fp.Sensor(quantum=0.1)}, fp.VelocityDifference(), measured=["C1"], observer=fp.ModelStates()
-            ),
-        ),
+        lambda: shown("C1", observer=fp.ModelStates(), C2=fp.Sensor(quantum=0.1)),
         InvalidProblem,
         "'C2' is estimated by ModelStates, not measured; sensors are those of C1",
     ),
     "no noise": (lambda: fp.KalmanFilter(measured={"C1": 0.1}, noise={}), InvalidValue, "name at least one"),
     "response of the model": (
-        lambda: run(
-            infusion(
-                KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["Ce"], observer=fp.ModelStates())
-            ),
-            FPI,
-        ),
+        lambda: run(shown("Ce", observer=fp.ModelStates()), FPI),
         NotSupported,
         "the response that Affine compares needs C1, which no sensor shows.*nothing can be learned",
     ),
