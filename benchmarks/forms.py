@@ -133,10 +133,10 @@ def noisy(one: Task) -> Task | None:
         return None
     late = run.time >= one.problem.measure_from
     sizes = np.sqrt(np.mean(run["desired"][late] ** 2, axis=0))
-    names = one.problem.plant.controlled_indices
+    orders = one.problem.plant.response_orders
     sensors = {
-        one.problem.plant.names[k] + "'" * one.problem.plant.orders[k]: fp.Sensor(noise=fp.Noise(NOISE * float(size)))
-        for k, size in zip(names, sizes, strict=True)
+        name + "'" * orders[name]: fp.Sensor(noise=fp.Noise(NOISE * float(size)))
+        for name, size in zip(one.problem.plant.controlled_names, sizes, strict=True)
     }
     return replace(one, problem=replace(one.problem, sensing=fp.Sensing(sensors)))
 

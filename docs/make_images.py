@@ -10,7 +10,9 @@ from fpirhc.report.figures import headline_figure, save_figure
 
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
-ROW = re.compile(r"^\| (\w+) \| ([\d.]+) % \| ([\d.]+) ms \| [\d.]+ \| \S+ ([\d.]+) % \| ([\d.]+) \| ([\d.]+) \|$", re.MULTILINE)
+ROW = re.compile(
+    r"^\| (\w+) \| ([\d.]+) % \| ([\d.]+) ms \| [\d.]+ \| \S+ ([\d.]+) % \| ([\d.]+) \| ([\d.]+) \|$", re.MULTILINE
+)
 
 
 def main() -> None:
@@ -24,7 +26,9 @@ def main() -> None:
 
 def draw_price() -> None:
     """Draw tube and price of the certified plants over the period; a bound of first order is a line through zero."""
-    rows = [(plant, *map(float, numbers)) for plant, *numbers in ROW.findall((DOCS / "certificate.md").read_text("utf-8"))]
+    rows = [
+        (plant, *map(float, numbers)) for plant, *numbers in ROW.findall((DOCS / "certificate.md").read_text("utf-8"))
+    ]
     figure, (tube, price) = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
     for plant, mismatch in dict.fromkeys((row[0], row[1]) for row in rows):
         periods, widths, verified, certified = zip(*(row[2:] for row in rows if row[0] == plant), strict=True)

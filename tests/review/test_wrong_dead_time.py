@@ -274,3 +274,23 @@ def test_scenarios_draw_the_dead_time():
         assert (sharp is not None and sharp < 0.1) == (lateness[k] == 0)
     tuning = Bench(task, Conditions(seed=0, use=TUNING, percent=5.0, compiled=False))
     assert {tuning._scenario(k).problem.dead_time.inputs["u"] for k in range(8)} == {20 * PERIOD}
+
+
+def test_a_loop_that_grows_too_slowly_for_a_short_run_is_no_yes():
+    """Plans that are stiffer than the shipped ones swing at 66 cycles: a run of 2 s shows .043 m, and one of 12 s .072."""
+    task = fp.load_problem("delayed_mass")
+    problem = replace(task.problem, cost=fp.Quadratic(states={"q": 1e3, "q'": 1.0}, deviation={"Q": 9e-4}))
+    one = about(answers(problem, task.controllers["RHC+FPI"]), "wrong by a tenth")
+    assert one.verdict == "unknown"
+    assert one.evidence.startswith("longer: the rms error of q is 0.0402 m without adaptation, 0.043 m with it; ")
+    assert "; but 6 cycles off, the slowest mode is multiplied by 1.000" in one.evidence
+    assert one.numbers["radius"] == pytest.approx(1.00017, abs=4e-5)
+    assert (
+        one.change
+        == "Weigh the inputs more, lower the rate or the gain, or measure the dead time better than to a tenth."
+    )
+    late = replace(problem, dead_time=fp.DeadTime(inputs={"Q": 0.066}))
+    run = fp.simulate(late, task.controllers["RHC+FPI"], seed=0)
+    assert fp.measure(late, run).rms_error["q"] == pytest.approx(0.072, rel=0.02)
+    shipped = about(answers(task.problem, task.controllers["RHC+FPI"]), "wrong by a tenth")
+    assert shipped.verdict == "yes"

@@ -6,6 +6,8 @@ dead time is made longer and shorter by 1, 2, 5, ... cycles, for all inputs toge
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fpirhc.controllers.base import Controller
@@ -152,8 +154,13 @@ def pays_when_late(case: Case) -> Answer | None:
         return Answer(PAYS_LATE, Verdict.UNKNOWN, f"no run: {error}")
     text = "; ".join(f"{name}: {one.sentence}" for name, one in errors.items())
     numbers = {f"{name}_{which}": value for name, one in errors.items() for which, value in _numbers(one).items()}
+    cycles, radius = _a_tenth_later(case)
     if all(one.passes for one in errors.values()):
-        return Answer(PAYS_LATE, Verdict.YES, text, "", numbers)
+        if radius < 1:
+            return Answer(PAYS_LATE, Verdict.YES, text, "", numbers)
+        text += f"; but {cycles} cycles off, the slowest mode is multiplied by {radius:.6g} per cycle, which short runs hardly show"
+        change = "Weigh the inputs more, lower the rate or the gain, or measure the dead time better than to a tenth."
+        return Answer(PAYS_LATE, Verdict.UNKNOWN, text, change, {**numbers, "radius": radius})
     harmful = any(one.fails for one in errors.values()) and not case.controller.learns
     change = "Lower the gain or the rate of the loop, or measure the dead time better than to a tenth."
     change = SEE_CONVERGENCE if case.diverges else change
@@ -161,6 +168,15 @@ def pays_when_late(case: Case) -> Answer | None:
 
 
 _CHANGES = {"longer": _PERCENT, "shorter": -_PERCENT}
+
+
+def _a_tenth_later(case: Case) -> tuple[int, float]:
+    """A tenth of the longest dead time in whole cycles, and the largest |pole| that far off; zero where it is not known."""
+    longest = max(case.problem.dead_time.inputs.values(), default=0.0) + case.problem.dead_time.measurement
+    cycles = math.ceil(_PERCENT / 100 * longest / case.problem.period - 1e-9)
+    if not case.loops.loops or case.diverges or not cycles:
+        return cycles, 0.0
+    return cycles, max(_radius(case, *change) for change in _wrong(case.problem, cycles))
 
 
 def _errors(late: Problem, controller: Controller) -> ErrorPair:
