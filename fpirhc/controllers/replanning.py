@@ -5,7 +5,6 @@ Theory: docs/theory-questions.md.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,8 +14,8 @@ import numpy as np
 
 from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.reference_states import largest_response
-from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser
@@ -131,20 +130,12 @@ class FromPlan(Replanning):
         room: by name of an input, what plans leave of its range at both ends, for tracking and deformation; 0 where not named.
             A plan then depends on the plans before it alone, whatever the plant does, which a certificate needs. None: plans have
             the range less the deformation of the last cycle, so they depend on the plant.
-
-    Raises:
-        InvalidValue: a room that is negative or not finite.
     """
 
     tracking: Tracking
-    room: Mapping[str, float] | None = field(
+    room: Mapping[str, NotNegative] | None = field(
         default=None, kw_only=True, hash=False, metadata={"setting": "where given"}
     )
-
-    def __post_init__(self) -> None:
-        for name, room in (self.room or {}).items():
-            if not 0 <= room < math.inf:
-                raise InvalidValue(f"FromPlan(room={{{name!r}: {room!r}}}): expected a finite number of at least 0")
 
     @property
     def restarts(self) -> bool:

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
-from fpirhc.deformation.base import Deformation, require_numbers
+from fpirhc.deformation.base import Deformation
+from fpirhc.fields.kinds import NotZero
 from fpirhc.symbolic.layout import Expression
 
 
@@ -19,17 +20,11 @@ class Affine(Deformation):
     Args:
         gain: A_c, negative where the model has the sign of the plant's input effect right.
 
-    Raises:
-        InvalidValue: the gain is zero or not finite.
-
     References:
         H. Khan, J. K. Tar, I. J. Rudas, Robot. Autom. Eng. J. 3(5), 2018, DOI 10.19080/RAEJ.2018.03.555623.
     """
 
-    gain: float
-
-    def __post_init__(self) -> None:
-        require_numbers("Affine", {"gain": self.gain})
+    gain: NotZero
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

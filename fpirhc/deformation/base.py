@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 import casadi as ca
 
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked, former_members, replaced, unnamed_inner
-from fpirhc.fields.kinds import described, finite_number
+from fpirhc.fields.kinds import described
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout
 
@@ -283,24 +283,6 @@ def innermost(deformation: Deformation) -> Deformation:
 def smooth_norm(column: Expression, floor: float) -> Expression:
     """Return sqrt(|column|^2 + floor^2): the Euclidean norm, differentiable at zero and never zero."""
     return ca.sqrt(ca.sumsqr(column) + floor * floor)
-
-
-def require_numbers(owner: str, values: Mapping[str, float]) -> None:
-    """Check that every value is a finite number other than zero.
-
-    Raises:
-        InvalidValue: some value is zero or not finite; the message names every such value.
-    """
-    wrong = [f"{name}={value!r}" for name, value in values.items() if not _is_number(value) or value == 0]
-    if wrong:
-        raise InvalidValue(
-            f"{owner}({', '.join(wrong)}): expected finite numbers other than zero. "
-            "Zero would freeze the request; no adaptation is Identity()"
-        )
-
-
-def _is_number(value: object) -> bool:
-    return finite_number(value)
 
 
 def of_last_pair(deformation: Deformation) -> bool:

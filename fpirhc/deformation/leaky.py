@@ -49,7 +49,8 @@ def leaky_margin(product: float, pole: float) -> float:
         InvalidValue: a product outside (0, 2), a pole outside [0, 1).
     """
     _check_product("leaky_margin", product)
-    check_pole("leaky_margin", pole)
+    if not (finite_number(pole) and 0 <= pole < 1):
+        raise InvalidValue(f"leaky_margin(pole={pole!r}): expected a number from 0 (no leak) to below 1")
     return 2 * math.sqrt(pole / (product * (2 + product))) / (1 - pole)
 
 
@@ -71,12 +72,6 @@ def default_pole(product: float, uncertainty: float) -> float:
     least = _least_pole(product, uncertainty)
     factor, amount = _BEYOND
     return positive(uncertainty) * smaller(factor * least + amount, 0.5 * (1 + least))
-
-
-def check_pole(owner: str, pole: float) -> None:
-    """Raise InvalidValue where the pole is outside [0, 1)."""
-    if not (finite_number(pole) and 0 <= pole < 1):
-        raise InvalidValue(f"{owner}(pole={pole!r}): expected a number from 0 (no leak) to below 1")
 
 
 def check_longest(owner: str, longest: float | None, cycles: Cycles) -> None:

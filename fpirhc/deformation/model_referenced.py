@@ -12,9 +12,9 @@ from typing import Self
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, discrete
-from fpirhc.deformation.leaky import check_cycles, check_longest, check_pole, check_uncertainty, chosen_pole
+from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.fields.kinds import finite_number
+from fpirhc.fields.kinds import BelowOne, finite_number
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.functions import stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -45,7 +45,7 @@ class ModelReferenced(Wrapper):
     measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle
     lag: float | tuple[float, ...] | None = field(default=None, metadata={"of_problem": True})
     uncertainty: int | None = None
-    pole: float | None = None
+    pole: BelowOne | None = None
     longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
@@ -60,8 +60,6 @@ class ModelReferenced(Wrapper):
             )
         if self.uncertainty is not None and self.cycles is not None:  # else it is checked with the problem's dead times
             check_uncertainty("ModelReferenced", self.uncertainty, self._delays)
-        if self.pole is not None:
-            check_pole("ModelReferenced", self.pole)
 
     @property
     def mirror(self) -> Mirror:

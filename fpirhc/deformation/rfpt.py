@@ -12,8 +12,9 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Reach, require_numbers, smooth_norm
+from fpirhc.deformation.base import Deformation, Iteration, Reach, smooth_norm
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import NotZero
 from fpirhc.symbolic.layout import Expression
 
 _FLOOR = 1e-9  # A_c |h| below which the norm is rounded off, so that its derivatives exist at zero
@@ -23,16 +24,14 @@ _FLOOR = 1e-9  # A_c |h| below which the norm is rounded off, so that its deriva
 class _Transformation(Deformation):
     """What both have: the settings K_c, B_c and A_c, and the gains."""
 
-    offset: float
+    offset: NotZero
     sign: float
-    gain: float
+    gain: NotZero
 
     def __post_init__(self) -> None:
-        owner = type(self).__name__
-        require_numbers(owner, {"offset": self.offset, "gain": self.gain})
         if self.sign not in (-1, 1):
             raise InvalidValue(
-                f"{owner}(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
+                f"{type(self).__name__}(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
             )
 
     @property

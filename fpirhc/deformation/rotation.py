@@ -12,8 +12,8 @@ from typing import ClassVar, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Reach, require_numbers
-from fpirhc.errors import InvalidValue
+from fpirhc.deformation.base import Deformation, Iteration, Reach
+from fpirhc.fields.kinds import NotZero, Positive
 from fpirhc.symbolic.layout import Expression
 
 _FLOOR = 1e-18  # added to the squared chord between the unit vectors, so that its root has derivatives at zero
@@ -33,9 +33,6 @@ class Rotation(Deformation):
             usually at most 1.
         radius: R, the common norm; several times the largest request, response and desired response, in their units.
 
-    Raises:
-        InvalidValue: the fraction zero or not finite, or the radius not positive.
-
     References:
         B. Csanádi, P. Galambos, J. K. Tar, Gy. Györök, A. Serester, A novel, abstract rotation-based fixed point
         transformation in adaptive control, IEEE SMC 2018. The map here is in its spirit.
@@ -43,13 +40,8 @@ class Rotation(Deformation):
 
     gain_name: ClassVar[str] = "fraction"
 
-    fraction: float
-    radius: float
-
-    def __post_init__(self) -> None:
-        require_numbers("Rotation", {"fraction": self.fraction, "radius": self.radius})
-        if self.radius < 0:
-            raise InvalidValue(f"Rotation(radius={self.radius!r}): expected a positive number in units of the response")
+    fraction: NotZero
+    radius: Positive
 
     @property
     def iteration(self) -> Iteration:

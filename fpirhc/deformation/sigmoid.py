@@ -12,16 +12,19 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import Annotated, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, RequestChange, require_numbers, smooth_norm
+from fpirhc.deformation.base import Deformation, RequestChange, smooth_norm
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import NotZero, Positive, Range
 from fpirhc.symbolic.functions import atanh, signed, sqrt, tanh
 from fpirhc.symbolic.layout import Expression
 
-LARGEST_SHIFT = 5.0  # beyond it zeta'(x*) is below 2e-4: the map hardly moves and loses digits
+_SHIFTS = Range(
+    "a number from -5 to 5, such as 0.3", low=-5.0, high=5.0
+)  # beyond it zeta'(x*) is below 2e-4: the map hardly moves and loses digits
 _FLOOR = 1e-9  # |h| / S below which the norm is rounded off, so that its derivatives exist at zero
 _BISECTIONS = 60
 
@@ -39,9 +42,6 @@ class Sigmoid(Deformation):
             from 0.81 S to 0.29 S).
         scale: S, in units of the response; None leaves the choice to the controller.
 
-    Raises:
-        InvalidValue: the gain zero or not finite, the shift too large, or the scale not positive.
-
     References:
         A. Dineva, J. K. Tar, A. Várkonyi-Kóczy, V. Piuri, Generalization of a sigmoid generated fixed point
         transformation from SISO to MIMO systems, IEEE INES 2015.
@@ -49,18 +49,9 @@ class Sigmoid(Deformation):
         the last request as in the former.
     """
 
-    gain: float
-    shift: float = 0.3
-    scale: float | None = field(default=None, metadata={"automatic": True})
-
-    def __post_init__(self) -> None:
-        require_numbers("Sigmoid", {"gain": self.gain})
-        if not abs(self.shift) <= LARGEST_SHIFT:
-            raise InvalidValue(
-                f"Sigmoid(shift={self.shift!r}): expected at most {LARGEST_SHIFT:g} in size; 0.3 is usual"
-            )
-        if self.scale is not None and not (0 < self.scale < math.inf):
-            raise InvalidValue(f"Sigmoid(scale={self.scale!r}): expected a positive number in units of the response")
+    gain: NotZero
+    shift: Annotated[float, _SHIFTS] = 0.3
+    scale: Positive | None = field(default=None, metadata={"automatic": True})
 
     def with_scale(self, scale: float) -> Self:
         """Return the same map with scale S."""

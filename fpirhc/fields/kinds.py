@@ -90,6 +90,18 @@ class Range:
         return above and below
 
 
+class _NotZero(Range):
+    """A finite number other than zero."""
+
+    def holds(self, value: float) -> bool:
+        return math.isfinite(value) and value != 0
+
+
+def whole(low: int, high: int) -> Range:
+    """Return the range of a whole number."""
+    return Range(f"a whole number from {low} to {high}", low, high)
+
+
 class _JudgedByOwner(Range):
     """Any number, NaN among them: whoever holds it by name refuses what is not finite, with this name."""
 
@@ -100,6 +112,9 @@ class _JudgedByOwner(Range):
 
 JudgedByOwner: TypeAlias = Annotated[float, _JudgedByOwner("a finite number")]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
+NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
+NotZero: TypeAlias = Annotated[float, _NotZero("a finite number other than zero (no adaptation is Identity())")]
+BelowOne: TypeAlias = Annotated[float, Range("a number from 0 to below 1", low=0.0, high=1.0, open_high=True)]
 Deviation: TypeAlias = Annotated[  # its square is finite, and not zero
     float, Range("a positive number from 1e-100 to 1e100", low=1e-100, high=1e100)
 ]
@@ -109,8 +124,8 @@ Duration: TypeAlias = Annotated[
 Accuracy: TypeAlias = Annotated[
     float, Range("a number above 0 and below 1", low=0.0, high=1.0, open_low=True, open_high=True)
 ]
-Count: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000000", low=1, high=1e6)]
-Few: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000", low=1, high=1000)]
+Count: TypeAlias = Annotated[int, whole(1, 1_000_000)]
+Few: TypeAlias = Annotated[int, whole(1, 1000)]
 Seed: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]  # of random numbers
 CountOrZero: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]
 

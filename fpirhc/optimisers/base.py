@@ -13,7 +13,7 @@ from typing import ClassVar, Literal, cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
@@ -131,23 +131,6 @@ def built(optimiser: Optimiser, ocp: OptimalControl, form: Literal["step", "conv
     if key not in ocp.functions:
         ocp.functions[key] = getattr(optimiser, form)(ocp.opened())
     return ocp.functions[key]
-
-
-def require_settings(owner: str, iterations: int, tolerance: float) -> None:
-    """Check the settings of an iterative optimiser.
-
-    Args:
-        owner: name of the optimiser, for the message.
-        iterations: per call.
-        tolerance: of the stationarity.
-
-    Raises:
-        InvalidValue: fewer than one iteration, or a tolerance that is not positive.
-    """
-    if iterations < 1:
-        raise InvalidValue(f"{owner} needs at least 1 iteration, got {iterations}")
-    if not tolerance > 0:
-        raise InvalidValue(f"{owner} needs a positive tolerance, got {tolerance}")
 
 
 def stage_later(columns: ca.MX) -> ca.MX:

@@ -15,10 +15,10 @@ from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.fields.kinds import Count
+from fpirhc.fields.kinds import Count, NotNegative, Positive
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Optimiser, first_plan, require_settings, sane, stage_later
+from fpirhc.optimisers.base import Optimiser, first_plan, sane, stage_later
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
 from fpirhc.optimisers.plain import PlainSettings, plain_memory, plain_step, shifted_plain
@@ -48,23 +48,15 @@ class FixedPoint(Optimiser):
         most_iterations: of one call with limits of states in a loop. The call ends where the plan is solved, a remembered plan
             usually after a handful. A call that uses all of them is NOT_CONVERGED, and returns the better one of its plan and the
             plan in force.
-
-    Raises:
-        InvalidValue: fewer than one iteration, a tolerance that is not positive, or a negative damping.
     """
 
     iterations: Count
-    tolerance: float
+    tolerance: Positive
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
     hessian: HessianModel | None = None
-    damping: float = 0.0
+    damping: NotNegative = 0.0
     feasible: float = 1e-8
     most_iterations: Count = 100
-
-    def __post_init__(self) -> None:
-        require_settings("FixedPoint", self.iterations, self.tolerance)
-        if not 0 <= self.damping < float("inf"):
-            raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
 
     @property
     def in_data(self) -> tuple[str, ...]:

@@ -16,11 +16,11 @@ from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
-from fpirhc.fields.kinds import Count
+from fpirhc.fields.kinds import Count, Positive
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import Optimiser, judge, require_settings, sane, shift, status_of
+from fpirhc.optimisers.base import Optimiser, judge, sane, shift, status_of
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal
@@ -39,21 +39,15 @@ class FullSpaceFixedPoint(Optimiser):
         map: the deformation; None chooses the affine map with 0.95 of the gain 1/sigma_max(H)^2 along the reference.
         scaled: iterate on variables that make the rows of H of the same size (Ruiz), which helps by orders of magnitude.
         acceleration: Anderson(m), or None.
-
-    Raises:
-        InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
     cannot_keep = ("inputs",)
 
     iterations: Count
-    tolerance: float
+    tolerance: Positive
     map: Deformation | None = None
     scaled: bool = False
     acceleration: Anderson | None = None
-
-    def __post_init__(self) -> None:
-        require_settings("FullSpaceFixedPoint", self.iterations, self.tolerance)
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if anything is bounded, or the map's gain cannot contract.

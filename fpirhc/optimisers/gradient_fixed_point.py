@@ -15,11 +15,11 @@ from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
-from fpirhc.fields.kinds import Count
+from fpirhc.fields.kinds import Count, Positive
 from fpirhc.horizon.problem import OptimalControl, steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of
+from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, sane, shift, status_of
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal
@@ -36,20 +36,14 @@ class GradientFixedPoint(Optimiser):
         tolerance: of the stationarity, in the unit of the inputs.
         map: the deformation; None chooses the affine map with 0.95 of the gain 1/L, L the largest curvature along the reference.
         acceleration: Anderson(m), or None.
-
-    Raises:
-        InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
     cannot_keep = ("states",)
 
     iterations: Count
-    tolerance: float
+    tolerance: Positive
     map: Deformation | None = None
     acceleration: Anderson | None = None
-
-    def __post_init__(self) -> None:
-        require_settings("GradientFixedPoint", self.iterations, self.tolerance)
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if states are bounded, or the map's gain cannot contract.

@@ -15,7 +15,6 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Count, Positive
 from fpirhc.horizon.problem import OptimalControl
@@ -37,18 +36,11 @@ class MultipleShooting(Optimiser):
 
     Args:
         tolerance: of the stationarity, in the unit of the inputs, below which a plan is converged.
-
-    Raises:
-        InvalidValue: a tolerance that is not positive.
     """
 
     cannot_keep = ("prices",)
 
-    tolerance: float = 1e-3
-
-    def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise InvalidValue(f"{type(self).__name__} needs a positive tolerance, got {self.tolerance}")
+    tolerance: Positive = 1e-3
 
     @property
     @abstractmethod

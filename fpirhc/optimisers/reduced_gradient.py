@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.fields.kinds import Count
+from fpirhc.fields.kinds import Count, Positive
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
-from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of
+from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, sane, shift, status_of
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import TINY, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, scalar
@@ -31,18 +31,12 @@ class ReducedGradient(Optimiser):
     Args:
         iterations: per call.
         tolerance: of the stationarity, in the unit of the inputs, below which a plan is converged.
-
-    Raises:
-        InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
     cannot_keep = ("states",)
 
     iterations: Count
-    tolerance: float
-
-    def __post_init__(self) -> None:
-        require_settings("ReducedGradient", self.iterations, self.tolerance)
+    tolerance: Positive
 
     def memory(self, ocp: OptimalControl) -> Layout:
         plan = Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements))

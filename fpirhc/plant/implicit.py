@@ -13,7 +13,6 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Few
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
@@ -28,11 +27,6 @@ class _Implicit(Integrator):
 
     substeps: Few = 1
     newton: Few = 3
-
-    def __post_init__(self) -> None:
-        for what, value in (("sub-step", self.substeps), ("Newton step", self.newton)):
-            if value < 1:
-                raise InvalidValue(f"{type(self).__name__} needs at least 1 {what}, got {value}")
 
     @property
     @abstractmethod

@@ -12,10 +12,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
+from typing import Annotated
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import JudgedByOwner, finite_number, real_number
+from fpirhc.fields.kinds import JudgedByOwner, Range, finite_number, real_number
 
 
 @dataclass(frozen=True)
@@ -188,22 +189,18 @@ class Normal(Spread):
         return exact + share * _width(exact, self.absolute, self.relative) * _standard(probability)
 
 
+_FACTOR = Range("a number above 1, such as 1.3 for 30 %", 1.0, open_low=True, open_high=True)
+
+
 @dataclass(frozen=True)
 class LogNormal(Spread):
     """Log-normal around exact as its median, cut off at two standard deviations: the parameter keeps its sign.
 
     Args:
         factor: by which the parameter is larger or smaller at one standard deviation, above 1.
-
-    Raises:
-        InvalidValue: the factor is not above 1.
     """
 
-    factor: float
-
-    def __post_init__(self) -> None:
-        if not _is_number(self.factor) or not 1 < self.factor < math.inf:
-            raise InvalidValue(f"LogNormal(factor={self.factor!r}): expected a number above 1, such as 1.3 for 30 %")
+    factor: Annotated[float, _FACTOR]
 
     def quantile(self, exact: float, share: float, probability: float) -> float:
         """Return exact factor^(share z), z the quantile of the cut standard normal, turned round for a negative exact value."""

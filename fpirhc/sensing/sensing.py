@@ -7,16 +7,15 @@ Theory: docs/theory-estimation.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import real_number
+from fpirhc.fields.kinds import BelowOne, Positive
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, quantities, response_names
@@ -38,28 +37,11 @@ class Sensor(Checked):
             None: no noise.
         quantum: Q, the resolution (of an encoder, for example), in the quantity's unit; None: no quantisation.
         dropout: probability that a cycle's sample is lost.
-
-    Raises:
-        InvalidValue: noise that is not a Disturbance, a quantum that is not positive, a probability outside [0, 1).
     """
 
     noise: Disturbance | None = None
-    quantum: float | None = None
-    dropout: float = 0.0
-
-    def __post_init__(self) -> None:
-        wrong = []
-        if self.quantum is not None and not _within(self.quantum, 0.0, math.inf):
-            wrong.append(f"quantum={self.quantum!r}: expected a positive number in the unit of the quantity, or None")
-        if self.dropout != 0 and not _within(self.dropout, 0.0, 1.0):
-            wrong.append(f"dropout={self.dropout!r}: expected a probability from 0 to below 1")
-        if wrong:
-            raise InvalidValue(f"Sensor: {'; '.join(wrong)}")
-
-
-def _within(value: object, lower: float, upper: float) -> bool:
-    number = real_number(value)
-    return number is not None and lower < number < upper
+    quantum: Positive | None = None
+    dropout: BelowOne = 0.0
 
 
 _STREAM = 1  # separates the sensors' random series from the series of disturbances

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue
-from fpirhc.fields.kinds import finite_number
+from fpirhc.fields.kinds import Positive
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, known_by_positions, spline_weights
@@ -39,21 +38,12 @@ class StateVariableFilter(DerivativeEstimator):
     Args:
         bandwidth: w, rad/s.
 
-    Raises:
-        InvalidValue: a bandwidth that is not positive.
-
     References:
         P. C. Young, Process parameter estimation and self adaptive control, in Theory of Self-Adaptive Control Systems,
         Plenum 1966.
     """
 
-    bandwidth: float
-
-    def __post_init__(self) -> None:
-        if not (finite_number(self.bandwidth) and self.bandwidth > 0):
-            raise InvalidValue(
-                f"StateVariableFilter(bandwidth={self.bandwidth!r}): expected a positive number of rad/s"
-            )
+    bandwidth: Positive
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         return tuple(plant.chains)

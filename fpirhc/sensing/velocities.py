@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Range
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator
 from fpirhc.symbolic.block import GAP, Block, is_long, straightened
@@ -52,6 +53,11 @@ class VelocityDifference(DerivativeEstimator):
         return 1
 
 
+_TIME_CONSTANT = Range(
+    "a positive number of seconds (without a filter use VelocityDifference())", 0.0, open_low=True, open_high=True
+)
+
+
 @dataclass(frozen=True)
 class LowPassDifference(DerivativeEstimator):
     """The same difference through a first-order low-pass, which begins with the first difference.
@@ -61,19 +67,9 @@ class LowPassDifference(DerivativeEstimator):
 
     Args:
         time_constant: tau, s.
-
-    Raises:
-        InvalidValue: a time constant that is not positive.
     """
 
-    time_constant: float
-
-    def __post_init__(self) -> None:
-        if not (isinstance(self.time_constant, int | float) and 0 < self.time_constant < math.inf):
-            raise InvalidValue(
-                f"LowPassDifference(time_constant={self.time_constant!r}): expected a positive number of seconds; "
-                "without a filter use VelocityDifference()"
-            )
+    time_constant: Annotated[float, _TIME_CONSTANT]
 
     def pole(self, period: float) -> float:
         """Pole of the low-pass, exp(-T / tau)."""

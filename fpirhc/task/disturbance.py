@@ -11,12 +11,14 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import NotNegative, Range
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.symbolic.layout import Expression
 
@@ -134,18 +136,20 @@ class Noise(Disturbance):
 
     Args:
         deviation: standard deviation, in the unit of the disturbed signal.
-
-    Raises:
-        InvalidValue: a deviation that is negative or not finite.
     """
 
-    deviation: float
-
-    def __post_init__(self) -> None:
-        _check_deviation(self)
+    deviation: NotNegative
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
         return random.normal(0.0, self.deviation, times.shape)
+
+
+_CORRELATION = Range(
+    "a positive number of seconds (for noise without correlation use Noise(deviation=...))",
+    0.0,
+    open_low=True,
+    open_high=True,
+)
 
 
 @dataclass(frozen=True)
@@ -159,21 +163,10 @@ class ColouredNoise(Disturbance):
     Args:
         deviation: standard deviation, in the unit of the disturbed signal.
         correlation_time: s.
-
-    Raises:
-        InvalidValue: a deviation that is negative or not finite, a correlation time that is not positive.
     """
 
-    deviation: float
-    correlation_time: float
-
-    def __post_init__(self) -> None:
-        _check_deviation(self)
-        if not 0 < self.correlation_time < math.inf:
-            raise InvalidValue(
-                f"ColouredNoise(correlation_time={self.correlation_time!r}): expected a positive number of seconds; "
-                "for noise without correlation use Noise(deviation=...)"
-            )
+    deviation: NotNegative
+    correlation_time: Annotated[float, _CORRELATION]
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
         from scipy.signal import lfilter  # it takes longer to import than all the rest of a problem
@@ -226,10 +219,3 @@ class Formula(Disturbance):
             what = "a disturbance expression" + (f" is differentiated {order} times and" if order else "")
             raise InvalidValue(f"{what} is not finite at t = {where:g}")
         return samples
-
-
-def _check_deviation(noise: Noise | ColouredNoise) -> None:
-    if not 0 <= noise.deviation < math.inf:
-        raise InvalidValue(
-            f"{type(noise).__name__}(deviation={noise.deviation!r}): expected a finite number of at least 0"
-        )

@@ -8,11 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Positive, Range
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import GAP, Block, straightened
@@ -24,6 +26,15 @@ from fpirhc.tracking.base import ROOM, IntegralLaw, Useful, error_chains, law_si
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default
+
+
+_ORDERS = Range(
+    "a number between 0 and 2: below 1 decays without overshoot, and from 2 on the error does not decay",
+    0.0,
+    2.0,
+    open_low=True,
+    open_high=True,
+)
 
 
 @dataclass(frozen=True)
@@ -44,19 +55,12 @@ class Fractional(IntegralLaw):
         InvalidValue: a rate, order or memory outside its range; when the loop is built, a memory of more than 20 000 cycles.
     """
 
-    rate: float
-    order: float
+    rate: Positive
+    order: Annotated[float, _ORDERS]
     memory: float | None = field(default=None, metadata={"structure": True})
     largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.rate) and self.rate > 0):
-            raise InvalidValue(f"Fractional(rate={self.rate!r}): expected a positive number, 1/s")
-        if not 0 < self.order < 2:
-            raise InvalidValue(
-                f"Fractional(order={self.order!r}): expected a number between 0 and 2; below 1 decays without overshoot, "
-                "and from 2 on the error does not decay"
-            )
         if self.memory is not None and not 1 <= self.rate * self.memory < math.inf:
             raise InvalidValue(
                 f"Fractional(memory={self.memory!r}): expected at least 1 / rate = {1 / self.rate:.4g}; 20 / rate is usual"

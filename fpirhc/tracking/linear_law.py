@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.kinds import Duration
+from fpirhc.fields.kinds import Duration, Positive
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
@@ -123,19 +123,12 @@ class Exponential(LinearLaw):
         bumpless: whether the integral starts so that the first desired response is the nominal one.
         largest: response of every controlled coordinate beyond ten times of which an error is not integrated, and an integral does
             not grow or start a run; infinite for no bound. Empty: what the limits of the inputs allow.
-
-    Raises:
-        InvalidValue: a rate that is not positive.
     """
 
-    rate: float
+    rate: Positive
     integral: bool = True
     bumpless: bool = True
     largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.rate) and self.rate > 0):
-            raise InvalidValue(f"tracking rate must be positive (1/s), got {self.rate}")
 
     def gains(self, order: int) -> tuple[float, ...]:
         degree = order + 1 if self.integral else order

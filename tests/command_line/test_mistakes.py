@@ -69,7 +69,7 @@ too many cycles
     more than 1e+09 cycles ... shorten it
 comma behind a number
   gain=-0.2, scale -> gain=(-0.2,), scale
-    Sigmoid.gain: expected a number ... remove the comma
+    Sigmoid.gain: expected a finite number ... remove the comma
 stages with a point
   stages=4 -> stages=4.0
     Horizon.stages: expected a whole number ... write 4
@@ -90,7 +90,7 @@ numpy array of symbols
     must be one scalar expression, got an array of the shape (2,)
 symbol as a setting
   gain=-0.3 -> gain=ca.SX.sym("g")
-    Affine.gain: expected a number, got a CasADi symbol ... a setting is a number
+    Affine.gain: expected a finite number other than zero (no adaptation is Identity()), got a CasADi ... a setting is a number
 response that returns nothing
   return {"y" -> _ = {"y"
     response must return {name: expression}, got None ... return
@@ -307,5 +307,8 @@ def test_no_traceback_reaches_the_terminal(tmp_path):
     words = [sys.executable, "-m", "fpirhc", "run", str(tmp_path / "mine.py"), "CTC"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == ExitCode.BAD_INPUT
-    assert "Affine.gain: expected a number, got the text 'a'" in done.stderr
+    assert (
+        "Affine.gain: expected a finite number other than zero (no adaptation is Identity()), got the text 'a'"
+        in done.stderr
+    )
     assert "Traceback" not in done.stderr

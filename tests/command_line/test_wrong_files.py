@@ -308,7 +308,7 @@ OTHERS = {
             "line 31:",
             "no field 'n_horizon'",
             "line 36:",
-            "Sigmoid.gain: expected a number, got the text 'big'",
+            "Sigmoid.gain: expected a finite number other than zero (no adaptation is Identity()), got the text 'big'",
         ),
     ),
     "key that is not there": one(

@@ -483,8 +483,8 @@ def test_what_does_not_fit_is_refused_before_the_run(why):
     [
         (lambda: fp.Projection(2.0), "between 0 and 2"),
         (lambda: fp.Projection(0.5, dead_zone=-1.0), "at least 0"),
-        (lambda: fp.LyapunovRule({"m": 0.0}), "positive"),
-        (lambda: fp.rivals.SlotineLi(0.0, {"q": 1.0}, GENTLE, BOX), "'rate'"),
+        (lambda: fp.LyapunovRule({"m": 0.0}), "finite number above 0"),
+        (lambda: fp.rivals.SlotineLi(0.0, {"q": 1.0}, GENTLE, BOX), "SlotineLi.rate"),
     ],
 )
 def test_settings_out_of_range_are_refused(build, reason):

@@ -229,7 +229,7 @@ def test_what_does_not_fit_is_refused(rival, message):
 
 
 def test_settings_are_checked():
-    with pytest.raises(FpirhcError, match=r"smoothing=0\.4"):
+    with pytest.raises(FpirhcError, match=r"smoothing: expected a number from 0 to 0.25, got 0.4"):
         fp.rivals.RepetitiveControl(TRACK, repeats=1.0, smoothing=0.4)
     with pytest.raises(FpirhcError, match="above 0"):
         fp.rivals.ADRC(6.0, observer=-1.0)

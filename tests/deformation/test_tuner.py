@@ -57,7 +57,7 @@ def test_expected_sign_refuses_what_does_not_converge(settings):
 @pytest.mark.parametrize("target", [0.0, 2.0, float("nan")])
 def test_tuner_refuses_a_target_that_does_not_converge(target):
     """At a product of 2 the iteration oscillates for ever."""
-    with pytest.raises(InvalidValue, match=r"is usual|expected a number, got nan"):
+    with pytest.raises(InvalidValue, match="expected a product of gain and plant between 0 and 2"):
         fp.Tuned(fp.Affine(gain=-0.5), largest_gain=0.8, target=target)
 
 

@@ -287,8 +287,11 @@ def test_a_disturbed_plant():
             r"noise\['y'\]: expected a positive number.*got -1\.0",
         ),
         (lambda: fp.RecursiveLeastSquares(SPRING, NOISE, 0.0), "number of seconds"),
-        (lambda: fp.MovingHorizon(SPRING, NOISE, 0, 1.0), "window=0"),
-        (lambda: fp.MovingHorizon(SPRING, NOISE, 5, 1.0, iterations=0), "iterations=0"),
+        (lambda: fp.MovingHorizon(SPRING, NOISE, 0, 1.0), "window: expected a whole number from 1 to 2000"),
+        (
+            lambda: fp.MovingHorizon(SPRING, NOISE, 5, 1.0, iterations=0),
+            "iterations: expected a whole number from 1 to 20",
+        ),
         (lambda: fp.MovingHorizon({}, NOISE, 5, 1.0), "at least one parameter"),
         (lambda: fp.DisturbanceKalman({}, {"y": 1.0}), "drift"),
         (

@@ -67,7 +67,7 @@ def test_state_limits_are_refused_by_the_reduced_gradient():
 def test_settings_are_checked():
     with pytest.raises(InvalidValue, match=r"ReducedGradient.iterations: expected a whole number from 1"):
         fp.ReducedGradient(iterations=0, tolerance=1e-3)
-    with pytest.raises(InvalidValue, match="positive tolerance"):
+    with pytest.raises(InvalidValue, match=r"Ipopt.tolerance: expected a finite number above 0"):
         fp.Ipopt(tolerance=0.0)
 
 

@@ -281,8 +281,8 @@ def turning(**changes: Any) -> StateObserver:
 
 SPEED = fp.MovingHorizonStates(measured={"y'": 0.1}, noise={"y": 0.5}, window=4)
 WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
-    "window": (lambda: turning(window=0), InvalidValue, r"window=0\): expected a whole number from 1 to 500"),
-    "iterations": (lambda: turning(iterations=51), InvalidValue, r"iterations=51\): expected a whole number from 1 to 50"),
+    "window": (lambda: turning(window=0), InvalidValue, r"window: expected a whole number from 1 to 500"),
+    "iterations": (lambda: turning(iterations=51), InvalidValue, r"iterations: expected a whole number from 1 to 50"),
     "nothing measured": (lambda: turning(measured={}), InvalidValue, r"MovingHorizonStates\(measured={}\): name at least one"),
     "bounds": (lambda: turning(bounds={"angle": (1.0, -1.0)}), InvalidValue, r"are \(1.0, -1.0\); write lower < upper"),
     "name": (lambda: swing(turning(bounds={"angel": (-1.0, 1.0)})), InvalidProblem, "bounds: state 'angel' is unknown"),

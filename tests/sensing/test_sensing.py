@@ -382,17 +382,20 @@ def test_all_mistakes_of_sensing_are_told_at_once():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: fp.Noise(-1.0), "Noise.*deviation=-1.0.*at least 0"),
-        (lambda: fp.Noise(math.nan), "Noise.deviation: expected a number, got nan"),
-        (lambda: fp.ColouredNoise(math.inf, 1.0), "ColouredNoise.*deviation=inf"),
-        (lambda: fp.ColouredNoise(1.0, 0.0), "correlation_time=0.0.*positive"),
+        (lambda: fp.Noise(-1.0), "Noise.deviation: expected a finite number of at least 0"),
+        (lambda: fp.Noise(math.nan), "Noise.deviation: expected a finite number.*got nan"),
+        (lambda: fp.ColouredNoise(math.inf, 1.0), "ColouredNoise.deviation: .*got inf"),
+        (lambda: fp.ColouredNoise(1.0, 0.0), "correlation_time: expected a positive number.*got 0.0"),
         (
             lambda: fp.Sensor(noise=0.1),  # type: ignore[arg-type]  # a number is refused
             "Sensor.noise: expected a Disturbance or None, got 0.1",
         ),
-        (lambda: fp.Sensor(quantum=0.0), "quantum=0.0: expected a positive number"),
-        (lambda: fp.Sensor(quantum=-1.0, dropout=1.0), "quantum=-1.0.*dropout=1.0: expected a probability"),
-        (lambda: fp.Sensor(dropout=math.nan), "Sensor.dropout: expected a number, got nan"),
+        (lambda: fp.Sensor(quantum=0.0), "Sensor.quantum: expected a finite number above 0"),
+        (
+            lambda: fp.Sensor(quantum=-1.0, dropout=1.0),
+            r"(?s)quantum: .*got -1.0.*dropout: expected a number from 0 to below 1",
+        ),
+        (lambda: fp.Sensor(dropout=math.nan), "Sensor.dropout: expected a number from 0.*got nan"),
         (lambda: fp.SavitzkyGolay(window=10, degree=2), "odd window.*use 9 or 11"),
         (lambda: fp.SavitzkyGolay(window=3, degree=3), "more samples than the degree.*at least 5"),
         (
@@ -400,8 +403,8 @@ def test_all_mistakes_of_sensing_are_told_at_once():
             "window: expected a whole number, got 5.0; write 5",
         ),
         (lambda: fp.LowPassDifference(time_constant=0.0), r"positive number of seconds.*VelocityDifference\(\)"),
-        (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=1.0), "pole=1.0.*below 1"),
-        (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=math.nan), "Filtered.pole: expected a number, got nan"),
+        (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=1.0), "pole: expected a number from 0 to below 1, got 1.0"),
+        (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=math.nan), "Filtered.pole: expected a number from 0.*got nan"),
     ],
 )
 def test_wrong_values_are_refused(make, message):

@@ -5,14 +5,13 @@ Theory: docs/theory-rivals.md.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
 from fpirhc.controllers.contract import Undeformed
-from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
@@ -31,22 +30,11 @@ class AccelerationFeedback(Undeformed):
         tracking: the law that gives the desired response.
         gain: kappa, dimensionless.
         time_constant: of the low-pass on the response error, s; 0: no low-pass.
-
-    Raises:
-        InvalidValue: a gain that is not positive, or a negative time constant.
     """
 
     tracking: Tracking
-    gain: float
-    time_constant: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.gain) and self.gain > 0):
-            raise InvalidValue(f"AccelerationFeedback(gain={self.gain!r}): expected a positive number")
-        if not 0 <= self.time_constant < math.inf:
-            raise InvalidValue(
-                f"AccelerationFeedback(time_constant={self.time_constant!r}): expected 0 or more seconds"
-            )
+    gain: Positive
+    time_constant: NotNegative = 0.0
 
     def pole(self, period: float) -> float:
         """Return the pole p of the low-pass for control cycles of that period, s."""

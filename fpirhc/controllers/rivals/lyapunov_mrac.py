@@ -5,7 +5,6 @@ Theory: docs/theory-rivals.md.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import casadi as ca
@@ -15,7 +14,8 @@ from scipy.linalg import solve_continuous_lyapunov
 from fpirhc.controllers.base import commanding_blocks, like, reference_block
 from fpirhc.controllers.contract import Undeformed, check_derivatives
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
-from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.errors import Mistakes
+from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
@@ -35,21 +35,11 @@ class LyapunovMRAC(Undeformed):
         rate: of the reference model, 1/s.
         adaptation: gamma, in units of the input times s^(2n-1) per squared unit of the coordinate.
         leakage: rate with which the gains return to those of the model, 1/s.
-
-    Raises:
-        InvalidValue: a rate or adaptation that is not positive, a negative leakage.
     """
 
-    rate: float
-    adaptation: float
-    leakage: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, value in (("rate", self.rate), ("adaptation", self.adaptation)):
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidValue(f"LyapunovMRAC({name}={value!r}): expected a positive number")
-        if not 0 <= self.leakage < math.inf:
-            raise InvalidValue(f"LyapunovMRAC(leakage={self.leakage!r}): expected 0 or more, 1/s")
+    rate: Positive
+    adaptation: Positive
+    leakage: NotNegative = 0.0
 
     @property
     def learns(self) -> bool:

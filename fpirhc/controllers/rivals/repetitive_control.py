@@ -6,13 +6,14 @@ Theory: docs/theory-rivals.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
 from fpirhc.controllers.contract import Undeformed
-from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.fields.kinds import Duration, Positive
+from fpirhc.errors import InvalidProblem
+from fpirhc.fields.kinds import Duration, Positive, Range
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
@@ -32,19 +33,12 @@ class RepetitiveControl(Undeformed):
         repeats: the period of the task, in its unit of time; a whole number of control cycles.
         gain: gamma; below 2 over the largest plant gain per model gain.
         smoothing: b of Q, from 0 to 1/4; above 0 what only changes from cycle to cycle is forgotten.
-
-    Raises:
-        InvalidValue: a smoothing outside its range.
     """
 
     tracking: Tracking
     repeats: Duration = field(metadata={"structure": True})
     gain: Positive = 0.5
-    smoothing: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.smoothing <= 0.25:
-            raise InvalidValue(f"RepetitiveControl(smoothing={self.smoothing!r}): expected a number from 0 to 0.25")
+    smoothing: Annotated[float, Range("a number from 0 to 0.25", low=0.0, high=0.25)] = 0.0
 
     def cycles(self, problem: Problem) -> int:
         """Return N.

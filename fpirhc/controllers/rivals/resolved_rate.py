@@ -5,7 +5,6 @@ Theory: docs/theory-rivals.md.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import casadi as ca
@@ -14,7 +13,7 @@ from fpirhc.controllers.base import commanding_blocks, invert_block, like, refer
 from fpirhc.controllers.contract import Undeformed, check_derivatives
 from fpirhc.controllers.reference_states import motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.reference_model import decay_gains
-from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.motion import controlled_places, time_signal
 from fpirhc.symbolic.block import Block, Delay
@@ -32,16 +31,9 @@ class ResolvedAccelerationRate(Undeformed):
 
     Args:
         rate: Lambda, 1/s.
-
-    Raises:
-        InvalidValue: rate not positive.
     """
 
-    rate: float
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.rate) and self.rate > 0):
-            raise InvalidValue(f"ResolvedAccelerationRate(rate={self.rate!r}): expected a positive number, 1/s")
+    rate: Positive
 
     def gains(self, degree: int) -> tuple[float, ...]:
         """Return the coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""

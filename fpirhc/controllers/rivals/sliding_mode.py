@@ -13,7 +13,8 @@ import casadi as ca
 from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import decay_gains
-from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.errors import Mistakes
+from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
@@ -33,20 +34,11 @@ class SlidingMode(Undeformed):
         rate: Lambda, decay of the error on S = 0, 1/s.
         gain: K, above the largest response error of the model, in units of the response (m/s^2 for n = 2).
         width: w, boundary layer, in units of the response times s (m/s for n = 2); K period / w must stay below 2.
-
-    Raises:
-        InvalidValue: a setting that is not a positive number.
     """
 
-    rate: float
-    gain: float
-    width: float
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "gain", "width"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidValue(f"SlidingMode({name}={value!r}): expected a positive number")
+    rate: Positive
+    gain: Positive
+    width: Positive
 
     def check(self, problem: Problem) -> None:
         """Raise if the loop chatters even with an exact model.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -12,6 +11,7 @@ from fpirhc.controllers.base import Controller, closing_blocks, fed, like, refer
 from fpirhc.controllers.rivals.learned_parameters import Learning, learning_delays
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Positive
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.motion import derivative_unit, places
@@ -47,24 +47,16 @@ class SlotineLi(Controller):
         combinations: expressions of parameters that enter linearly as a whole, by name.
         deformation: the map between desired response and request; Identity() is no deformation.
 
-    Raises:
-        InvalidValue: rate or damping not positive.
-
     References:
         J.-J. E. Slotine, W. Li, On the adaptive control of robot manipulators, Int. J. Robotics Research 6(3), 1987.
     """
 
-    rate: float
-    damping: Mapping[str, float]
+    rate: Positive
+    damping: Mapping[str, Positive]
     rule: Rule
     bounds: Mapping[str, tuple[float, float]]
     combinations: Mapping[str, Combination] = field(default_factory=dict)
     deformation: Deformation = field(default_factory=Identity)
-
-    def __post_init__(self) -> None:
-        for name, value in {"rate": self.rate, **self.damping}.items():
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidValue(f"SlotineLi: '{name}' is {value!r}; expected a positive number")
 
     @property
     def learns(self) -> bool:

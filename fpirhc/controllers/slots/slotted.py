@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
@@ -21,7 +22,8 @@ from fpirhc.controllers.slots.schedules import Schedule, linear_modes
 from fpirhc.controllers.slots.slot import Channel, First, Slot, channel, delays_for_channel, for_channel
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import settled
-from fpirhc.errors import FpirhcError, InvalidValue, Mistakes, NotContractive
+from fpirhc.errors import FpirhcError, Mistakes, NotContractive
+from fpirhc.fields.kinds import Accuracy, CountOrZero, NotNegative, Range
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
@@ -48,9 +50,6 @@ class Slotted(Controller):
         smallest_gain: share of its size at the start that |beta| must keep; below it the command is held (signal `slot_held`).
         largest_growth: by how much a diverging zero dynamics may grow within one slot.
 
-    Raises:
-        InvalidValue: a number out of range.
-
     References:
         J. K. Tar, J. F. Bito, I. J. Rudas, Contradiction resolution in the adaptive control of underactuated mechanical systems
         evading the framework of optimal controllers, Acta Polytechnica Hungarica 13(1), 2016, for the idea; the switching is
@@ -59,20 +58,10 @@ class Slotted(Controller):
 
     slots: Sequence[Slot]
     schedule: Schedule
-    blend: float
-    blank: int = 0
-    smallest_gain: float = 0.05
-    largest_growth: float = 100.0
-
-    def __post_init__(self) -> None:
-        if not (isinstance(self.blend, int | float) and math.isfinite(self.blend) and self.blend >= 0):
-            raise InvalidValue(f"Slotted(blend={self.blend!r}): expected a number of seconds of at least 0")
-        if not (isinstance(self.blank, int) and self.blank >= 0):
-            raise InvalidValue(f"Slotted(blank={self.blank!r}): expected a whole number of cycles of at least 0")
-        if not (isinstance(self.smallest_gain, int | float) and 0 < self.smallest_gain < 1):
-            raise InvalidValue(f"Slotted(smallest_gain={self.smallest_gain!r}): expected a share between 0 and 1")
-        if not (isinstance(self.largest_growth, int | float) and self.largest_growth > 1):
-            raise InvalidValue(f"Slotted(largest_growth={self.largest_growth!r}): expected a factor above 1")
+    blend: NotNegative
+    blank: CountOrZero = 0
+    smallest_gain: Accuracy = 0.05
+    largest_growth: Annotated[float, Range("a factor above 1", low=1.0, open_low=True)] = 100.0
 
     @property
     def deformation(self) -> Deformation:

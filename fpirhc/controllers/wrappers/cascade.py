@@ -21,6 +21,7 @@ from fpirhc.deformation.base import Deformation, RequestChange, automatic
 from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.maps import growth_of
@@ -146,21 +147,10 @@ class ThroughModel(Checked):
             controlled coordinate, 0 settles within a cycle. None: the slowest one of the model at the start, with the command held;
             0 for outputs of order 0, which the model moves at once.
         dead_time: from a target to its measured output; None: that of the problem, for the slowest input.
-
-    Raises:
-        InvalidValue: a negative or infinite time.
     """
 
-    lag: float | tuple[float, ...] | None = field(default=None, metadata={"structure": True})
-    dead_time: float | None = field(default=None, metadata={"structure": True})
-
-    def __post_init__(self) -> None:
-        times = [
-            *(every(self.lag) if self.lag is not None else ()),
-            *([] if self.dead_time is None else [self.dead_time]),
-        ]
-        if not all(math.isfinite(t) and t >= 0 for t in times):
-            raise InvalidValue(f"{self!r}: expected finite times of at least 0")
+    lag: NotNegative | tuple[NotNegative, ...] | None = field(default=None, metadata={"structure": True})
+    dead_time: NotNegative | None = field(default=None, metadata={"structure": True})
 
     def stated(self, problem: Problem) -> ThroughModel:
         """Return the pairing with the lag as a number; one that cannot be known stays open, for `decays` to refuse."""

@@ -22,6 +22,7 @@ from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import with_inner
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.chain import derivatives_function, measured_signals
 from fpirhc.plant.integrators import one_step
@@ -79,18 +80,9 @@ class ByModel(Predictor):
     Args:
         residual_time: time constant of the low-pass on the residual of the responses that is added, s; None: no residual. The loop
             of the residual has a limit of its own: it is stable at moderate rate x dead time (0.4) and unstable at long dead times.
-
-    Raises:
-        InvalidValue: a time constant that is not positive.
     """
 
-    residual_time: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.residual_time is not None and not 0 < self.residual_time < np.inf:
-            raise InvalidValue(
-                f"ByModel(residual_time={self.residual_time!r}): expected a positive number of seconds or None"
-            )
+    residual_time: Positive | None = None
 
     def others(self, late: float) -> tuple[Predictor, ...]:
         return (ByModel(residual_time=late), ByDesired()) if late and self.residual_time is None else ()
@@ -169,8 +161,8 @@ class Predicted(ControllerWrapper):
         InvalidValue: a dead time that is negative or not finite; a longest one that is shorter than their sum.
     """
 
-    inputs: float
-    measurement: float = 0.0
+    inputs: NotNegative
+    measurement: NotNegative = 0.0
     by: Predictor = field(default_factory=ByModel)
     longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
@@ -179,9 +171,6 @@ class Predicted(ControllerWrapper):
             raise InvalidValue(
                 f"Predicted(longest={self.longest!r}): expected at least {self.inputs + self.measurement:g} s, the dead time"
             )
-        for name, value in (("inputs", self.inputs), ("measurement", self.measurement)):
-            if not (np.isfinite(value) and value >= 0):
-                raise InvalidValue(f"Predicted({name}={value!r}): expected a number of seconds of at least 0")
 
     @property
     def feeds(self) -> Mapping[str, str]:

@@ -14,8 +14,9 @@ from typing import NamedTuple, Self
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, discrete
-from fpirhc.deformation.leaky import check_cycles, check_longest, check_pole, check_uncertainty, chosen_pole
+from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.functions import largest, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.queue import MOST, Cycles, Queue, every, room, several
@@ -167,15 +168,13 @@ class Increment(_Queued):
     """
 
     uncertainty: int | None = None
-    pole: float | None = None
+    pole: BelowOne | None = None
 
     def __post_init__(self) -> None:
         check_cycles("Increment", self.cycles)
         check_longest("Increment", self.longest, self.cycles)
         if self.uncertainty is not None:
             check_uncertainty("Increment", self.uncertainty, self.cycles)
-        if self.pole is not None:
-            check_pole("Increment", self.pole)
 
     @classmethod
     def within(cls, map: Deformation, most: float) -> Increment:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from fpirhc.deformation.base import Deformation, Iteration, Wrapper, discrete
-from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 
@@ -22,18 +22,9 @@ class Filtered(Wrapper):
     Args:
         map: any deformation that iterates.
         pole: p of the filter, from 0 (none) to below 1; exp(-period / time constant).
-
-    Raises:
-        InvalidValue: a pole outside [0, 1).
     """
 
-    pole: float
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.pole < 1:
-            raise InvalidValue(
-                f"Filtered(pole={self.pole!r}): expected a number from 0 to below 1; exp(-period / time constant) is one"
-            )
+    pole: BelowOne
 
     @property
     def iteration(self) -> Iteration:

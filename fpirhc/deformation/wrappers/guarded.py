@@ -13,7 +13,7 @@ from typing import ClassVar
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Wrapper, discrete, forget, smooth_norm, start_of_map
-from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Positive
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import nominal
@@ -34,18 +34,11 @@ class Guarded(Wrapper):
     Args:
         map: any deformation that iterates.
         largest_deformation: |r - d| beyond which the iteration has left its basin, in units of the response.
-
-    Raises:
-        InvalidValue: a limit that is not positive.
     """
 
     passes_pair: ClassVar[bool] = True
 
-    largest_deformation: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.largest_deformation < math.inf:
-            raise InvalidValue(f"Guarded(largest_deformation={self.largest_deformation!r}): expected a positive number")
+    largest_deformation: Positive
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         numbers = ("sign", "oscillating", "growing", "fast", "slow", "pause", "trips", "clean", "event", "fallback")

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, discrete
-from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Accuracy, whole
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -30,15 +31,9 @@ class DelayWatched(Wrapper):
     Args:
         map: any deformation.
         most: longest dead time that is searched, cycles.
-
-    Raises:
-        InvalidValue: a longest dead time outside 1 .. 200.
     """
 
-    most: int
-
-    def __post_init__(self) -> None:
-        _check_most(type(self).__name__, self.most)
+    most: Annotated[int, whole(1, _MOST)]
 
     @property
     def iteration(self) -> Iteration:
@@ -69,18 +64,10 @@ class SelfPaired(Wrapper):
         map: any deformation that iterates.
         most: longest dead time that is searched, cycles.
         confidence: least confidence of an estimate that is used, in (0, 1).
-
-    Raises:
-        InvalidValue: a longest dead time outside 1 .. 200, a confidence outside (0, 1).
     """
 
-    most: int
-    confidence: float = 0.6
-
-    def __post_init__(self) -> None:
-        _check_most(type(self).__name__, self.most)
-        if not 0 < self.confidence < 1:
-            raise InvalidValue(f"SelfPaired(confidence={self.confidence!r}): expected a share between 0 and 1")
+    most: Annotated[int, whole(1, _MOST)]
+    confidence: Accuracy = 0.6
 
     @property
     def iteration(self) -> Iteration:
@@ -134,11 +121,6 @@ class SelfPaired(Wrapper):
         candidate = ca.if_else(ca.logic_or(same, ca.logic_not(trusted)), memory["pair_candidate"], newest)
         adopt = ca.logic_and(trusted, stood > _PATIENCE)
         return stood, candidate, ca.if_else(adopt, newest, memory["pair_cycles"])
-
-
-def _check_most(owner: str, most: int) -> None:
-    if not 1 <= most <= _MOST:
-        raise InvalidValue(f"{owner}(most={most!r}): expected a longest dead time between 1 and {_MOST} cycles")
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:

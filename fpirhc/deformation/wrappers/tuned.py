@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Annotated, Self
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Wrapper, discrete, growing_in_a_row, returning_in_a_row
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Range
 from fpirhc.symbolic.functions import asin, larger, power, sqrt
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -22,6 +23,9 @@ _GROWING, _RETURNING = 5, 8  # in a row
 _FAST, _SLOW = 1.5, 1 / 3  # an error that grew by less than the one counts the other
 _RECOVERY = 1.0  # target below the map's own gain: the product of a deadbeat iteration
 _SMALLEST = 1e-3  # smallest factor that oscillation may lead to
+
+
+_PRODUCTS = Range("a product of gain and plant between 0 and 2, such as 0.5", 0.0, 2.0, open_low=True, open_high=True)
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class Tuned(Wrapper):
     """
 
     largest_gain: float
-    target: float = 0.5
+    target: Annotated[float, _PRODUCTS] = 0.5
 
     def __post_init__(self) -> None:
         gain = self.map.effective_gain()
@@ -47,10 +51,6 @@ class Tuned(Wrapper):
             raise InvalidValue(
                 f"Tuned(largest_gain={self.largest_gain!r}): expected a bound beyond the map's own effective gain {gain:.4g}; "
                 "assess_gain(...).sector_limit gives one. Without a bound a tuner raises the gain until the loop oscillates"
-            )
-        if not 0 < self.target < 2:
-            raise InvalidValue(
-                f"Tuned(target={self.target!r}): expected a product of gain and plant between 0 and 2; 0.5 is usual"
             )
 
     def memory(self, elements: tuple[str, ...]) -> Layout:

@@ -11,13 +11,14 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Deviation
+from fpirhc.fields.kinds import Deviation, Range
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Layout
 from fpirhc.symbolic.live import Following
@@ -118,6 +119,9 @@ class Uncertain(Checked):
             raise InvalidValue(f"Uncertain(lower={self.lower!r}, upper={self.upper!r}): expected finite lower < upper")
 
 
+Memory: TypeAlias = Annotated[float, Range("a positive number of seconds, or math.inf", 0.0, open_low=True)]
+
+
 @dataclass(frozen=True, eq=False)
 class Learner(ParameterEstimator):
     """What learners of parameters share: the priors, and the noise of the responses.
@@ -129,6 +133,10 @@ class Learner(ParameterEstimator):
 
     parameters: Mapping[str, Uncertain]
     noise: Mapping[str, Deviation]
+
+    def __post_init__(self) -> None:
+        if not self.parameters:
+            raise InvalidValue(f"{type(self).__name__}(parameters={{}}): name at least one parameter to learn")
 
     def learned(self) -> tuple[str, ...]:
         return tuple(self.parameters)
@@ -144,14 +152,6 @@ class Learner(ParameterEstimator):
     def residual(self, plant: Plant) -> ca.Function:
         """Return the Function of `residual_function` in units of the noise."""
         return residual_function(plant, self.parameters, [self.noise[c] for c in plant.controlled_names])
-
-    def _require(self, time: float) -> None:
-        """Raise unless there is a parameter to learn, and the time constant is positive."""
-        owner = type(self).__name__
-        if not self.parameters:
-            raise InvalidValue(f"{owner}(parameters={{}}): name at least one parameter to learn")
-        if not time > 0:
-            raise InvalidValue(f"{owner}(time={time!r}): expected a positive number of seconds, or math.inf")
 
 
 def _check_names(owner: str, plant: Plant, parameters: Mapping[str, Uncertain], noise: Mapping[str, float]) -> None:

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import whole
 from fpirhc.learning.estimators.base import (
     Correct,
     Learner,
+    Memory,
     Seen,
     Uncertain,
     between,
@@ -42,18 +44,12 @@ class MovingHorizon(Learner):
         iterations: Gauss-Newton steps per cycle.
 
     Raises:
-        InvalidValue: no parameter; a noise or time that is not positive; a window or iterations outside their range.
+        InvalidValue: no parameter.
     """
 
-    window: int
-    time: float
-    iterations: int = 1
-
-    def __post_init__(self) -> None:
-        self._require(self.time)
-        for name, value, most in (("window", self.window, MOST), ("iterations", self.iterations, 20)):
-            if not isinstance(value, int) or not 1 <= value <= most:
-                raise InvalidValue(f"MovingHorizon({name}={value!r}): expected a whole number from 1 to {most}")
+    window: Annotated[int, whole(1, MOST)]
+    time: Memory
+    iterations: Annotated[int, whole(1, 20)] = 1
 
     def memory(self, problem: Problem) -> Layout:
         size, names = len(self.parameters), self.learned()

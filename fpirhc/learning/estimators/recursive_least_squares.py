@@ -16,6 +16,7 @@ import numpy as np
 from fpirhc.learning.estimators.base import (
     Correct,
     Learner,
+    Memory,
     Seen,
     Uncertain,
     between,
@@ -37,13 +38,10 @@ class RecursiveLeastSquares(Learner):
         time: time constant of forgetting, s; math.inf: no pair is forgotten.
 
     Raises:
-        InvalidValue: no parameter, or a noise or time that is not positive.
+        InvalidValue: no parameter.
     """
 
-    time: float
-
-    def __post_init__(self) -> None:
-        self._require(self.time)
+    time: Memory
 
     def memory(self, problem: Problem) -> Layout:  # noqa: ARG002
         size = len(self.parameters)

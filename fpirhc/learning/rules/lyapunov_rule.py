@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Positive
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression
@@ -22,17 +22,9 @@ class LyapunovRule(Rule):
 
     Args:
         gains: diagonal of Gamma by parameter, squared unit of the parameter per unit of w^T G p and second.
-
-    Raises:
-        InvalidValue: a gain that is not positive; when the loop is built, gains and bounds of different parameters.
     """
 
-    gains: Mapping[str, float]
-
-    def __post_init__(self) -> None:
-        for name, gain in self.gains.items():
-            if not (math.isfinite(gain) and gain > 0):
-                raise InvalidValue(f"LyapunovRule(gains={{'{name}': {gain!r}}}): expected a positive number")
+    gains: Mapping[str, Positive]
 
     @property
     def reads_response(self) -> bool:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import NotNegative, Range
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
 from fpirhc.symbolic.layout import Expression
 
 _RELATIVE, _FLOOR = 1e-9, 1e-12  # of the matrix that is inverted: a response without information changes nothing
+
+
+_CONVERGENT = Range("a number between 0 and 2, both excluded", 0.0, 2.0, open_low=True, open_high=True)
 
 
 @dataclass(frozen=True)
@@ -28,21 +33,12 @@ class Projection(Rule):
         gain: gamma, between 0 and 2.
         dead_zone: |h| below which the estimate stays, in units of the response; above it the step grows as (|h| - dead_zone) / |h|.
 
-    Raises:
-        InvalidValue: a gain outside (0, 2), a negative dead zone; when the loop is built, bounds that are not finite.
-
     References:
         G. C. Goodwin, K. S. Sin, Adaptive Filtering, Prediction and Control, Prentice-Hall 1984, ch. 3 (projection, dead zone).
     """
 
-    gain: float
-    dead_zone: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.gain < 2:
-            raise InvalidValue(f"Projection(gain={self.gain!r}): expected a number between 0 and 2, both excluded")
-        if not (math.isfinite(self.dead_zone) and self.dead_zone >= 0):
-            raise InvalidValue(f"Projection(dead_zone={self.dead_zone!r}): expected a number of at least 0")
+    gain: Annotated[float, _CONVERGENT]
+    dead_zone: NotNegative = 0.0
 
     @property
     def reads_response(self) -> bool:

@@ -11,12 +11,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.fields.kinds import Deviation, Positive
+from fpirhc.fields.kinds import Deviation, Positive, whole
 from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import (
@@ -271,17 +272,14 @@ class MovingHorizonStates(StateObserver):
 
     measured: Mapping[str, Deviation]
     noise: Mapping[str, Deviation]
-    window: int
+    window: Annotated[int, whole(1, MOST)]
     start: Mapping[str, Deviation] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    iterations: int = 1
+    iterations: Annotated[int, whole(1, 50)] = 1
     barrier: Positive = 1e-2
 
     def __post_init__(self) -> None:
         require_named("MovingHorizonStates", measured=self.measured, noise=self.noise)
-        for name, value, most in (("window", self.window, MOST), ("iterations", self.iterations, 50)):
-            if not isinstance(value, int) or not 1 <= value <= most:
-                raise InvalidValue(f"MovingHorizonStates({name}={value!r}): expected a whole number from 1 to {most}")
         for name, (lower, upper) in self.bounds.items():
             if not lower < upper:
                 raise InvalidValue(
