@@ -19,6 +19,23 @@ def linear(gain: float, believed: float) -> fp.Plant:
     )
 
 
+def sine_of_three(gain: float = 1.6) -> fp.Problem:
+    """A mass along sin 3 t for 3 s, by a model of gain 1."""
+    sine = fp.Trajectory(lambda t: {"y": ca.sin(3 * t)})
+    start = {"y": 0.0, "y'": 3.0}
+    return fp.Problem(linear(gain, 1.0), sine, start, period=1e-3, duration=3.0, measure_from=1.0)
+
+
+def heavy(
+    believed: float, exact: float, spring: tuple[float, float] | None = None, *, q: str = "q", u: str = "u"
+) -> fp.Plant:
+    """M q'' = u - k q, on a spring or without one, with a wrong mass and stiffness."""
+    parameters = {"m": fp.Parameter(believed, exact, "kg")} | ({"k": fp.Parameter(*spring, "N/m")} if spring else {})
+    return fp.Plant(
+        {q: "m"}, {u: "N"}, parameters, lambda x, v, f, p: {q: (f[u] - (p.k * x[q] if spring else 0)) / p.m}
+    )
+
+
 def pendulum(mass: float = 1.0, believed: float = 1.4) -> fp.Plant:
     """A pendulum with a torque, q measured from hanging down."""
     return fp.Plant(

@@ -6,6 +6,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from plants import heavy
 
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
@@ -21,19 +22,9 @@ PERIOD = 1e-3  # s
 
 def mass(**settings) -> fp.Problem:
     """M q'' = u - k q, the model's mass 1.5 times too large."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"u": "N"},
-        parameters={"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(6.0, 10.0, "N/m")},
-        response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
-    )
-    settings_in_use: dict[str, Any] = {
-        "reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}),
-        "start": {"q": 0.0},
-        "period": PERIOD,
-        "duration": 4.0,
-    }
-    return fp.Problem(**({"plant": plant} | settings_in_use | settings))
+    sine = fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)})
+    usual: dict[str, Any] = {"reference": sine, "start": {"q": 0.0}, "period": PERIOD, "duration": 4.0}
+    return fp.Problem(**({"plant": heavy(1.5, 1.0, (6.0, 10.0))} | usual | settings))
 
 
 def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.ComputedTorque:

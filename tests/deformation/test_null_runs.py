@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
-from plants import linear
+from plants import linear, sine_of_three
 
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
@@ -25,15 +24,7 @@ ONE = {"y": 1.0}
 
 def problem(**changes) -> fp.Problem:
     """A mass along a sine, 60 % heavier in the model."""
-    settings = {
-        "plant": linear(1.6, 1.0),
-        "reference": fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
-        "start": {"y": 0.0, "y'": 3.0},
-        "period": 1e-3,
-        "duration": 3.0,
-        "measure_from": 1.0,
-    }
-    return fp.Problem(**{**settings, **changes})
+    return replace(sine_of_three(), **changes)
 
 
 def null_of(adaptive: fp.ComputedTorque, cured: float = 1.0, **changes):

@@ -10,10 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import pytest
-from plants import linear
+from plants import sine_of_three
 
 import fpirhc as fp
 from fpirhc.errors import OutputError
@@ -29,14 +28,8 @@ HOSTILE = "<script>alert('x')</script> \"& </script>"
 
 def problem():
     """A linear plant with a wrong model that follows a sine."""
-    return fp.Problem(
-        plant=linear(1.6, 1.0),
-        reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
-        start={"y": 0.3},
-        period=1e-3,
-        duration=1.0,
-        disturbances={"u": fp.Noise(0.01)},
-    )
+    noise = {"u": fp.Noise(0.01)}
+    return replace(sine_of_three(), start={"y": 0.3}, duration=1.0, measure_from=0.0, disturbances=noise)
 
 
 @pytest.fixture(scope="module")

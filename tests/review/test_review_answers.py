@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from plants import heavy
 from reviewed import answer as asked
 from reviewed import linear
 
@@ -35,14 +36,10 @@ EDGE = math.log(100) / CYCLES  # of the logarithm of a factor per cycle
 
 def mass(**settings: Any) -> fp.Problem:
     """2 kg and 10 N/m, taken for 1.5 kg and 6 N/m, along 0.5 sin 3t: u* = -4 sin 3t N, r* = -4.667 sin 3t, J = 0.75."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"u": "N"},
-        parameters={"m": fp.Parameter(1.5, 2.0, "kg"), "k": fp.Parameter(6.0, 10.0, "N/m")},
-        response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
-    )
     usual: dict[str, Any] = {"start": {"q": 0.0, "q'": 1.5}, "period": PERIOD, "duration": PERIOD * CYCLES}
-    return fp.Problem(plant, fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}), **(usual | settings))
+    return fp.Problem(
+        heavy(1.5, 2.0, (6.0, 10.0)), fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}), **(usual | settings)
+    )
 
 
 @pytest.fixture(scope="module")

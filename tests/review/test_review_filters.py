@@ -7,6 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from plants import heavy
 
 import fpirhc as fp
 from fpirhc.review.questions.margins import SLOWER
@@ -17,14 +18,8 @@ DEVIATIONS = {"y''": 1e-3, "y'": 1.0, "y": 1.0}  # the response is measured far 
 
 def cart(gain: float) -> fp.Problem:
     """A mass whose response is `gain` times the model's."""
-    plant = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "N"},
-        parameters={"m": fp.Parameter(1.0, 1 / gain, "kg")},
-        response=lambda q, v, u, p: {"y": u.u / p.m},
-    )
-    reference = fp.Trajectory(lambda t: {"y": ca.sin(t)})
-    return fp.Problem(plant=plant, reference=reference, start={"y": 0.0}, period=1e-2, duration=5.0)
+    sine = fp.Trajectory(lambda t: {"y": ca.sin(t)})
+    return fp.Problem(heavy(1.0, 1 / gain, q="y"), sine, start={"y": 0.0}, period=1e-2, duration=5.0)
 
 
 def spring(gain: float) -> fp.Problem:

@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from plants import heavy
 
 import fpirhc as fp
 from fpirhc.problem_files.shipped import shipped_problems
@@ -18,14 +19,8 @@ from fpirhc.review.questions.reference import jumps, reference_free_of_jumps
 
 def mass(motion: Callable[[Any], Any], **settings: Any) -> fp.Problem:
     """Two kilograms and a force."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"u": "N"},
-        parameters={"m": fp.Parameter(3.0, 2.0, "kg")},
-        response=lambda q, v, u, p: {"q": u.u / p.m},
-    )
     usual: dict[str, Any] = {"start": {"q": 0.0}, "period": 1e-2, "duration": 4.0}
-    return fp.Problem(plant, fp.Trajectory(lambda t: {"q": motion(t)}), **(usual | settings))
+    return fp.Problem(heavy(3.0, 2.0), fp.Trajectory(lambda t: {"q": motion(t)}), **(usual | settings))
 
 
 def stepping(at: float, size: float, smooth: float) -> fp.Problem:

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
+from plants import heavy
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
@@ -21,12 +22,6 @@ STEP = 0.05  # s
 
 def oscillator(**settings: Any) -> fp.Problem:
     """M q'' = u - k q at rest; model and plant are the same."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"u": "N"},
-        parameters={"m": fp.Parameter(1.0, 1.0, "kg"), "k": fp.Parameter(4.0, 4.0, "N/m")},
-        response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
-    )
     usual: dict[str, Any] = {
         "reference": fp.Trajectory(lambda t: {"q": 0 * t}),
         "start": {"q": 0.1},
@@ -35,7 +30,7 @@ def oscillator(**settings: Any) -> fp.Problem:
         "horizon": fp.Horizon(stages=60, step=STEP),
         "cost": fp.Quadratic(states={"q": 1e2, "q'": 1.0}, rate={"u": 0.5}),
     }
-    return fp.Problem(plant=plant, **(usual | settings))
+    return fp.Problem(heavy(1.0, 1.0, (4.0, 4.0)), **(usual | settings))
 
 
 def model_of_a_stage() -> tuple[np.ndarray, np.ndarray]:

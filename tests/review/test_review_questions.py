@@ -9,6 +9,7 @@ import abroad
 import casadi as ca
 import numpy as np
 import pytest
+from plants import heavy
 from reviewed import answer
 
 import fpirhc as fp
@@ -62,14 +63,8 @@ def test_a_right_model_has_nothing_out_of_reach():
 
 def mass(amplitude: float = 0.5, **limits: Any) -> fp.Problem:
     """2 kg along A sin t with a plan; the force that this needs is -2 A sin t."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"u": "N"},
-        parameters={"m": fp.Parameter(2.0, 2.0, "kg")},
-        response=lambda q, v, u, p: {"q": u.u / p.m},
-    )
     return fp.Problem(
-        plant,
+        heavy(2.0, 2.0),
         fp.Trajectory(lambda t: {"q": amplitude * ca.sin(t)}),
         start={"q": 0.0, "q'": amplitude},
         period=0.1,

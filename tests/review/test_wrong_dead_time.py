@@ -8,6 +8,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from plants import heavy
 from reviewed import about, answer, answers, case
 
 import fpirhc as fp
@@ -30,15 +31,9 @@ MAP = fp.Affine(gain=-1.0)  # effective gain 0.5
 
 def mass(cycles: int, **settings) -> fp.Problem:
     """A mass behind a dead time, the model's 1.3 times too large."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"u": "N"},
-        parameters={"m": fp.Parameter(1.3, 1.0, "kg")},
-        response=lambda q, v, u, p: {"q": u.u / p.m},
-    )
     return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(2 * t)}),
+        heavy(1.3, 1.0),
+        fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(2 * t)}),
         start={"q": 0.0},
         period=PERIOD,
         duration=4.0,

@@ -7,21 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plants import heavy
 
 import fpirhc as fp
 
 
 def late_mass(late: float, amplitude: float = 0.2) -> fp.Problem:
     """A mass without limits behind a dead time that its law does not know."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"F": "N"},
-        parameters={"m": fp.Parameter(1.0, 1.0, "kg")},
-        response=lambda q, v, u, p: {"q": u.F / p.m},
-    )
     return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"q": amplitude + 0 * t}),
+        heavy(1.0, 1.0, u="F"),
+        fp.Trajectory(lambda t: {"q": amplitude + 0 * t}),
         start={"q": 0.0},
         period=0.01,
         duration=60.0,

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import linear
+from plants import linear, sine_of_three
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
@@ -28,15 +28,7 @@ TRACK = fp.Exponential(rate=6.0)
 
 def case(deformation, gain=1.6, **changes):
     """Computed torque with and without this deformation on a linear plant."""
-    problem = fp.Problem(
-        plant=linear(gain, 1.0),
-        reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
-        start={"y": 0.0, "y'": 3.0},
-        period=1e-3,
-        duration=3.0,
-        measure_from=1.0,
-        **changes,
-    )
+    problem = replace(sine_of_three(gain), **changes)
     controllers = {"plain": fp.ComputedTorque(TRACK), "adaptive": fp.ComputedTorque(TRACK, deformation)}
     return Task("case", Path("case.py"), "a case", "", problem, controllers)
 
