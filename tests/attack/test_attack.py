@@ -41,31 +41,24 @@ def test_every_fault_of_the_loop(problem):
 
 
 @needs_compiler
-def test_flipped_bits_of_a_library_are_noticed(tmp_path):
+@pytest.mark.parametrize("flips", [40, pytest.param(400, marks=pytest.mark.slow)])
+def test_flipped_bits_of_a_library_are_noticed(flips, tmp_path):
     """No library with a flipped bit, and none with a flipped bit in its checksum, is loaded."""
-    assert flipped_bits(tmp_path, 40, seed=0) == 0
+    assert flipped_bits(tmp_path, flips, seed=flips) == 0
 
 
 @pytest.mark.slow
 @needs_compiler
-def test_every_flipped_bit_and_every_kill(tmp_path):
-    """400 flipped bits, and 30 compilations that are killed: the next process has right numbers."""
-    assert flipped_bits(tmp_path / "flips", 400, seed=1) == 0
+def test_compilations_survive_their_kills(tmp_path):
+    """The next process has right numbers."""
     assert killed_compilations(tmp_path / "kills", 30, seed=1) == 0
 
 
+@pytest.mark.parametrize("flips", [40, pytest.param(400, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ARTEFACTS)
-def test_flipped_bits_of_files_are_noticed(name, tmp_path):
+def test_flipped_bits_of_files_are_noticed(name, flips, tmp_path):
     """A saved run, a ledger or a baseline with a flipped bit is refused by name, or reads as it was written."""
-    result = flipped(name, tmp_path / "flips", 40, seed=0)
-    assert (result.raw, result.unnoticed) == ((), 0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ARTEFACTS)
-def test_every_flipped_bit_of_files(name, tmp_path):
-    """400 flips of each."""
-    result = flipped(name, tmp_path / "flips", 400, seed=1)
+    result = flipped(name, tmp_path / "flips", flips, seed=flips)
     assert (result.raw, result.unnoticed) == ((), 0)
 
 
@@ -83,15 +76,8 @@ def test_a_study_survives_its_kills(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_random_command_lines(tmp_path):
+@pytest.mark.parametrize("seeds", [range(5000, 5020), pytest.param(range(1000), marks=pytest.mark.slow)], ids=len)
+def test_random_command_lines(seeds, tmp_path):
     with prepared(tmp_path / "work"):
-        ends = [raw_end(random_line(seed)) for seed in range(5000, 5020)]
-    assert [end for end in ends if end] == []
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_a_thousand_random_command_lines(tmp_path):
-    with prepared(tmp_path / "work"):
-        ends = [raw_end(random_line(seed)) for seed in range(1000)]
+        ends = [raw_end(random_line(seed)) for seed in seeds]
     assert [end for end in ends if end] == []

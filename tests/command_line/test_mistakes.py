@@ -289,15 +289,9 @@ def test_the_file_without_mistakes_is_accepted(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_random_mistakes_never_end_in_a_raw_error(tmp_path, monkeypatch):
-    raw = [raw_error(tmp_path / "mine.py", seed, monkeypatch) for seed in range(120)]
-    assert [one for one in raw if one] == []
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_ten_thousand_random_mistakes_never_end_in_a_raw_error(tmp_path, monkeypatch):
-    raw = [raw_error(tmp_path / "mine.py", seed, monkeypatch) for seed in range(1000, 11_000)]
+@pytest.mark.parametrize("seeds", [range(120), pytest.param(range(1000, 11_000), marks=pytest.mark.slow)], ids=len)
+def test_random_mistakes_never_end_in_a_raw_error(seeds, tmp_path, monkeypatch):
+    raw = [raw_error(tmp_path / "mine.py", seed, monkeypatch) for seed in seeds]
     assert [one for one in raw if one] == []
 
 

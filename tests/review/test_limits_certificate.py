@@ -106,15 +106,10 @@ def stays_inside(name: str, count: int) -> None:
     assert np.abs(run["command"] - commands[:, :, 0]).max() < 1e-11
 
 
+@pytest.mark.parametrize("plants", [300, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", DURATIONS)
-def test_no_plant_of_the_box_leaves_its_certificate(name):
-    stays_inside(name, 300)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", DURATIONS)
-def test_none_of_ten_thousand_plants_leaves_its_certificate(name):
-    stays_inside(name, 10_000)
+def test_no_plant_of_the_box_leaves_its_certificate(name, plants):
+    stays_inside(name, plants)
 
 
 def test_plans_with_room_do_not_depend_on_the_plant():
