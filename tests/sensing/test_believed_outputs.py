@@ -15,16 +15,12 @@ import casadi as ca
 import numpy as np
 import pytest
 from filters import extended_filter, runge_kutta
-from gaps import gone_on
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.sensing.base import StateObserver
-from fpirhc.simulation.sample import raw_measurements
-from fpirhc.status import Status
-from fpirhc.studies.comparison.timing import measure_cycle
 
 LAW = fp.Exponential(rate=1.0)
 PLAIN, FPI = fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, fp.Affine(-1.0))
@@ -229,57 +225,6 @@ FIGURES = {
 def test_figures_are_those_of_the_page(bis_errors: dict[tuple[str, str], float], known: str) -> None:
     """The rows of docs/sensing.md, as they are printed there."""
     assert [bis_errors[known, name] for name in NAMES] == pytest.approx(FIGURES[known], rel=0.015)
-
-
-# Steppers are given raw measurements
-
-
-def noisy(problem: fp.Problem) -> fp.Problem:
-    """The depth with noise, rounding and lost samples."""
-    sensor = fp.Sensor(noise=fp.Noise(0.01), quantum=1e-3, dropout=0.05)
-    return replace(problem, duration=6.0, sensing=replace(problem.sensing, sensors={"depth": sensor}))
-
-
-LATE = fp.DeadTime(inputs={"u": 1 / 12}, measurement=1.5 / 12)
-
-
-def given(estimator: Any) -> fp.Problem:
-    """Estimated outputs beside a state that is given."""
-    return noisy(sedated(None, sensing=fp.Sensing(estimator=estimator)))
-
-
-RAW: dict[str, Callable[[], fp.Problem]] = {
-    "differences": lambda: given(fp.PositionDifference()),
-    "savitzky-golay": lambda: given(fp.SavitzkyGolay(window=5, degree=3)),
-    "filter": lambda: given(fp.StateVariableFilter(bandwidth=6.0)),
-    "velocity": lambda: replace(given(fp.VelocityDifference()), dead_time=LATE),
-    "model": lambda: replace(noisy(sedated(fp.ModelStates())), dead_time=LATE),
-    "Kalman": lambda: noisy(sedated(FILTER)),
-}
-
-
-@pytest.mark.parametrize("name", RAW)
-def test_raw_measurements_of_a_run_give_its_commands(name: str) -> None:
-    """Bit by bit; in a cycle with a bad sample nothing but estimators and observers goes on."""
-    problem = RAW[name]()
-    controller = fp.ComputedTorque(LAW, fp.Affine(-0.2))
-    result = run(problem, controller, seed=2)
-    anything = dict.fromkeys(problem.sensing.measures(problem.plant), (-np.inf, np.inf))
-    stepper = fp.Stepper(problem, controller, compiled=False, plausible=anything)
-    memory, measured = stepper.start(), raw_measurements(result)
-    states = () if problem.sensing.observer else problem.plant.state.elements
-    assert stepper.measures == (*states, *problem.sensing.measures(problem.plant))
-    for k in range(result.cycles):
-        if k == 10:
-            held, after = stepper.step_measured(float(result.time[k]), measured[k] * np.nan, memory)
-            assert Status(int(stepper.trace()["status"][0])) == Status.BAD_SAMPLE
-            assert all(n.startswith(("observer_", "estimate_", "filter_")) for n in gone_on(stepper, memory, after))
-            assert np.array_equal(held, result["command"][k - 1])
-        command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
-        assert np.array_equal(command, result["command"][k]), k
-    assert np.ptp(result["command"]) > 1
-    stepper = fp.Stepper(problem, controller, compiled=False, bounded=False)
-    assert measure_cycle(problem, stepper, result) is not None
 
 
 # What is known before a run

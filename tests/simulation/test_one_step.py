@@ -24,11 +24,13 @@ from fpirhc.controllers.base import Controller
 from fpirhc.members import examples
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
+from fpirhc.studies.comparison.timing import measure_cycle
 from fpirhc.symbolic.native import find_compiler
 
 Loop = tuple[fp.Problem, Controller]
 FPI = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.Affine(gain=-0.5))
 REFERENCED = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.ModelReferenced(fp.Affine(gain=-0.05), lag=(1e-3, 0.0)))
+COMPARTMENTS: dict[str, Any] = {"measured": {"bis": 0.5}, "noise": {"C1": 0.3, "C2": 0.02, "C3": 0.02, "Ce": 0.1}}
 CYCLES = 40
 
 
@@ -67,6 +69,20 @@ def believing(
         sensing = fp.Sensing({}, estimator, measured=[measured], observer=observer)
         chosen = task.controllers[controller] if isinstance(controller, str) else controller
         return replace(problem, sensing=sensing, dead_time=late), chosen
+
+    return make
+
+
+def of_outputs(estimator: Any, observer: Any = None, late: float = 0.0) -> Callable[[], Loop]:
+    """A noisy output that is estimated, beside states that are given, or whose states are believed."""
+
+    def make() -> Loop:
+        task = fp.load_problem("anaesthesia")
+        measured = None if observer is None else ["bis"]
+        sensing = fp.Sensing({"bis": fp.Sensor(noise=fp.Noise(0.3))}, estimator, measured=measured, observer=observer)
+        dead_time = fp.DeadTime(measurement=late * task.problem.period)
+        chosen = task.controllers["CTC"].with_deformation(fp.Affine(gain=-0.1))
+        return replace(task.problem, sensing=sensing, dead_time=dead_time), chosen
 
     return make
 
@@ -139,6 +155,13 @@ LOOPS: dict[str, Callable[[], Loop]] = {
         "h1",
         "RHC",
     ),
+    "differences of outputs": of_outputs(fp.PositionDifference()),
+    "polynomials of outputs": of_outputs(fp.SavitzkyGolay(window=5, degree=3)),
+    "filtered outputs": of_outputs(fp.StateVariableFilter(bandwidth=6.0)),
+    "late velocities of outputs": of_outputs(fp.VelocityDifference(), late=1.5),
+    "model behind outputs": of_outputs(fp.PositionDifference(), fp.ModelStates(), late=1.5),
+    "Kalman behind outputs": of_outputs(fp.PositionDifference(), fp.KalmanFilter(**COMPARTMENTS)),
+    "window behind outputs": of_outputs(fp.PositionDifference(), fp.MovingHorizonStates(**COMPARTMENTS, window=3)),
     "outside": outside,
 } | {str(e): sensed(e, REFERENCED) for e in examples("derivative estimators")}
 GO_ON = ("observe", "estimate_", "filter_", "mirror_", "queue_", "pair_", "delay_", "sent")  # without a sample
@@ -159,10 +182,10 @@ class Fed:
         self.stepper, self.run, self.measured = trial.stepper, trial.run, raw_measurements(trial.run)
         self.memory = self.stepper.start() if memory is None else memory
 
-    def __call__(self, cycle: int, factor: float = 1.0) -> np.ndarray:
-        """The command of a cycle, the first number of its sample multiplied by a factor."""
+    def __call__(self, cycle: int, bad: float | None = None, place: int = 0) -> np.ndarray:
+        """The command of a cycle, after a sample with a bad number at a place."""
         sample = self.measured[cycle].copy()
-        sample[0] = factor * sample[0] if np.isfinite(factor) else factor
+        sample[place] = sample[place] if bad is None else bad
         command, self.memory = self.stepper.step_measured(float(self.run.time[cycle]), sample, self.memory)
         return command
 
@@ -177,18 +200,20 @@ def test_every_kind_of_problem_has_one_step(trial):
     run = fp.simulate(trial.problem, trial.controller, seed=1)
     assert run.compiled == (find_compiler() is not None)
     assert run.cycles == trial.run.cycles == CYCLES
+    assert len(trial.stepper.measures) == raw_measurements(trial.run).shape[1]
+    assert measure_cycle(trial.problem, trial.stepper, trial.run) is not None
     for signal in ("command", "state", "desired"):
         scale = np.abs(trial.run[signal]).max(initial=1e-300)
         np.testing.assert_allclose(run[signal], trial.run[signal], rtol=0, atol=1e-9 * scale)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_bad_sample_is_a_skipped_tick(trial, bad):
+@pytest.mark.parametrize(("bad", "place"), [(np.nan, 0), (np.inf, -1)])
+def test_a_bad_sample_is_a_skipped_tick(trial, bad, place):
     """The command is the last one. Estimators and queues go on, and everything is as if the tick had been missed."""
     fed = Fed(trial)
     command = [fed(k) for k in range(12)][-1]
     missed = Fed(trial, fed.memory)
-    assert np.array_equal(fed(12, bad), command)
+    assert np.array_equal(fed(12, bad, place), command)
     assert fed.status == Status.BAD_SAMPLE
     assert trial.stepper.trace()["skipped"] == 1
     changed = gone_on(trial.stepper, missed.memory, fed.memory)
