@@ -90,6 +90,10 @@ def test_a_solver_that_fails_holds_the_command():
     """One that raises, and one that ends without having written a command."""
     one = stepper()
     command, memory = one.step(*SAMPLE, one.start())
+    evaluate, one._may_fail, one._evaluate = one._evaluate, True, lambda: None
+    np.testing.assert_array_equal(one.step(0.01, *SAMPLE[1:], memory)[0], command)
+    assert (status(one), one.why_failed) == (Status.SOLVER_FAILED, "the compiled solver failed")
+    one._may_fail, one._evaluate = False, evaluate
 
     def raising():
         raise RuntimeError("no convergence")
