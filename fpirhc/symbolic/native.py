@@ -299,6 +299,28 @@ def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) ->
     return key, _loaded[key]
 
 
+def shared_library(source: str, flags: Sequence[str] = (), libraries: Sequence[str] = ()) -> Path:
+    """Return the path of a library of one C file, compiled where it is not in the cache.
+
+    Args:
+        source: C.
+        flags: for the compiler, after its usual ones.
+        libraries: for the linker, such as '-lm'.
+
+    Raises:
+        CompileError: there is no compiler, or it fails.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise CompileError(_why_no_compiler())
+    unit, link = _unit(source, compiler, flags), (compiler, *flags, *_LINK)
+    key = hashlib.sha256("\0".join((unit.key, *link, *libraries)).encode()).hexdigest()[:32]
+    path = cache_folder() / f"{key}{_suffix()}"
+    if not _is_intact(path):
+        _compile([unit], link, path, libraries)
+    return path
+
+
 def _suffix() -> str:
     return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
@@ -328,7 +350,7 @@ def _is_intact(path: Path) -> bool:
         return False
 
 
-def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path) -> None:
+def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path, libraries: Sequence[str] = ()) -> None:
     """Compile into a folder of its own beside the cache entry, files side by side, then link and put the library into place.
 
     The first file is of this library alone. Others are drivers, whose objects are kept for the libraries that share them. What
@@ -347,7 +369,7 @@ def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path) -> None:
             else:
                 _publish(result, place)
         library = Path(work) / f"model{_suffix()}"
-        _succeed([*link, "-o", str(library), *map(str, objects), "-lm"], library, work)
+        _succeed([*link, "-o", str(library), *map(str, objects), *libraries, "-lm"], library, work)
         _publish(library, path)
 
 

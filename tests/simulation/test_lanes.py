@@ -1,0 +1,165 @@
+"""Plants side by side in one register err as the ordinary loop says, one after the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.simulation.lanes import run_many
+from fpirhc.simulation.metrics.base import measured_errors
+from fpirhc.simulation.simulate import Simulator
+
+TWO_MASS = fp.load_problem("two_mass")
+ADAPTIVE = TWO_MASS.controllers["CTC+FPI (eq 6)"]
+
+
+def odd(q, v, u, p):
+    """A response with the functions that scalar code may have, small beside the force."""
+    x, y = 0.2 * q.x, 0.1 * v.x
+    terms = [
+        ca.sin(x),
+        ca.cos(y),
+        ca.tan(x),
+        ca.asin(x),
+        ca.acos(x),
+        ca.atan(y),
+        ca.sinh(x),
+        ca.cosh(y),
+        ca.tanh(x),
+        ca.exp(y),
+    ]
+    terms += [
+        ca.log(2 + x),
+        ca.sqrt(2 + y),
+        ca.asinh(x),
+        ca.acosh(2 + x),
+        ca.atanh(y),
+        ca.log1p(x),
+        ca.expm1(y),
+        ca.fabs(x),
+    ]
+    terms += [ca.sign(y), ca.floor(5 * x), ca.ceil(5 * y), ca.fmod(5 * x, 0.3), ca.atan2(x, 2 + y), ca.hypot(x, y)]
+    terms += [
+        ca.fmin(x, y),
+        ca.fmax(x, y),
+        ca.if_else(x < y, x, y),
+        (2 + x) ** (1 + y),
+        (2 + x) ** 0.3,
+        ca.copysign(x, y),
+    ]
+    return {"x": (u.F + 0.02 * sum(terms)) / p.m}
+
+
+ODD = fp.Problem(
+    plant=fp.Plant(
+        coordinates={"x": "m"}, inputs={"F": "N"}, order=2, response=odd, parameters={"m": fp.Parameter(1.4, 1.0, "kg")}
+    ),
+    reference=fp.Trajectory(lambda t: {"x": ca.sin(2 * t)}),
+    start={"x": 0.0},
+    period=2e-3,
+    duration=4.0,
+    measure_from=1.0,
+)
+NOISY = replace(
+    TWO_MASS.problem,
+    duration=3.0,
+    measure_from=1.0,
+    disturbances={"q1": fp.Step(at=1.5, size=3.0)},
+    sensing=fp.Sensing(
+        {"q1": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.05), "q2": fp.Sensor(quantum=1e-4)},
+        fp.SavitzkyGolay(window=7, degree=4),
+    ),
+)
+LAW = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.ModelReferenced(fp.Affine(gain=-0.5)))
+FISHERY = fp.load_problem("fishery")
+CASES = {
+    "published form": (TWO_MASS.problem, ADAPTIVE),
+    "functions": (ODD, LAW),
+    "lost samples": (NOISY, LAW),
+    "dead time": (
+        replace(TWO_MASS.problem, dead_time=fp.DeadTime(inputs={"Q1": 5e-3, "Q2": 2.5e-3})),
+        fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Increment(fp.Affine(gain=-0.5), cycles=(5.0, 2.5))),
+    ),
+    "map": (FISHERY.problem, next(c for n, c in FISHERY.controllers.items() if n.startswith("CTC"))),
+}
+
+
+def plants(ready: Simulator, count: int, share: float = 0.2) -> np.ndarray:
+    exact = ready.problem.plant.exact
+    return exact * (1 + share * np.random.default_rng(0).uniform(-1, 1, (count, exact.size)))
+
+
+def by_itself(ready: Simulator, exact: np.ndarray) -> tuple[np.ndarray, np.ndarray, str | None]:
+    """Rms and largest error and the end of the ordinary run."""
+    variant = ready.problem.with_exact(exact)
+    run = ready.run(seed=0, variant=variant)
+    errors = measured_errors(variant, run)
+    return np.sqrt(np.mean(errors**2, axis=0)), np.max(np.abs(errors), axis=0), run.stop
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_errors_are_those_of_the_ordinary_loop(name):
+    """To 1e-12, for a number of plants that fills no whole register; the functions of vectors round otherwise.
+
+    A quantum makes a whole one of a last place now and then, so behind coarse sensors it is 1e-9.
+    """
+    close = 1e-9 if name == "lost samples" else 1e-12
+    ready = fp.simulator(*CASES[name])
+    exact = plants(ready, 11, 0.05)
+    many = run_many(ready, exact)
+    assert many.lanes > 1, many.why
+    assert not many.stops
+    for k in (0, 3, 10):
+        rms, largest, stop = by_itself(ready, exact[k])
+        assert stop is None
+        np.testing.assert_allclose([v[k] for v in many.rms_error.values()], rms, rtol=close)
+        np.testing.assert_allclose([v[k] for v in many.max_error.values()], largest, rtol=close)
+
+
+def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
+    """A twentieth of a mass makes the iteration diverge: its run ends as the ordinary one does."""
+    ready = fp.simulator(
+        replace(TWO_MASS.problem, limits=fp.Limits()),
+        fp.ComputedTorque(fp.Exponential(rate=6.0), fp.BeyondLimit(fp.Affine(gain=-1.5))),
+    )
+    exact = plants(ready, 8, 0.01)
+    place = TWO_MASS.problem.plant.parameter.elements.index("m1")
+    calm = run_many(ready, exact)
+    exact[5, place] *= 0.05
+    many = run_many(ready, exact)
+    assert dict(many.stops) == {5: by_itself(ready, exact[5])[2]}
+    assert np.isnan(many.rms_error["q1"][5])
+    kept = np.arange(8) != 5
+    for name in ("q1", "q2"):
+        np.testing.assert_array_equal(many.rms_error[name][kept], calm.rms_error[name][kept])
+
+
+@pytest.mark.parametrize(
+    ("controller", "compiler", "why"),
+    [("RHC", True, "the loop has a plan, a table or a solver in it"), ("CTC", False, "there is no C compiler")],
+)
+def test_without_lanes_the_errors_are_the_same_and_it_says_why(controller, compiler, why, monkeypatch):
+    problem = replace(TWO_MASS.problem, duration=0.5, measure_from=0.1)
+    ready = fp.simulator(problem, TWO_MASS.controllers[controller], compiled=compiler)
+    if not compiler:
+        monkeypatch.setenv("FPIRHC_CC", "none")
+    exact = plants(ready, 2)
+    many = run_many(ready, exact)
+    assert many.lanes == 0
+    assert many.why.startswith(why)
+    np.testing.assert_array_equal([many.rms_error[n][1] for n in ("q1", "q2")], by_itself(ready, exact[1])[0])
+
+
+def test_wrong_parameters_are_named():
+    ready = fp.simulator(TWO_MASS.problem, ADAPTIVE, compiled=False)
+    with pytest.raises(InvalidShape, match=r"exact of shape \(1, 2\)\): expected one row per plant with m1, "):
+        run_many(ready, np.ones((1, 2)))
+    exact = plants(ready, 3)
+    exact[1, 0] = np.nan
+    with pytest.raises(InvalidValue, match="parameters of plant 1 are not finite"):
+        run_many(ready, exact)
