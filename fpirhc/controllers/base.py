@@ -377,10 +377,7 @@ def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
 
 def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
     """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
-    plant = problem.plant
-    closing, delays = closing_blocks(problem, deformation)
-    update = bounded(problem, tracking).update(plant, problem.period)
-    return [*desired_blocks(problem, tracking), *closing, update], [*delays, *tracking.delays(plant)]
+    return _between(problem, tracking, closing_blocks(problem, deformation))
 
 
 def law_blocks(problem: Problem, tracking: Tracking, *law: Block) -> tuple[list[Block], list[Delay]]:
@@ -388,13 +385,14 @@ def law_blocks(problem: Problem, tracking: Tracking, *law: Block) -> tuple[list[
 
     The law reads 'desired' and writes 'command_unclipped' and '_deformed_unclipped'; see `commanding_blocks`.
     """
-    plant = problem.plant
     closing, delays = commanding_blocks(problem)
+    return _between(problem, tracking, ([*law, *closing], delays))
+
+
+def _between(
+    problem: Problem, tracking: Tracking, closing: tuple[list[Block], list[Delay]]
+) -> tuple[list[Block], list[Delay]]:
+    """The blocks between those of the desired response and the update of the tracking law."""
+    plant, (blocks, delays) = problem.plant, closing
     update = bounded(problem, tracking).update(plant, problem.period)
-    return [*desired_blocks(problem, tracking), *law, *closing, update], [*delays, *tracking.delays(plant)]
-
-
-def input_gain(plant: Plant) -> ca.Function:
-    """Return the Function (state, input, parameters) -> derivative of the controlled response with respect to the inputs."""
-    x, u, p = plant.symbols()
-    return ca.Function("fpirhc_input_gain", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
+    return [*desired_blocks(problem, tracking), *blocks, update], [*delays, *tracking.delays(plant)]

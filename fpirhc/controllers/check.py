@@ -219,8 +219,6 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     A controller with live numbers is checked with the numbers of the build, and returned as it is.
 
     Args:
-        problem: the problem.
-        controller: the controller.
         numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.
 
     Raises:

@@ -288,11 +288,7 @@ class Undeformed(Controller, ABC):
 
 @dataclass(frozen=True)
 class ControllerWrapper(Controller, ABC):
-    """Contract: a controller around another one, with its deformation.
-
-    Args:
-        controller: the wrapped one.
-    """
+    """Contract: a controller around another one, with its deformation."""
 
     controller: Controller
 
@@ -449,7 +445,6 @@ def check_chains(problem: Problem, law: str) -> None:
     """Raise for an output of order 0, which has no derivative below its response.
 
     Args:
-        problem: the problem.
         law: what needs such a derivative, as the beginning of a sentence.
 
     Raises:
@@ -464,7 +459,6 @@ def check_derivatives(problem: Problem, law: str) -> None:
     """Raise for a map or an output of order 0, where a law has no meaning.
 
     Args:
-        problem: the problem.
         law: what the law does with derivatives, as the beginning of a sentence.
 
     Raises:

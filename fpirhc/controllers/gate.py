@@ -130,11 +130,6 @@ def outcome(
     """Return (memory to keep, whether the step is fine): memory and command are finite, and no status says that something was not.
 
     Args:
-        memory_next: of the next cycle.
-        memory: as it was.
-        command: of this cycle.
-        trace: of this cycle.
-        layout: of the trace.
         ran: whether the results are to be kept where they are fine.
         opaque: whether the step is a graph of calls.
     """

@@ -49,12 +49,7 @@ __all__ = ["MEASURED", "MEASURED_OUTPUT", "MEASURED_TIME", "measured_reads", "mi
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
-    """Return the block that writes '_modelled', with what it remembers; none where the deformation is not model-referenced.
-
-    Args:
-        problem: the problem.
-        deformation: of the controller.
-    """
+    """Return the block that writes '_modelled', with what it remembers; none where the deformation is not model-referenced."""
     mirror = deformation.mirror
     if not mirror.referenced:
         return [], []
@@ -71,12 +66,7 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
 
 
 def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks, and before them one that writes the measured state or outputs, and their time, where a block reads them.
-
-    Args:
-        plant: the plant.
-        blocks: of the controller.
-    """
+    """Return the blocks behind one that writes the measured state or outputs, and their time, where a block reads them."""
     writes = measured_reads(plant, blocks)
     if not writes:
         return list(blocks)
@@ -255,7 +245,6 @@ def memory_moves(problem: Problem, names: Sequence[str]) -> list[ca.DM]:
     What is remembered at a start is linear in the start; a cycle later the start would have been on the same path.
 
     Args:
-        problem: with the estimator.
         names: of what it measures.
     """
     motion = problem.plant.output

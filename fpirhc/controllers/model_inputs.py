@@ -37,9 +37,7 @@ class KnownSignals:
     """What a model is told.
 
     Args:
-        plant: the model.
         signals: from outside, by name.
-        period: of the control cycle.
     """
 
     plant: Plant

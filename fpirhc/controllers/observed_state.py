@@ -161,9 +161,6 @@ def moving(plant: Plant, integrator: Integrator, period: float, *, fraction: boo
     """Return Function (state, input, parameters, forcing, share) -> state after that share of a cycle.
 
     Args:
-        plant: the model.
-        integrator: of its motion.
-        period: of the control cycle.
         fraction: whether the share may lie between 0 and 1; a sample in between is interpolated.
     """
     (x, u, p), w, share = plant.symbols(), ca.SX.sym("w", len(plant.names)), ca.SX.sym("share")

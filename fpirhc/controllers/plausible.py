@@ -39,7 +39,6 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
     Of a plant with outputs they are those of its outputs, "output.y".
 
     Args:
-        problem: the task.
         own: intervals by name, "q1", "q1'", or "q1''" for the response, that replace the automatic ones.
 
     Raises:
@@ -179,8 +178,6 @@ class Jumps:
     """The check of one signal.
 
     Args:
-        problem: the task.
-        signal: that holds the responses.
         places: of the responses in it that are checked.
         scale: of these responses.
     """
@@ -254,7 +251,6 @@ def response_jumps(problem: Problem, reads: Layout) -> Jumps | None:
 
     Args:
         problem: the task, with the numbers of the build.
-        reads: of the step.
     """
     raw, names = raw_signal(problem), response_names(problem.plant)
     signal = reads["realised"] if raw is None and "realised" in reads else raw

@@ -254,8 +254,6 @@ def first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, da
 
     Args:
         problem: with numbers for its live settings.
-        optimiser: of the plans.
-        ocp: the horizon.
         data_of: Function (time, parameters, live numbers) -> data of the horizon.
     """
     first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()

@@ -43,7 +43,6 @@ def compose_with_sensing(problem: Problem, controller: Controller) -> Composite:
 
     Args:
         problem: that the controller is composed for.
-        controller: checked here against the problem.
     """
     return _LATEST.of((problem, controller), (plans_are_compiled(),), lambda: _composed(problem, controller))
 
@@ -298,8 +297,6 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
     """Return a composed step as one block.
 
     Args:
-        name: of the block.
-        composite: the step.
         feeds: name of a signal that the step reads -> the signal that it is given instead.
     """
     reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)

@@ -83,7 +83,6 @@ class Reach:
     """The setting of a map that requests and responses must stay far below.
 
     Args:
-        name: of the setting.
         size: of the setting, in units of the response.
     """
 

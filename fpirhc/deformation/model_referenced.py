@@ -19,7 +19,7 @@ from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.functions import stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
-from fpirhc.symbolic.queue import Cycles, Queue, every, room, several
+from fpirhc.symbolic.queue import Cycles, Queue, every, longest_of, several
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,8 @@ class ModelReferenced(Wrapper):
 
     def opened(self, paths: tuple[str, ...]) -> Self:
         """Return it with queues of twice the dead time where that becomes live and no longest one is stated."""
-        live = any(path.startswith("cycles") for path in paths)
-        return (
-            replace(self, longest=max(1.0, room(max(every(self._cycles))))) if live and self.longest is None else self
-        )
+        longest = longest_of(self.longest, self._cycles, paths)
+        return self if longest is self.longest else replace(self, longest=longest)
 
     @property
     def iteration(self) -> Iteration:

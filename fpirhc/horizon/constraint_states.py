@@ -27,9 +27,6 @@ class ConstraintState:
     """One further entry of the stage's state.
 
     Args:
-        name: of the entry.
-        unit: of the entry.
-        expression: of the stage before.
         lower: bound; infinite where free.
         upper: bound; infinite where free.
     """

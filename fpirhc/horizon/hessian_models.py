@@ -124,7 +124,6 @@ def stage_leaves(ocp: OptimalControl, names: tuple[str, ...]) -> tuple[_Parts, s
     """Return what a driver in C calls and C code to stand before it, which together provide `linearise` and the parts named.
 
     Args:
-        ocp: the problem.
         names: evaluate, pull.
     """
     parts = split_stage(ocp)

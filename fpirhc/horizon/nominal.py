@@ -43,7 +43,6 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
     """Return the state on the reference.
 
     Args:
-        plant: the model.
         outputs: the nominal outputs and their derivatives; of a plant without outputs its nominal state.
 
     Raises:
@@ -80,10 +79,7 @@ def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: f
     """Return sum_{k<r} C(r, k) rate^(r-k) e^(k) of every controlled output, with which its error decays; 0 for order 0.
 
     Args:
-        plant: the plant.
-        x: its state.
         outputs: nominal outputs and derivatives.
-        p: its parameters.
         rate: per unit of time.
     """
     calm = ca.DM.zeros(len(plant.names))
@@ -225,10 +221,8 @@ def singular_gain(plant: Plant, states: np.ndarray, inputs: np.ndarray, period: 
     """Return a sentence that says where the gain vanishes or changes its sign, and its values; empty where it does not.
 
     Args:
-        plant: the model.
         states: of its nominal run, cycle by cycle, shape (nx, m).
         inputs: of the same run, shape (nu, m).
-        period: length of a cycle.
     """
     x, u, p = plant.symbols()
     response, count = plant.equations.controlled_response(x, u, p), states.shape[1]

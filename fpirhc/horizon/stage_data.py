@@ -190,11 +190,7 @@ def live_table(table: np.ndarray, settings: np.ndarray, scale: np.ndarray, steep
 
 
 class Withheld:
-    """A number that follows from live settings, where code is built: every use is refused, so that no code keeps an old number.
-
-    Args:
-        paths: of the settings.
-    """
+    """A number that follows from live settings, where code is built: every use is refused, so that no code keeps an old number."""
 
     __array_ufunc__ = None
 

@@ -86,7 +86,6 @@ class Optimiser(Checked, ABC):
         """Return the memory for the next horizon, which starts one stage later, or a share `ocp.shares` of every stage.
 
         Args:
-            ocp: the problem.
             memory: a column in the layout of `memory`.
         """
 
@@ -237,9 +236,7 @@ def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, toler
 
     Args:
         finite: whether the plan and its numbers are finite.
-        residual: its stationarity.
         violation: the largest violation of a state bound.
-        tolerance: of the stationarity.
     """
     converged = ca.if_else(residual <= tolerance, int(Status.OK), int(Status.NOT_CONVERGED))
     feasible = ca.if_else(violation <= FEASIBLE, converged, int(Status.INFEASIBLE))
@@ -258,12 +255,9 @@ def improved(
     """Improve a plan until its status is OK; with a violated limit of a state, as long as the violation shrinks.
 
     Args:
-        optimiser: the optimiser.
-        ocp: the problem.
         state: the first state, shape (ns,).
         data: shape (ntheta, N + 1).
         memory: from which the first call begins.
-        calls: most calls.
 
     Returns:
         Plan (nu, N), diagnostics with the iterations of all calls, memory, and the number of calls.

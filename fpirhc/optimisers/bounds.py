@@ -115,8 +115,6 @@ class Limited:
     """The limits of one call.
 
     Args:
-        ocp: the problem.
-        scales: its units.
         lower: lower limits of the inputs, shape (nu,).
         upper: upper limits of the inputs, shape (nu,).
     """

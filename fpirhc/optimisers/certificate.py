@@ -29,13 +29,10 @@ class Certificate:
     """What is known about a plan.
 
     Args:
-        stationarity: of the plan, recomputed.
-        feasibility: of the plan, recomputed.
         factor: K, infinite where it is not known.
         error: bound of the distance to the optimum in the M-norm (square root of cost), NaN where K >= 1.
         input_error: bound of the error of any input, in its unit.
         suboptimality: bound of V(U) - V(U*).
-        free: number of free directions.
         curvature: least eigenvalue of M^-1 H; a plan where it is not positive is no strict minimum.
         active: number of limits of states with a multiplier.
         complementarity: largest product of a multiplier and the distance of its limit, in units of the cost.

@@ -21,7 +21,7 @@ from fpirhc.horizon.hessian_models import (
 )
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT
-from fpirhc.optimisers import limited_settings as numbers
+from fpirhc.optimisers import limited_settings as constants
 from fpirhc.optimisers.base import FEASIBLE, KEPT, shift, shift_gains
 from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF, Scales, scales
 from fpirhc.optimisers.limited_graph import limited_graph
@@ -104,34 +104,12 @@ def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:
 
 
 def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]:
-    names = (
-        "PATIENCE",
-        "HOPELESS",
-        "AHEAD",
-        "PURE_STEPS",
-        "MU_WARM",
-        "MU_MOST",
-        "MU_END",
-        "MU_LEAST",
-        "MU_ROUNDS",
-        "FILTER",
-        "MOST_RAISES",
-        "MOST_REWARMS",
-        "POOR",
-        "LEAST_DAMPING",
-        "NEARLY",
-        "ABOVE",
-        "ROLLED",
-        "REFERENCE",
-        "DESCENT",
-        "LAST_START",
-    )
     statuses = {
         "CONVERGED": Status.OK,
         **{s.name: s for s in (Status.NOT_CONVERGED, Status.INFEASIBLE, Status.NON_FINITE)},
     }
     return {
-        **{name: getattr(numbers, name) for name in names},
+        **{name: value for name, value in vars(constants).items() if name.isupper()},
         **{name: int(status) for name, status in statuses.items()},
         "COST": repr(float(measures.cost)),
         "ENOUGH": ENOUGH,
@@ -141,7 +119,7 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "PIVOT": PIVOT,
         "NEAR_LIMIT": FEASIBLE,
         "KEPT_SHARE": KEPT,
-        "ROUNDING": f"OF_TYPE({numbers.ROUNDING}, 1e-5)",
+        "ROUNDING": f"OF_TYPE({constants.ROUNDING}, 1e-5)",
         "DAMPING": repr(float(settings.damping)),
         "TOLERANCE": repr(float(settings.tolerance)),
         "FEASIBLE": repr(float(settings.feasible)),

@@ -14,6 +14,7 @@ import numpy as np
 from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import Expansion, expand, expansion_shapes, sweep
+from fpirhc.optimisers import limited_settings as constants
 from fpirhc.optimisers.base import FEASIBLE, KEPT, clip, sane, stationarity
 from fpirhc.optimisers.bounds import BOUNDARY, Certified, Interior, certify, largest_gap
 from fpirhc.optimisers.limited_phases import (
@@ -43,18 +44,7 @@ from fpirhc.optimisers.limited_phases import (
     priced,
     restart,
 )
-from fpirhc.optimisers.limited_settings import (
-    AHEAD,
-    FILTER,
-    HOPELESS,
-    MU_END,
-    MU_WARM,
-    PATIENCE,
-    PURE_STEPS,
-    ROLLED,
-    LimitedSettings,
-    limited_memory,
-)
+from fpirhc.optimisers.limited_settings import LimitedSettings, limited_memory
 from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import FINITE, is_finite
@@ -134,7 +124,7 @@ def _first_state(call: Call, memory: ca.MX) -> State:
         "point_states": ca.horzcat(call.s0, ca.reshape(remembered["plan_states"], ns, n)),
         "z": ca.reshape(remembered["plan_multipliers"], rows, 2 * n),
         "mu": remembered["plan_barrier"] * call.scales.cost,
-        "floor": constant(MU_END * call.scales.cost),
+        "floor": constant(constants.MU_END * call.scales.cost),
         "delta": remembered["plan_damping"],
         **fixed(phase=PURE, place_of=BEGINS, fresh=1, slacks=WARM, use_exact=not call.settings.plain_first, start=-1),
     }
@@ -152,7 +142,7 @@ def _empty_state(ocp: OptimalControl, rows: int, remembered: dict[str, ca.MX]) -
     empty = Expansion(*(ca.MX.zeros(*shape) for shape in expansion_shapes(ocp)))
     limits = {name: ca.MX.zeros(rows, 2 * n) for name in ("t", "e", "z", "dt", "de", "dz", "next_z", "best_z")}
     state: State = {**as_point(empty), **limits, **{name: ca.MX(0) for name in _SCALARS}}
-    state |= {"best_inputs": empty.inputs, "best_states": empty.states, "filter": ca.MX.zeros(FILTER, 2)}
+    state |= {"best_inputs": empty.inputs, "best_states": empty.states, "filter": ca.MX.zeros(constants.FILTER, 2)}
     state |= {"v": empty.inputs, "gains": ca.reshape(remembered["plan_gains"], nu, ns * n), "du": empty.inputs}
     costates = ca.reshape(remembered["plan_costates"], ns, n)
     state |= {"dx": empty.states, "costates": costates, "swept": ca.MX.zeros(ns, n)}
@@ -176,7 +166,7 @@ def _results(call: Call, s: State, memory: ca.MX, posed: ca.MX) -> list[ca.MX]:
             "plan_costates": ca.vec(s["costates"]),
             "plan_gains": ca.vec(s["gains"]),
             "plan_multipliers": ca.vec(s["z"]),
-            "plan_barrier": ca.MX(MU_WARM),
+            "plan_barrier": ca.MX(constants.MU_WARM),
             "plan_damping": s["delta"],
         }
     )
@@ -225,11 +215,7 @@ def _status(call: Call, s: State, p: Expansion, c: Certified, ok: ca.MX) -> ca.M
 
 
 class _Turn:
-    """Builds the expressions of a turn.
-
-    Args:
-        call: the problem and its arguments.
-    """
+    """Builds the expressions of a turn."""
 
     def __init__(self, call: Call) -> None:
         ocp = call.ocp
@@ -263,7 +249,7 @@ class _Turn:
         inputs = old.inputs + ca.if_else(share > 0, share * move, 0) + ca.if_else(pure, deformed, 0)
         states = old.states + ca.if_else(ca.logic_and(share > 0, ca.logic_not(descent)), share * s["dx"], 0)
         gaps = ca.if_else(descent, (1 - share) * (old.next_states - old.states[:, 1:]), 0)
-        starts = ca.logic_and(ca.logic_and(s["fresh"] == 1, s["slacks"] == COLD), s["start"] == ROLLED)
+        starts = ca.logic_and(ca.logic_and(s["fresh"] == 1, s["slacks"] == COLD), s["start"] == constants.ROLLED)
         rolled = ca.if_else(fresh, starts, ca.logic_or(pure, descent))
         p = Expansion(*self._expand(inputs, states, s["gains"], rolled, gaps, call.s0, call.data, *box(call, s)))
         return p, rolled, _is_usable(p)
@@ -306,12 +292,12 @@ def _judge_pure(call: Call, s: State, p: Expansion, usable: ca.MX) -> State:
     """Return the state with the plan accepted, or at the begin of an interior phase."""
     c = call.certified(p, s["next_z"])
     halved = c.error <= 0.5 * s["error"]
-    waits = ca.logic_and(s["misses"] < PATIENCE, c.error < HOPELESS)
-    patient = ca.logic_and(ca.logic_or(halved, waits), s["steps"] + 1 <= PURE_STEPS)
+    waits = ca.logic_and(s["misses"] < constants.PATIENCE, c.error < constants.HOPELESS)
+    patient = ca.logic_and(ca.logic_or(halved, waits), s["steps"] + 1 <= constants.PURE_STEPS)
     ok = ca.logic_and(ca.logic_and(usable, c.error < FINITE), patient)
     taken = {**s, **as_point(p), **as_last(c), "z": s["next_z"], "costates": s["swept"], "steps": s["steps"] + 1}
     # Gauss-Newton goes on only where the contraction that was seen ends the call with one more step.
-    arrives = c.error**2 <= AHEAD * call.settings.scaled_tolerance(call.scales) * s["error"]
+    arrives = c.error**2 <= constants.AHEAD * call.settings.scaled_tolerance(call.scales) * s["error"]
     taken["use_exact"] = ca.logic_or(s["use_exact"], ca.logic_not(arrives))
     taken["misses"] = ca.if_else(halved, 0, s["misses"] + 1)
     taken["error"] = ca.if_else(halved, c.error, s["error"])
@@ -321,11 +307,7 @@ def _judge_pure(call: Call, s: State, p: Expansion, usable: ca.MX) -> State:
 
 
 class _Direction:
-    """Builds the sweeps of one call: with the Hessian of the settings, and with Gauss-Newton where that is not convex.
-
-    Args:
-        call: the problem and its arguments.
-    """
+    """Builds the sweeps of one call: with the Hessian of the settings, and with Gauss-Newton where that is not convex."""
 
     def __init__(self, call: Call) -> None:
         ocp, scales = call.ocp, call.scales

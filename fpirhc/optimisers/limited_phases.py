@@ -15,26 +15,9 @@ import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import Expansion
+from fpirhc.optimisers import limited_settings as constants
 from fpirhc.optimisers.bounds import HAIR, Certified, Interior, Limited, Scales, barrier_error, certified, scales
-from fpirhc.optimisers.limited_settings import (
-    ABOVE,
-    DESCENT,
-    FILTER,
-    LAST_START,
-    LEAST_DAMPING,
-    MOST_RAISES,
-    MOST_REWARMS,
-    MU_END,
-    MU_LEAST,
-    MU_MOST,
-    MU_ROUNDS,
-    MU_WARM,
-    NEARLY,
-    POOR,
-    REFERENCE,
-    ROUNDING,
-    LimitedSettings,
-)
+from fpirhc.optimisers.limited_settings import LimitedSettings
 from fpirhc.symbolic.expression import FINITE
 
 PURE, INTERIOR = 0, 1  # phase
@@ -140,10 +123,10 @@ def enter_interior(call: Call, s: State) -> State:
     s = {**s, **fixed(phase=INTERIOR, again=1, use_exact=1, filtered=0, raises=0, halvings=0)}
     best = {"point_inputs": s["best_inputs"], "point_states": s["best_states"], "z": s["best_z"]}
     back = {**s, **best, **fixed(fresh=1)}
-    near = fixed(mu=MU_WARM * cost, slacks=WARM, floor=MU_END * cost)
+    near = fixed(mu=constants.MU_WARM * cost, slacks=WARM, floor=constants.MU_END * cost)
     starts = choose(s, s["misses"] == 0, {**s, **near}, {**back, **near})
     floor = 0.01 * s["floor"]
-    stuck = ca.logic_or(s["stuck"], floor < MU_LEAST * cost)
+    stuck = ca.logic_or(s["stuck"], floor < constants.MU_LEAST * cost)
     returns = {**back, "floor": floor, "stuck": stuck, **fixed(slacks=AS_IS)}
     return choose(s, s["place_of"] == BEGINS, starts, returns)
 
@@ -152,7 +135,7 @@ def restart(call: Call, s: State) -> State:
     """Begin again from the next first guess; the iteration is stuck after the last one."""
     start = s["start"] + 1
     cold = begin_cold(call, {**s, "start": start}, None)
-    return choose(s, start > LAST_START, {**s, "start": start, **fixed(stuck=1)}, cold)
+    return choose(s, start > constants.LAST_START, {**s, "start": start, **fixed(stuck=1)}, cold)
 
 
 def begin_cold(call: Call, s: State, inputs: ca.MX | None) -> State:
@@ -165,17 +148,17 @@ def begin_cold(call: Call, s: State, inputs: ca.MX | None) -> State:
     """
     n, reach = call.ocp.stages, ca.DM(0.01 * call.scales.inputs)
     references, forward = guesses(call.ocp)(call.data)
-    on_reference = ca.logic_or(s["start"] == REFERENCE, s["start"] == DESCENT)
+    on_reference = ca.logic_or(s["start"] == constants.REFERENCE, s["start"] == constants.DESCENT)
     states = ca.if_else(on_reference, references, ca.repmat(call.s0, 1, n + 1))
     hair = ca.repmat(ca.fmin(reach, 0.25 * (call.upper - call.lower)), 1, n)
     first = forward[:, :n] if inputs is None else inputs
     low, high = ca.repmat(call.lower, 1, n) + hair, ca.repmat(call.upper, 1, n) - hair
     none = {"gains": 0 * s["gains"], "costates": 0 * s["costates"]}
     guess = {"point_inputs": ca.fmin(ca.fmax(first, low), high), "point_states": states}
-    descends = s["start"] >= DESCENT
+    descends = s["start"] >= constants.DESCENT
     zeros = fixed(filtered=0, raises=0, halvings=0, use_exact=0, price=call.scales.cost)
-    zeros |= {"descends": descends, "delta": LEAST_DAMPING * descends}
-    mu = fixed(mu=call.scales.cost, floor=MU_END * call.scales.cost)
+    zeros |= {"descends": descends, "delta": constants.LEAST_DAMPING * descends}
+    mu = fixed(mu=call.scales.cost, floor=constants.MU_END * call.scales.cost)
     return {**s, **none, **guess, **zeros, **mu, **fixed(phase=INTERIOR, slacks=COLD, fresh=1)}
 
 
@@ -223,7 +206,7 @@ def _advanced(call: Call, s: State) -> State:
     s = {**s, "delta": delta, **fixed(halvings=0, raises=0)}
     higher = {
         **s,
-        "mu": ca.fmin(10 * s["mu"], MU_MOST * cost),
+        "mu": ca.fmin(10 * s["mu"], constants.MU_MOST * cost),
         "rewarms": s["rewarms"] + 1,
         **fixed(slacks=WARM, filtered=0),
     }
@@ -237,8 +220,8 @@ def _advanced(call: Call, s: State) -> State:
 def _is_hardly_left(call: Call, s: State) -> ca.MX:
     """Whether the step from a remembered plan was so short that the plan is too near its limits for its barrier."""
     remembered = ca.logic_and(s["start"] < 0, s["place_of"] == BEGINS)
-    raisable = ca.logic_and(s["rewarms"] < MOST_REWARMS, s["mu"] < MU_MOST * call.scales.cost)
-    return ca.logic_and(ca.logic_and(remembered, raisable), s["alpha"] < POOR)
+    raisable = ca.logic_and(s["rewarms"] < constants.MOST_REWARMS, s["mu"] < constants.MU_MOST * call.scales.cost)
+    return ca.logic_and(ca.logic_and(remembered, raisable), s["alpha"] < constants.POOR)
 
 
 def _eased_damping(s: State) -> ca.MX:
@@ -246,21 +229,19 @@ def _eased_damping(s: State) -> ca.MX:
     halvings, delta = s["halvings"], s["delta"]
     eased = ca.if_else(delta > 5e-7, delta / 5, 0)
     eased = ca.if_else(halvings >= 3, ca.fmax(4 * delta, 1e-4), ca.if_else(halvings > 0, delta, eased))
-    return ca.if_else(s["descends"], ca.fmax(eased, LEAST_DAMPING), eased)
+    return ca.if_else(s["descends"], ca.fmax(eased, constants.LEAST_DAMPING), eased)
 
 
 def _lowered_barrier(call: Call, s: State, rest: ca.MX, products: tuple[ca.MX, ca.MX]) -> tuple[ca.MX, ca.MX]:
     """Lower mu as long as its barrier problem is solved; the filter is emptied with every reduction.
 
     Args:
-        call: the problem and its arguments.
-        s: the state.
         rest: scaled residual without complementarity.
         products: the least and the largest product of the complementarity.
     """
     (least, most), cost = products, call.scales.cost
     mu, filtered, going = s["mu"], s["filtered"], ca.MX(1)
-    for _ in range(MU_ROUNDS):
+    for _ in range(constants.MU_ROUNDS):
         apart = ca.if_else(least < FINITE, mu - least, 0)
         worst = ca.fmax(rest, ca.fmax(most - mu, apart) / cost)
         going = ca.logic_and(going, ca.logic_not(ca.logic_or(worst > 10 * mu / cost, mu <= s["floor"])))
@@ -275,7 +256,7 @@ def _shortened(call: Call, s: State) -> State:
     more = {"delta": ca.fmax(10 * s["delta"], 1e-3), "raises": s["raises"] + 1}
     raised = {**s, **fixed(halvings=0, filtered=0), **more}
     # The barrier of a remembered plan has been raised before: a first guess is cheaper than damping.
-    gives_up = ca.logic_or(ca.logic_or(s["start"] < 0, raised["raises"] > MOST_RAISES), raised["delta"] > 1e8)
+    gives_up = ca.logic_or(ca.logic_or(s["start"] < 0, raised["raises"] > constants.MOST_RAISES), raised["delta"] > 1e8)
     again = {**raised, **fixed(again=1), "use_exact": ca.if_else(s["descends"], 0, s["use_exact"])}
     raised = choose(s, gives_up, restart(call, raised), again)
     return choose(s, s["halvings"] + 1 <= 8, halved, raised)
@@ -287,8 +268,8 @@ def _passes_filter(call: Call, s: State, theta: ca.MX, phi: ca.MX) -> tuple[ca.M
     Sources: R. Fletcher, S. Leyffer, Math. Program. 91, 2002; A. Waechter, L. T. Biegler, Math. Program. 106, 2006, section 2.3.
     """
     cost, old = call.scales.cost, s["filter"]
-    slack = ROUNDING * (cost + ca.fabs(s["phi"]))
-    used = ca.DM(np.arange(FILTER)) < s["filtered"]
+    slack = constants.ROUNDING * (cost + ca.fabs(s["phi"]))
+    used = ca.DM(np.arange(constants.FILTER)) < s["filtered"]
     worse = ca.logic_and(theta > (1 - 1e-5) * old[:, 0], phi > old[:, 1] - 1e-5 * old[:, 0] * cost)
     dominated = ca.mmax(ca.logic_and(used, worse))
     both = ca.logic_and(theta <= s["theta"], phi <= s["phi"] + slack)
@@ -300,9 +281,9 @@ def _passes_filter(call: Call, s: State, theta: ca.MX, phi: ca.MX) -> tuple[ca.M
     passes = ca.if_else(both, 1, ca.if_else(descends, armijo, falls))
     passes = ca.logic_and(passes, ca.logic_not(dominated))
     joins = ca.logic_and(ca.logic_and(passes, falls), ca.logic_not(ca.logic_or(both, descends)))
-    joins = ca.logic_and(joins, s["filtered"] < FILTER)
-    place = ca.logic_and(joins, ca.DM(np.arange(FILTER)) == s["filtered"])
-    pair = ca.repmat(ca.horzcat(s["theta"], s["phi"]), FILTER, 1)
+    joins = ca.logic_and(joins, s["filtered"] < constants.FILTER)
+    place = ca.logic_and(joins, ca.DM(np.arange(constants.FILTER)) == s["filtered"])
+    pair = ca.repmat(ca.horzcat(s["theta"], s["phi"]), constants.FILTER, 1)
     return passes, {"filter": ca.if_else(ca.horzcat(place, place), pair, old), "filtered": s["filtered"] + joins}
 
 
@@ -353,15 +334,15 @@ def box(call: Call, s: State) -> tuple[ca.MX, ca.MX]:
 
 def _falls_enough(s: State, phi: ca.MX, cost: float) -> ca.MX:
     """Whether psi falls by a share of its slope, and of the move itself: the exact Hessian may be nearly singular."""
-    return phi <= s["phi"] + 1e-4 * s["alpha"] * s["dphi"] + ROUNDING * (cost + ca.fabs(s["phi"]))
+    return phi <= s["phi"] + 1e-4 * s["alpha"] * s["dphi"] + constants.ROUNDING * (cost + ca.fabs(s["phi"]))
 
 
 def priced(call: Call, s: State, p: Expansion) -> State:
     """Return the state with psi and its slope in place of phi and its slope, and with their price."""
     apart, weight = _sum_of_gaps(call, p), ca.repmat(ca.DM(call.ocp.step * call.ocp.curvature), 1, call.ocp.stages)
     largest = ca.mmax(ca.fabs(s["swept"]) * call.spread)
-    price = ca.if_else(s["price"] >= NEARLY * largest, s["price"], ABOVE * largest)
-    least = -LEAST_DAMPING * ca.sum1(ca.vec(weight * s["du"] ** 2))
+    price = ca.if_else(s["price"] >= constants.NEARLY * largest, s["price"], constants.ABOVE * largest)
+    least = -constants.LEAST_DAMPING * ca.sum1(ca.vec(weight * s["du"] ** 2))
     slope = ca.fmin(s["dphi"] - price * apart, least)
     return {**s, "price": price, "phi": s["phi"] + price * apart, "dphi": slope}
 

@@ -13,21 +13,9 @@ from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_sta
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import BOX_PIVOT, rounds
 from fpirhc.horizon.stage_data import SCALE, STEEPEST
+from fpirhc.optimisers import search as line_search
 from fpirhc.optimisers.base import clip, sane, shift, shift_gains, stationarity, status_of
-from fpirhc.optimisers.search import (
-    ARMIJO,
-    DRAWN_IN,
-    ROUNDING,
-    SHARE,
-    SHORTER,
-    SHORTEST,
-    UNTRIED,
-    Anchor,
-    Arguments,
-    Search,
-    deformed_move,
-    first_gamma,
-)
+from fpirhc.optimisers.search import Anchor, Arguments, Search, deformed_move, first_gamma
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, registered, with_driver
 from fpirhc.symbolic.expression import FINITE, is_finite
@@ -184,14 +172,14 @@ def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object
     return {
         "TOLERANCE": _number(ocp, settings.tolerance),
         "DAMPING": _number(ocp, settings.damping),
-        "SHARE": SHARE,
-        "ARMIJO": ARMIJO,
-        "SHORTER": SHORTER,
-        "SHORTEST": SHORTEST,
-        "DRAWN_IN": DRAWN_IN,
-        "ROUNDING": f"OF_TYPE({ROUNDING}, 1e-6)",
+        "SHARE": line_search.SHARE,
+        "ARMIJO": line_search.ARMIJO,
+        "SHORTER": line_search.SHORTER,
+        "SHORTEST": line_search.SHORTEST,
+        "DRAWN_IN": line_search.DRAWN_IN,
+        "ROUNDING": f"OF_TYPE({line_search.ROUNDING}, 1e-6)",
         "PLAIN": _MOST_PLAIN,
-        "UNTRIED": f"(FINITE / {FINITE / UNTRIED:g})",
+        "UNTRIED": f"(FINITE / {FINITE / line_search.UNTRIED:g})",
         "PIVOT": BOX_PIVOT,
         "ROUNDS": rounds(ocp.input.size),
         "CONVERGED": int(Status.OK),
@@ -236,7 +224,7 @@ def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> An
     first = first_gamma(ocp, arguments.data)
     resume = ca.if_else(remembered["plan_step"] > 0, ca.fmin(remembered["plan_step"], 1), 1)
     # After a rejected T a longer gamma would be rejected again, in every call of one iteration.
-    longer = ca.if_else(resume < SHORTEST, 1, 2) * remembered["plan_gamma"]
+    longer = ca.if_else(resume < line_search.SHORTEST, 1, 2) * remembered["plan_gamma"]
     gamma = ca.if_else(remembered["plan_gamma"] > 0, ca.fmin(longer, first), first)
     return Anchor(
         inputs=inputs,
@@ -245,8 +233,8 @@ def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> An
         gains=ca.reshape(remembered["plan_gains"], nu, ns * n),
         plain=clip(none, arguments.lower, arguments.upper),
         slope=none,
-        value=ca.MX(10 * UNTRIED),
-        envelope=ca.MX(10 * UNTRIED),
+        value=ca.MX(10 * line_search.UNTRIED),
+        envelope=ca.MX(10 * line_search.UNTRIED),
         step=ca.MX(1),
         gamma=gamma,
         resume=resume,
@@ -271,7 +259,7 @@ def _converged(
     again = _needed(ocp, settings, arguments, symbols)
     for _ in range(settings.most + 1):
         needed = again(*arguments, anchor.inputs, anchor.slope, anchor.value, plain)
-        plain += ca.logic_and(needed, anchor.step < SHORTEST)
+        plain += ca.logic_and(needed, anchor.step < line_search.SHORTEST)
         anchor, count = Anchor(*choice(needed, *arguments, *anchor)), count + needed
     return anchor, count
 
@@ -280,7 +268,9 @@ def _needed(ocp: OptimalControl, settings: PlainSettings, arguments: Arguments, 
     """Function (arguments, inputs, slope, value, plain steps) -> whether another iteration is needed."""
     plain = ca.MX.sym("plain")
     residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
-    solved = ca.logic_and(anchor.value < UNTRIED, residual <= ocp.number_in(settings.tolerance, arguments.data))
+    solved = ca.logic_and(
+        anchor.value < line_search.UNTRIED, residual <= ocp.number_in(settings.tolerance, arguments.data)
+    )
     needed = ca.logic_and(ca.logic_not(solved), plain < _MOST_PLAIN)
     return ca.Function("fpirhc_needed", [*arguments, anchor.inputs, anchor.slope, anchor.value, plain], [needed])
 
@@ -294,7 +284,7 @@ def _results(
     iterations: ca.MX | int,
 ) -> list[ca.MX]:
     """Plan, diagnostics and memory at the end of a call."""
-    posed, evaluated = sane(*arguments), anchor.value < UNTRIED
+    posed, evaluated = sane(*arguments), anchor.value < line_search.UNTRIED
     finite = ca.logic_and(posed, evaluated)
     residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
     empty = ca.mmax(arguments.lower - arguments.upper) > 0

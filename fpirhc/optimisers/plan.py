@@ -202,9 +202,6 @@ class _Breach:
     """One side of one limit, and by how much the states s_0 ... s_N are beyond it.
 
     Args:
-        name: of the state.
-        unit: of the state.
-        limit: the number.
         side: 'above' or 'below'.
         beyond: shape (N + 1,), zero where the limit is kept; s_0 of a written entry counts as kept.
         equation: whether both sides are the same.

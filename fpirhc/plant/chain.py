@@ -23,7 +23,6 @@ def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.
     """Return the Function (state, input, parameters, forcing) -> the wanted derivatives, in their order.
 
     Args:
-        plant: the plant.
         wanted: (coordinate or output, number of the derivative) of every entry.
     """
     x, u, p = plant.symbols()
@@ -126,7 +125,6 @@ def require_rates(plant: Plant, refusal: str) -> None:
     """Raise where the states have no derivatives with respect to time.
 
     Args:
-        plant: the plant.
         refusal: the message: who needs them, and what to do.
 
     Raises:

@@ -39,9 +39,7 @@ def lie_derivatives(plant: Motion, value: Expression, count: int, symbols: Symbo
     """Return an expression of the state and its first `count` derivatives along the motion.
 
     Args:
-        plant: the plant.
         value: expression of x, u and p.
-        count: number of derivatives.
         symbols: x, u, p, and the forcing w.
     """
     chain = [value]

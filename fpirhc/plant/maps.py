@@ -79,7 +79,6 @@ def over(plant: _Motion, cycle: float) -> _Motion:
 
     Args:
         plant: a map, or any other plant.
-        cycle: length of the control cycle.
 
     Raises:
         InvalidValue: the cycle is no whole number of steps; the next ones are named.

@@ -29,7 +29,6 @@ def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, f
     """Return the least and the largest value of every exact parameter.
 
     Args:
-        plant: the plant with its parameters.
         mismatch: percent.
 
     Raises:

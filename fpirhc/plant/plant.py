@@ -317,6 +317,12 @@ class Equations(MotionEquations):
         return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
 
     @cached_property
+    def input_gain(self) -> ca.Function:
+        """Function (state, input, parameters) -> derivative of the controlled response with respect to the inputs."""
+        x, u, p = self.motion.symbols()
+        return ca.Function("fpirhc_input_gain", [x, u, p], [ca.jacobian(self.controlled_response(x, u, p), u)])
+
+    @cached_property
     def affine(self) -> bool:
         """Whether the controlled response is affine in the inputs, decided from the symbols."""
         return affine(self.motion, self.controlled_response)

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.by_name import FoundByName
@@ -300,9 +299,9 @@ def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.nda
     places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
     exact = np.tile(grid.draws[0], (len(places), 1))
     jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
-    x, u, p = plant.symbols()
-    slope = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
-    gains = [np.asarray(slope(grid.states[k], grid.commands[0, k], believed).full()) for k in places]
+    gains = [
+        np.asarray(plant.equations.input_gain(grid.states[k], grid.commands[0, k], believed).full()) for k in places
+    ]
     usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
     if not usable:
         raise NotContractive(

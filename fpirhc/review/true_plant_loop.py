@@ -122,9 +122,7 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     )
     slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
     gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
-    x, u, p = model.symbols()
-    by_input = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(model.equations.controlled_response(x, u, p), u)])
-    assumed = np.asarray(by_input(grid.states[point.place], point.command, believed).full())
+    assumed = np.asarray(model.equations.input_gain(grid.states[point.place], point.command, believed).full())
     return Extra(modes, np.linalg.eigvals(gain @ np.linalg.inv(assumed)))
 
 

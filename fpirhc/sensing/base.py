@@ -191,10 +191,8 @@ class Model:
     """What an observer is built from.
 
     Args:
-        plant: the model.
         move: Function (state, input, parameters, forcing, share) -> state after that share of a cycle.
         start: first state, shape (nx,).
-        measured: names of the measured quantities.
     """
 
     plant: Plant
@@ -245,7 +243,6 @@ class StateObserver(Checked, ABC):
         """State elements that the controller is given from the observer.
 
         Args:
-            plant: the model.
             known: state elements that follow from what is measured.
         """
 

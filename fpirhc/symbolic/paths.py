@@ -95,8 +95,6 @@ def changed_at(value: T, path: str, content: object, copy: Copy = validated) -> 
 
     Args:
         value: the value; it stays as it is.
-        path: of the content.
-        content: the other content.
         copy: function (dataclass, changes by field) -> the changed copy; the default one validates.
     """
     name, _, rest = path.partition(".")

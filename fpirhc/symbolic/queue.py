@@ -78,13 +78,7 @@ class Queue:
         return ca.vertcat(newest, queue[:remembered]) if remembered else newest
 
     def memory(self, name: str, elements: Sequence[str], start: Sequence[float]) -> tuple[Signal, ...]:
-        """Return what is remembered of a signal of every cycle; nothing where no entry waits.
-
-        Args:
-            name: of the memory.
-            elements: of the signal.
-            start: its values before the run.
-        """
+        """Return what is remembered of a signal of every cycle; nothing where no entry waits."""
         names = tuple(f"{e}@{k}" for k in range(1, self.length) for e in elements)
         return (Signal(name, names, start=tuple(start) * (self.length - 1)),) if names else ()
 
@@ -176,6 +170,12 @@ class Queue:
 def room(delay: float) -> float:
     """Return the longest delay that a run may set where none is stated: twice the delay of the build."""
     return 2 * delay
+
+
+def longest_of(longest: float | None, cycles: Cycles, paths: Sequence[str]) -> float | None:
+    """Return the longest delay of a queue whose `cycles` may become live: the stated one, or else twice the delay."""
+    live = any(path.startswith("cycles") for path in paths)
+    return max(1.0, room(max(every(cycles)))) if live and longest is None else longest
 
 
 def every(cycles: Cycles) -> tuple[float, ...]:

@@ -41,17 +41,7 @@ def settled_maps(
     sensing: Sensing,
     mistakes: Mistakes,
 ) -> dict[str, object]:
-    """Return the fields of a problem that follow from its maps, by name, and add to `mistakes` what does not fit their steps.
-
-    Args:
-        plant: the model.
-        reality: another plant that moves.
-        period: of the control cycle.
-        integrator: of the problem.
-        horizon: of the problem.
-        sensing: of the problem.
-        mistakes: of the problem.
-    """
+    """Return the fields of a problem that follow from its maps, by name, and add to `mistakes` what does not fit their steps."""
     settled: dict[str, object] = {}
     try:
         settled["plant"] = over(plant, period)
@@ -124,8 +114,6 @@ def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -
     """Return the names of the model's coordinates and outputs that the plant that moves must have.
 
     Args:
-        plant: the model.
-        sensing: of the problem.
         judged: names whose errors are judged beside the controlled ones; None: no other need be there.
     """
     if sensing.observer is None:

@@ -104,8 +104,6 @@ def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Queue
     """Block that delays every entry of `source` by its own number of cycles.
 
     Args:
-        name: of the block.
-        source: the signal that is delayed.
         target: the delayed signal; its start value fills the queues.
         waits: how long every entry waits.
 

@@ -160,9 +160,7 @@ def check_signals(
 
     Args:
         plants: the model, and the plant of a reality where there is one.
-        signals: of the problem.
         times: of the run: its first, some between, its last.
-        mistakes: to which they are added.
     """
     units: dict[str, str] = {}
     for plant in plants:

@@ -70,8 +70,6 @@ class Limit(Checked, ABC):
         """Return the limited scalar of a stage, checked.
 
         Args:
-            name: of the limit.
-            view: of the stage.
             symbols: those that the view is made of; without them any.
 
         Raises:
@@ -154,11 +152,8 @@ class _Rate(Limit):
     """The change of an input per unit of time, from stage to stage.
 
     Args:
-        input: name of the input.
-        step: length of a stage.
         lower: lower end of the interval.
         upper: upper end of the interval.
-        unit: of the rate.
     """
 
     uses_rate: ClassVar[bool] = True

@@ -384,11 +384,6 @@ class Problem(Checked):
 
 def _check_times(problem: Problem, mistakes: Mistakes) -> None:
     unit = problem.time_unit
-    for name in ("period", "duration"):
-        value = getattr(problem, name)
-        if not finite_number(value) or value <= 0:
-            mistakes.add(f"{name} must be a positive number, in {unit}, got {value!r}")
-            return
     if problem.duration > MOST_CYCLES * problem.period:
         mistakes.add(
             f"a run of {problem.duration:g} s has more than {MOST_CYCLES:.0e} cycles of {problem.period:g} s; shorten it"

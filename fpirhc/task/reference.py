@@ -98,8 +98,6 @@ class Reference(Checked, ABC):
         """Function (t, own signals) -> (state, response) as far as it is known now.
 
         Args:
-            plant: with the coordinates.
-            stages: of the horizon.
             ahead: time by which the motion lies in the future.
         """
         del stages

@@ -44,8 +44,6 @@ class FilterBank:
     for numbers, live numbers and expressions. Source: Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998, 4.3.3.
 
     Args:
-        plant: with the coordinates.
-        orders: of the filter, by coordinate.
         rate: of all filters; it may be live.
         nodes: number of set-points that are given per coordinate: one, or one per node of a horizon.
     """

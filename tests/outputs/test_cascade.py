@@ -214,7 +214,7 @@ def test_a_model_that_does_not_settle_needs_a_stated_lag():
     problem = linear(0.6, plant=plant)
     with pytest.raises(InvalidValue, match=r"does not settle.*ThroughModel\(lag=...\)"):
         fp.simulate(problem, fp.Cascade(STATIC, affine(0.5)), seed=1)
-    with pytest.raises(InvalidValue, match="finite times of at least 0"):
+    with pytest.raises(InvalidValue, match="finite number of at least 0"):
         fp.ThroughModel(lag=-1.0)
     inner = fp.ComputedTorque(fp.Exponential(rate=0.05))
     run = fp.simulate(problem, fp.Cascade(inner, affine(0.3), fp.ThroughModel(lag=10.0)), seed=1, compiled=False)

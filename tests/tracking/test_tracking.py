@@ -61,5 +61,5 @@ def test_digital_limit():
 
 def test_rate_must_be_positive():
     """A rate of zero would never track."""
-    with pytest.raises(InvalidValue, match="positive"):
+    with pytest.raises(InvalidValue, match="above 0"):
         fp.Exponential(rate=0.0)

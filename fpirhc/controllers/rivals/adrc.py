@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import command_before, commanding_blocks, input_gain, like, reference_block, rename
+from fpirhc.controllers.base import command_before, commanding_blocks, like, reference_block, rename
 from fpirhc.controllers.contract import Undeformed, check_chains
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
@@ -70,7 +70,7 @@ class ADRC(Undeformed):
     def _observer_block(self, problem: Problem) -> Block:
         """Block (outputs, prediction, reference) -> (command, extended state)."""
         plant, orders = problem.plant, list(problem.plant.response_orders.values())
-        gain, response = input_gain(plant), plant.equations.controlled_response
+        gain, response = plant.equations.input_gain, plant.equations.controlled_response
 
         def step(s: Signals) -> dict[str, Expression]:
             seen, target = getattr(s, plant.output.name), error_chains(plant, s.reference)
@@ -104,7 +104,11 @@ class ADRC(Undeformed):
 
 def _prediction_block(problem: Problem) -> Block:
     """Block (extended state, command) -> the extended state before the next sample; without a sample it goes on."""
-    plant, gain, orders = problem.plant, input_gain(problem.plant), list(problem.plant.response_orders.values())
+    plant, gain, orders = (
+        problem.plant,
+        problem.plant.equations.input_gain,
+        list(problem.plant.response_orders.values()),
+    )
     acting, predicted = plant.response_signal("acting"), _states(plant, "_predicted")
 
     def later(states: Expression, effect: Expression) -> Expression:

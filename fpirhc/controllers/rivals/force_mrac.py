@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, bounded, commanding_blocks, desired_blocks, like
+from fpirhc.controllers.base import Controller, law_blocks, like
 from fpirhc.controllers.contract import Deforms, PlantModel
 from fpirhc.controllers.reference_states import request_of_commands
 from fpirhc.deformation.base import Deformation, automatic
@@ -74,15 +74,7 @@ class ForceMRAC(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
-        closing, delays = commanding_blocks(problem)
-        blocks = [
-            *desired_blocks(problem, self.tracking),
-            self._force_block(plant, problem.warm_up_cycles),
-            *closing,
-            bounded(problem, self.tracking).update(plant, problem.period),
-        ]
-        return blocks, [*delays, *self.tracking.delays(plant)]
+        return law_blocks(problem, self.tracking, self._force_block(problem.plant, problem.warm_up_cycles))
 
     def _force_block(self, plant: Plant, warm_up_cycles: float) -> Block:
         """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""

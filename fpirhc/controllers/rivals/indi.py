@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import command_before, input_gain, law_blocks, like
+from fpirhc.controllers.base import command_before, law_blocks, like
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.fields.kinds import Accuracy, Positive
 from fpirhc.members import Example
@@ -48,7 +48,11 @@ class INDI(Undeformed):
     def _increment_block(self, problem: Problem) -> Block:
         """Block (state, last command, realised, desired) -> command; before the first response it is the model's inverse."""
         plant, warm_up_cycles, coefficients = problem.plant, problem.warm_up_cycles, self.filter(problem.period)
-        gain, response, inverse = input_gain(plant), plant.equations.controlled_response, plant.equations.inverse
+        gain, response, inverse = (
+            plant.equations.input_gain,
+            plant.equations.controlled_response,
+            plant.equations.inverse,
+        )
         both = (("filtered_command", plant.input), ("filtered_response", plant.response_signal("_")))
         pairs = [like(signal, name + late) for name, signal in both for late in ("", "_before")]
         memory = Layout((*pairs, scalar("filter_begun"))) if self.frequency is not None else Layout()

@@ -57,7 +57,6 @@ class Learning:
         """Raise if plant, bounds, or rule do not fit each other.
 
         Args:
-            problem: with the plant.
             inverts: whether the controller inverts the mass matrix.
 
         Raises:

@@ -169,9 +169,9 @@ def _start_gains(plant: Plant) -> ca.Function:
 def _sign(problem: Problem) -> int:
     """Sign of the inputs' effect on the response by the model at the start; 0 where it is not definite."""
     plant = problem.plant
-    x, u, p = plant.symbols()
-    effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
-    matrix = np.asarray(effect(problem.start_state, [0] * len(plant.inputs), plant.approximate).full())
+    matrix = np.asarray(
+        plant.equations.input_gain(problem.start_state, [0] * len(plant.inputs), plant.approximate).full()
+    )
     values = np.linalg.eigvalsh(matrix + matrix.T)
     return 1 if values.min() > 0 else -1 if values.max() < 0 else 0
 

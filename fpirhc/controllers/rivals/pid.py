@@ -74,9 +74,7 @@ class PID(Undeformed):
             if name not in self.proportional:
                 mistakes.add(f"proportional: controlled coordinate '{name}' has no gain; add '{name}': ...")
         mistakes.raise_if_any()
-        x, u, p = plant.symbols()
-        effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.equations.controlled_response(x, u, p), u)])
-        at_start = effect(problem.start_state, problem.inputs_before, plant.approximate)
+        at_start = plant.equations.input_gain(problem.start_state, problem.inputs_before, plant.approximate)
         for k, (name, order) in enumerate(plant.response_orders.items()):
             gains = self.gains(name, order)
             if len(gains) > max(order, 1) + 1:

@@ -242,8 +242,6 @@ def linear_modes(
     """Return the modes at the reference's last point; where there are none an empty list and the reason.
 
     Args:
-        problem: with the plant.
-        channels: the slots on the plant.
         parameters: of the plant, shape (np,).
         blend: time constant of the offset at a switch, s; 0 leaves the offset out.
     """

@@ -226,9 +226,6 @@ class OutputChain:
     that vanishes in one state does not change the order.
 
     Args:
-        coordinate: its name.
-        input: name of the input.
-        unit: of the coordinate.
         order: the relative order r.
         response_unit: of y^(r).
         states: Function (state, parameters) -> (y, y', ..., y^(r-1)), shape (r,).

@@ -226,9 +226,7 @@ def floquet_radius(problem: Problem, slots: Sequence[Slot], schedule: Schedule, 
     Limits, dead time and the hold of the command over a cycle are left out.
 
     Args:
-        problem: with the plant.
         slots: one per coordinate.
-        schedule: of the slots.
         blend: time constant of the offset at a switch, s; 0 leaves the offset out.
 
     Raises:

@@ -310,9 +310,6 @@ def output_ahead(plant: Plant) -> ca.Function:
         y^(k)(t + tau) = h_k(x(t + tau), p) + sum_{j >= k} d^(j)(t) tau^(j-k) / (j-k)!,      d^(j) = y^(j) - h_j(x, p),   j < r,
 
     where d^(r) is taken as zero: over a dead time, which is short. Over a horizon it is not, see `consistent_state`.
-
-    Args:
-        plant: the model, with outputs.
     """
     x, u, p = plant.symbols()
     later, y, time = ca.SX.sym("later", x.numel()), ca.SX.sym("y", plant.output.size), ca.SX.sym("time")

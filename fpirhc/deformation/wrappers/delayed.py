@@ -19,7 +19,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.functions import largest, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.queue import MOST, Cycles, Queue, every, room, several
+from fpirhc.symbolic.queue import MOST, Cycles, Queue, every, longest_of, several
 
 __all__ = ["MOST", "Increment", "Paired"]
 
@@ -57,8 +57,8 @@ class _Queued(Wrapper):
 
     def opened(self, paths: tuple[str, ...]) -> Self:
         """Return it with queues of twice the dead time where that becomes live and no longest one is stated."""
-        live = any(path.startswith("cycles") for path in paths)
-        return replace(self, longest=max(1.0, room(max(every(self.cycles))))) if live and self.longest is None else self
+        longest = longest_of(self.longest, self.cycles, paths)
+        return self if longest is self.longest else replace(self, longest=longest)
 
     @property
     @abstractmethod
