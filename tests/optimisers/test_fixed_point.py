@@ -400,7 +400,7 @@ def test_feedback_keeps_unstable_plants_together():
     ("settings", "message"),
     [
         ({"iterations": 0}, "iterations: expected a whole number from 1"),
-        ({"tolerance": 0.0}, "positive tolerance"),
+        ({"tolerance": 0.0}, "tolerance: expected a finite number above 0"),
         ({"damping": -1.0}, "damping"),
     ],
 )
