@@ -359,20 +359,6 @@ class Faulty(fp.ComputedTorque):
         return blocks, [*delays, Delay(parts, "filtered")]
 
 
-@dataclass(frozen=True)
-class Backwards(Tracking):
-    """A law that pushes the plant away."""
-
-    def law(self, plant, period):
-        return Altered(change="pushes away", rate=1.0, integral=False).law(plant, period)
-
-    def update(self, plant, period):
-        return TRACKING.update(plant, period)
-
-    def delays(self, plant):
-        return TRACKING.delays(plant)
-
-
 @pytest.mark.parametrize(
     ("wrong", "law"),
     [
@@ -383,7 +369,7 @@ class Backwards(Tracking):
         (Faulty(TRACKING, change="clamps first"), controller_laws.bad_measurement_never_acts),
         (Faulty(TRACKING, change="keeps NaN"), controller_laws.bad_measurement_never_acts),
         (Faulty(TRACKING, change="trusts responses"), controller_laws.bad_response_never_acts),
-        (Faulty(Backwards()), controller_laws.exact_model_tracks),
+        (Faulty(Altered(rate=1.0, integral=False, change="pushes away")), controller_laws.exact_model_tracks),
         (Faulty(TRACKING, change="tells a plan"), controller_laws.facts_hold),
     ],
     ids=lambda v: getattr(v, "change", None),

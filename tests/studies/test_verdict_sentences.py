@@ -107,40 +107,20 @@ def test_where_nobody_finishes_every_end_is_told():
     )
 
 
+JUDGED = "FPI {} loss ({:g} N after {:g} N without adaptation; {} is better)."
+ASIDE = "By loss FPI and RHC cannot be set side by side: {} has none."
+
+
 @pytest.mark.parametrize(
     ("better", "before", "after", "outcome", "said_of_it"),
     [
-        (
-            "smaller",
-            4.0,
-            2.0,
-            Outcome.BETTER,
-            "FPI improves loss (2 N after 4 N without adaptation; smaller is better).",
-        ),
-        ("larger", 4.0, 2.0, Outcome.WORSE, "FPI worsens loss (2 N after 4 N without adaptation; larger is better)."),
-        (
-            "larger",
-            -4.0,
-            -2.0,
-            Outcome.BETTER,
-            "FPI improves loss (-2 N after -4 N without adaptation; larger is better).",
-        ),
-        (
-            "smaller",
-            4.0,
-            4.0,
-            Outcome.NO_DIFFERENCE,
-            "FPI does not clearly change loss (4 N after 4 N without adaptation; smaller is better).",
-        ),
-        ("smaller", math.nan, 2.0, Outcome.BETTER, "By loss FPI and RHC cannot be set side by side: RHC has none."),
-        ("smaller", 4.0, math.nan, Outcome.WORSE, "By loss FPI and RHC cannot be set side by side: FPI has none."),
-        (
-            "larger",
-            math.nan,
-            math.nan,
-            Outcome.NOT_COMPARABLE,
-            "By loss FPI and RHC cannot be set side by side: RHC and FPI has none.",
-        ),
+        ("smaller", 4.0, 2.0, Outcome.BETTER, JUDGED.format("improves", 2, 4, "smaller")),
+        ("larger", 4.0, 2.0, Outcome.WORSE, JUDGED.format("worsens", 2, 4, "larger")),
+        ("larger", -4.0, -2.0, Outcome.BETTER, JUDGED.format("improves", -2, -4, "larger")),
+        ("smaller", 4.0, 4.0, Outcome.NO_DIFFERENCE, JUDGED.format("does not clearly change", 4, 4, "smaller")),
+        ("smaller", math.nan, 2.0, Outcome.BETTER, ASIDE.format("RHC")),
+        ("smaller", 4.0, math.nan, Outcome.WORSE, ASIDE.format("FPI")),
+        ("larger", math.nan, math.nan, Outcome.NOT_COMPARABLE, ASIDE.format("RHC and FPI")),
     ],
 )
 def test_the_figure_that_a_problem_is_judged_by(better, before, after, outcome, said_of_it):
