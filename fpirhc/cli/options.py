@@ -48,6 +48,14 @@ def whole(least: int) -> Callable[[str], int]:
     return number
 
 
+def shard(text: str) -> tuple[int, int]:
+    """K/N, a part of several."""
+    part, mark, parts = text.partition("/")
+    if mark and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts):
+        return int(part), int(parts)
+    raise argparse.ArgumentTypeError(f"expected K/N with K from 1 to N, such as 3/100, got '{text}'")
+
+
 def positive(text: str) -> float:
     """A number above 0."""
     return _number(text, text, lambda one: 0 < one < math.inf, "a number above 0")

@@ -270,7 +270,27 @@ def recorded() -> None:
 
 
 # name of the command: (what to do before, its words, the exit code), one after the other
+def in_parts() -> None:
+    """One of two parts of a study of two scenarios."""
+    main(
+        [
+            "compare",
+            "line.py",
+            "--scenarios",
+            "2",
+            "--mismatch",
+            "10",
+            "--shard",
+            "1/2",
+            "--out",
+            "part",
+            "--no-compile",
+        ]
+    )
+
+
 JOURNEYS: dict[str, Any] = {
+    "merge": [(in_parts, "part --out joined", 0), (None, "part", 2), (None, "nowhere --out joined", 3)],
     "list": [(None, "", 0), (None, "--alll", 2)],
     "review": [(None, "line.py", 0), (None, "line.py --mismatch 250", 2), (too_weak, "line.py", 1)],
     "probe": [

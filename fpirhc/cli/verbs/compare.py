@@ -19,6 +19,7 @@ from fpirhc.cli.options import (
     add_processes,
     add_scenarios,
     add_seed,
+    shard,
 )
 from fpirhc.cli.output import RESULTS, results_folder, resumable
 from fpirhc.cli.verb import ExitCode, Verb
@@ -145,6 +146,8 @@ def _add_scenarios(parser: argparse.ArgumentParser) -> None:
     add_processes(group)
     text = "controller that the others are compared with (default: the first)"
     group.add_argument("--baseline", metavar="NAME", help=text)
+    text = "run every N-th scenario from the K-th on, here; 'fpirhc merge' joins the folders"
+    group.add_argument("--shard", type=shard, metavar="K/N", help=text)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -162,7 +165,7 @@ def _check(options: argparse.Namespace) -> None:
             "--cases have the parameters that they state; leave --mismatch out, or compare --scenarios N"
         )
     if options.scenarios is None and not options.cases:
-        named = [n for n in ("mismatch", "baseline") if getattr(options, n) is not None]
+        named = [n for n in ("mismatch", "baseline", "shard") if getattr(options, n) is not None]
         named += ["processes"] if options.processes != 1 else []
         if named:
             raise InvalidValue(f"--{named[0]} needs --scenarios N, the number of scenarios")
@@ -183,6 +186,7 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
     task = load_problem(options.problem)
     drawn = f"scenarios_{options.mismatch or 0:g}percent"
     name = f"{'tuned_' if options.tuned else ''}{'cases' if options.cases else drawn}_seed{options.seed}"
+    name += "_shard{}of{}".format(*options.shard) if options.shard else ""
     folder = results_folder(options.out, task.name, name)
     comparison = _compared(options, task, folder)
     report = folder / "report.html"
@@ -210,6 +214,7 @@ def _compared(options: argparse.Namespace, task: Task, folder: Path) -> Scenario
             count=options.scenarios,
             percent=options.mismatch or 0.0,
             cases=options.cases,
+            shard=options.shard or (1, 1),
             seed=options.seed,
             folder=folder,
             controllers=options.controllers,
@@ -229,6 +234,7 @@ def _scenarios_command(options: argparse.Namespace) -> str:
     words = ["fpirhc", "compare", options.problem, "--seed", str(options.seed)]
     drawn = ["--scenarios", str(options.scenarios), "--mismatch", f"{options.mismatch or 0:g}"]
     words += ["--cases", *options.cases] if options.cases else drawn
+    words += ["--shard", "{}/{}".format(*options.shard)] if options.shard else []
     for name in ("baseline", "tuned", "headline"):
         if getattr(options, name):
             words += [f"--{name}", getattr(options, name)]

@@ -310,6 +310,30 @@ class Ledger:
         return value
 
 
+def header_of(path: Path) -> dict[str, Any]:
+    """Return the conditions of the results in a file.
+
+    Raises:
+        OutputError: it cannot be read, or its first line is damaged.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.readline()
+    except OSError as error:
+        raise OutputError(
+            f"cannot read '{path}': {error.strerror}; expected the folder of a comparison of scenarios"
+        ) from None
+    try:
+        value = json.loads(text)
+        header = {name: one for name, one in value.items() if name != _SUM}
+        whole = value.get(_SUM) == _sum(header)
+    except (ValueError, AttributeError):
+        whole = False
+    if not whole:
+        raise OutputError(f"'{path}', line 1 is damaged; run this part again")
+    return header
+
+
 def _text(value: Mapping[str, Any]) -> str:
     return json.dumps(value, allow_nan=False, separators=(",", ":"))
 

@@ -40,6 +40,7 @@ def compare_scenarios(
     count: int | None = None,
     percent: float = 0.0,
     cases: Sequence[str] | None = None,
+    shard: tuple[int, int] = (1, 1),
     seed: Seed,
     folder: Path,
     controllers: Sequence[str] | None = None,
@@ -59,6 +60,7 @@ def compare_scenarios(
         count: number of random scenarios.
         percent: range of the exact parameters' draws around the problem's, percent.
         cases: in place of random scenarios, those cases of the task that these patterns name; see `Cases.matching`.
+        shard: (k, n): every n-th of these scenarios, from the k-th on; `merge_shards` joins the folders.
         seed: of all draws.
         folder: folder to which finished scenarios are written, one by one.
         controllers: names of controllers; None: all.
@@ -80,7 +82,7 @@ def compare_scenarios(
     """
     begin = time.perf_counter()
     figure = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
-    numbers = scenario_numbers(task, count, percent, cases)
+    numbers = _of_shard(scenario_numbers(task, count, percent, cases), *shard)
     if processes < 1:
         raise InvalidValue(f"processes {processes}: expected at least 1")
     task = with_tuned(task, tuned or {})
@@ -117,6 +119,22 @@ def compare_scenarios(
         elapsed=time.perf_counter() - begin,
         pictures=task.pictures,
     )
+
+
+def _of_shard(numbers: Sequence[int], part: int, parts: int) -> Sequence[int]:
+    """Every n-th of the scenarios.
+
+    Raises:
+        InvalidValue: there is no such part, or nothing in it.
+    """
+    if not 1 <= part <= parts:
+        raise InvalidValue(f"shard {part}/{parts}: expected a part from 1 to {parts}")
+    own = numbers[part - 1 :: parts]
+    if not own:
+        raise InvalidValue(
+            f"shard {part}/{parts} of {len(numbers)} scenarios has none; use at most {len(numbers)} shards"
+        )
+    return own
 
 
 def _completed(
