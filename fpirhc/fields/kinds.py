@@ -112,6 +112,7 @@ class _JudgedByOwner(Range):
 
 JudgedByOwner: TypeAlias = Annotated[float, _JudgedByOwner("a finite number")]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
+Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
 NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
 NotZero: TypeAlias = Annotated[float, _NotZero("a finite number other than zero (no adaptation is Identity())")]
 BelowOne: TypeAlias = Annotated[float, Range("a number from 0 to below 1", low=0.0, high=1.0, open_high=True)]

@@ -6,17 +6,17 @@ terminal cost.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from numbers import Real
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
@@ -121,6 +121,9 @@ class Cost(Checked, ABC):
         """Return the terminal cost."""
 
 
+Weights: TypeAlias = Mapping[str, NotNegative]
+
+
 @dataclass(frozen=True, eq=False)
 class Quadratic(Cost):
     """Weighted squares, by name.
@@ -138,12 +141,12 @@ class Quadratic(Cost):
             states have no reference, so `states` has no weights then.
     """
 
-    states: Mapping[str, float] = field(default_factory=dict)
-    effort: Mapping[str, float] = field(default_factory=dict)
-    deviation: Mapping[str, float] = field(default_factory=dict)
-    rate: Mapping[str, float] = field(default_factory=dict)
-    terminal: Mapping[str, float] | Terminal | None = None
-    outputs: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
+    states: Weights = field(default_factory=dict)
+    effort: Weights = field(default_factory=dict)
+    deviation: Weights = field(default_factory=dict)
+    rate: Weights = field(default_factory=dict)
+    terminal: Weights | Terminal | None = None
+    outputs: Weights = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def weighs_effort(self) -> bool:
@@ -183,11 +186,6 @@ class Quadratic(Cost):
         self._check_kind(plant, mistakes)
         for what, (weights, valid) in groups.items():
             mistakes.unknown(f"{what}:", weights, valid)
-            for name, weight in weights.items():
-                if not isinstance(weight, Real) or not math.isfinite(weight) or weight < 0:
-                    mistakes.add(
-                        f"{what}: the weight of '{name}' must be a finite number of at least 0, got {weight!r}"
-                    )
         if not any(w for weights, _ in groups.values() for w in weights.values()):
             mistakes.add("every weight is zero, so every plan is optimal; weigh at least one state")
         for name in terminal:

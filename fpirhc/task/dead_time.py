@@ -12,7 +12,7 @@ import casadi as ca
 
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import finite_number
+from fpirhc.fields.kinds import Finite, NotNegative
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -36,9 +36,9 @@ class DeadTime(Checked):
             zero. Twice the dead time where it is not named.
     """
 
-    inputs: Mapping[str, float] = field(default_factory=dict)
-    measurement: float = 0.0
-    before: Mapping[str, float] = field(default_factory=dict)
+    inputs: Mapping[str, NotNegative] = field(default_factory=dict)
+    measurement: NotNegative = 0.0
+    before: Mapping[str, Finite] = field(default_factory=dict)
     longest: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
 
     @property
@@ -79,13 +79,8 @@ class DeadTime(Checked):
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("before: input", self.before, plant.inputs)
         mistakes.unknown("longest: input or measurement", self.longest, (*plant.inputs, MEASUREMENT))
-        for name, value in self.before.items():
-            if not finite_number(value):
-                mistakes.add(f"before: '{name}' must be a finite number, got {value!r}")
         for name, value in nominal({**self.inputs, MEASUREMENT: self.measurement}).items():
-            if not finite_number(value) or value < 0:
-                mistakes.add(f"'{name}' must be a number of at least 0, in {unit}, got {value!r}")
-            elif value > MOST * period:
+            if value > MOST * period:
                 mistakes.add(
                     f"'{name}' is {value:g} {unit}, more than {MOST} control cycles of {period:g} {unit}; "
                     "use a longer period for the run"
@@ -95,7 +90,7 @@ class DeadTime(Checked):
                     f"'{name}' is {value:g} {unit}, longer than its stated longest={{'{name}': {self.longest[name]:g}}}"
                 )
         for name, value in self.longest.items():
-            if not finite_number(value) or not 0 < value <= MOST * period:
+            if not 0 < value <= MOST * period:
                 mistakes.add(f"longest: '{name}' must be from above 0 to {MOST} control cycles, got {value!r} {unit}")
         mistakes.raise_if_any()
 

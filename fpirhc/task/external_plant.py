@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import CountOrZero, Positive, finite_number
+from fpirhc.fields.kinds import CountOrZero, NotNegative, Positive, finite_number
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.parameter import check_parameters, with_exact_values
 from fpirhc.plant.plant import Parameter, Plant
@@ -83,8 +83,8 @@ class ExternalPlant(Checked):
     deadline: Positive | None = None
     reset_deadline: Positive = 10.0
     clock: Callable[[], float] = field(default=wall.perf_counter, metadata={"setting": False})
-    dead_time: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
-    lag: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
+    dead_time: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
+    lag: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
 
     make: Make | None = field(default=None, metadata={"setting": False})
     parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
@@ -202,8 +202,6 @@ class ExternalPlant(Checked):
         units = quantities(model)
         mistakes.unknown("measures: quantity", self.measures, units)
         mistakes.unknown("lag: input", self.lag, model.inputs)
-        for name in (name for name, tau in self.lag.items() if not (finite_number(tau) and tau >= 0)):
-            mistakes.add(f"lag of {name} is {self.lag[name]!r}; expected a time of at least 0 {model.time_unit}")
         for name in measured:
             if name not in self.measures:
                 mistakes.add(

@@ -15,8 +15,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.expected import takes
-from fpirhc.fields.kinds import finite_number
+from fpirhc.fields.kinds import Finite, Positive
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import derivative_unit
 from fpirhc.plant.plant import Plant
@@ -90,14 +89,10 @@ class PathConstraint(Limit):
         unit: of the expression.
     """
 
-    expression: Callable[..., Value]
+    expression: Callable[[OfStage], Value]
     lower: float = -math.inf
     upper: float = math.inf
     unit: str = ""
-
-    def __post_init__(self) -> None:
-        if not takes(self.expression, 1):
-            raise InvalidValue("PathConstraint.expression: expected a function of 1 argument, the view of a stage")
 
     def value(self, view: OfStage) -> Value:
         return self.expression(view)
@@ -115,8 +110,8 @@ class Ellipsoid(Limit):
         InvalidValue: no axis, an axis that is not positive, or a centre of something without axis.
     """
 
-    axes: Mapping[str, float]
-    centre: Mapping[str, float] = field(default_factory=dict)
+    axes: Mapping[str, Positive]
+    centre: Mapping[str, Finite] = field(default_factory=dict)
 
     upper: ClassVar[float] = 1.0
     unit: ClassVar[str] = "1"
@@ -126,9 +121,6 @@ class Ellipsoid(Limit):
             raise InvalidValue(
                 "Ellipsoid(axes={}): expected a half axis by name of at least one state, output or input"
             )
-        for name, axis in self.axes.items():
-            if not 0 < nominal(axis) < math.inf:
-                raise InvalidValue(f"Ellipsoid(axes={{'{name}': {axis!r}}}): expected a positive number")
         for name in self.centre.keys() - self.axes.keys():
             raise InvalidValue(f"Ellipsoid(centre): '{name}' has no axis.{nearest(name, list(self.axes))}")
 
@@ -192,8 +184,8 @@ class Limits(Checked):
     states: Mapping[str, Interval] = field(default_factory=dict)
     rates: Mapping[str, Interval] = field(default_factory=dict)
     paths: Mapping[str, Limit] = field(default_factory=dict)
-    soft: Mapping[str, float] = field(default_factory=dict)
-    prices: Mapping[str, float] = field(default_factory=dict)
+    soft: Mapping[str, Positive] = field(default_factory=dict)
+    prices: Mapping[str, Positive] = field(default_factory=dict)
 
     def check(self, plant: Plant) -> None:
         """Raise if a name is unknown or an interval is empty.
@@ -219,12 +211,6 @@ class Limits(Checked):
         mistakes.unknown("prices: limit of", self.prices, [*self.states, *self.paths, *rates])
         for name in sorted(self.prices.keys() & self.soft.keys()):
             mistakes.add(f"'{name}' is both soft and priced; choose one")
-        for name, price in self.prices.items():
-            if not finite_number(price) or not 0 < price < math.inf:
-                mistakes.add(f"prices: the price of '{name}' must be a positive number, got {price!r}")
-        for name, weight in self.soft.items():
-            if not finite_number(weight) or not 0 < weight < math.inf:
-                mistakes.add(f"soft: the weight of '{name}' must be a positive number, got {weight!r}")
         mistakes.raise_if_any()
 
     def members(self, plant: Plant, step: float) -> dict[str, Limit]:

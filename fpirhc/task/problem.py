@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Duration, finite_number
+from fpirhc.fields.kinds import Duration, Finite
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
@@ -86,7 +86,7 @@ class Problem(Checked):
 
     plant: Plant
     reference: Reference
-    start: Mapping[str, float]
+    start: Mapping[str, Finite]
     period: Duration
     duration: Duration
     limits: Limits = field(default_factory=Limits)
@@ -440,9 +440,6 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
         if c not in problem.start:
             mistakes.add(f"start: {words(plant)[0]} '{c}' has no first value; add '{c}': ...")
     for name, value in problem.start.items():
-        if not finite_number(value):
-            mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
-            continue
         low, high = plant.ranges.get(name, (-math.inf, math.inf))
         if not low <= value <= high:
             mistakes.add(f"start: '{name}' is {value:g}, outside its physical range of {low:g} to {high:g}")

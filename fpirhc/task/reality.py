@@ -7,7 +7,6 @@ Theory: docs/theory-plants.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, input_reaches_at, relative_order
 from fpirhc.plant.integrators import Integrator, stiffness
 from fpirhc.plant.maps import check_time, over, unlike
@@ -43,7 +43,7 @@ class Reality(Checked):
     """
 
     plant: Plant
-    start: Mapping[str, float] = field(default_factory=dict)
+    start: Mapping[str, Finite] = field(default_factory=dict)
     integrator: Integrator | None = None
     seen: Mapping[str, str] = field(default_factory=dict)
 
@@ -132,9 +132,6 @@ class Reality(Checked):
         mistakes.unknown("seen: coordinate of the model", self.seen, model.coordinates)
         mistakes.unknown("seen: coordinate of the reality", self.seen.values(), self.plant.coordinates)
         mistakes.unknown("start: state", self.start, self.plant.state.elements)
-        for name, value in self.start.items():
-            if not math.isfinite(value):
-                mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
         if self.plant.time_unit != model.time_unit:
             mistakes.add(
                 f"its time is in {self.plant.time_unit}, the model's in {model.time_unit}; write both in one unit"

@@ -48,7 +48,7 @@ path of two arguments
 path with its text and function swapped
   fp.PathConstraint(lambda view: view.state.y + view.state.z, upper=3.0, unit="m") ->
       fp.PathConstraint("m", lambda view: view.state.y)
-    PathConstraint.expression: expected a function, got the text 'm'
+    PathConstraint.expression: expected a function of 1 argument, got the text 'm'
 reference that returns a number
   lambda t: {"y": ca.sin(t), "z": 0.1 * ca.cos(t)} -> lambda t: 0.5
     reference must return {name: expression}, got 0.5
@@ -57,7 +57,7 @@ reference without a coordinate
     coordinate 'z' has no nominal motion ... add 'z' to the reference
 negative weight
   "z": 10.0, "y'": 0.1} -> "z": -10.0}
-    the weight of 'z' must be a finite number of at least 0, got -10.0
+    Quadratic.states['z']: expected a finite number of at least 0, got -10.0
 limits that no number meets
   "force": (-20.0, 20.0) -> "force": (float("inf"), float("inf"))
     'force' has limits (inf, inf) that no number meets ... a free side is -inf below, inf above

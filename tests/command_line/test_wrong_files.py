@@ -114,7 +114,7 @@ names of another tool
     Problem needs start, period, duration
 start as an array
   start={"angle": 0.0} -> start=np.zeros(2)
-    Problem.start: expected {name: a number}, got an array of the shape (2,)
+    Problem.start: expected {name: a finite number}, got an array of the shape (2,)
 limits by vectors
   fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(lbu=np.array([-15.0]), ubu=np.array([15.0]))
     mine.py, line 29 ... no field 'lbu'. Did you mean 'inputs'? ... no field 'ubu'. Did you mean 'inputs'?
@@ -229,7 +229,7 @@ output of an unknown state
     'temperature' (mine.py, line 20): state 'C_A' is unknown ... Valid: C, T.
 start in another unit
   "T": 350.0} -> "T": "77 C"}
-    Problem.start['T']: expected a number, got the text '77 C'
+    Problem.start['T']: expected a finite number, got the text '77 C'
 start of an output
   start={"C": 0.5, "T": 350.0} -> start={"temperature": 350.0}
     start: state 'temperature' is unknown. Valid: C, T. ... state 'C' has no first value; add 'C' ... state 'T' has no first

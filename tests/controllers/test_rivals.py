@@ -357,7 +357,6 @@ MISFITS = {
         "relative order 2, but rates has 3",
     ),
     "unknown parameter": (swing, fp.rivals.ForceMRAC(TRACK, SIGMOID, {"mass": 1.0}), "parameter 'mass' is unknown"),
-    "no number": (swing, fp.rivals.ForceMRAC(TRACK, SIGMOID, {"m": float("inf")}), "'m' must be a finite number"),
     "chattering": (swing, fp.rivals.SlidingMode(RATE, 500.0, 0.2), "chatters with any model"),
 }
 

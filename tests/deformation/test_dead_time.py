@@ -233,8 +233,6 @@ def test_receding_horizon_starts_where_its_command_acts():
     ("dead_time", "sentence"),
     [
         (fp.DeadTime(inputs={"Q3": 0.1}), "input 'Q3'.*Did you mean"),
-        (fp.DeadTime(inputs={"Q1": -0.1}), "'Q1' must be a number of at least 0, in s"),
-        (fp.DeadTime(measurement=float("inf")), "'measurement' must be a number of at least 0, in s"),
         (fp.DeadTime(inputs={"Q1": 2.0}), "'Q1' is 2 s, more than 1000 control cycles of 0.001 s"),
     ],
 )
@@ -318,6 +316,10 @@ def test_bad_settings():
             fp.Paired(SIGMOID, cycles=cycles)
     with pytest.raises(InvalidValue, match=r"Predicted.inputs: expected a finite number of at least 0"):
         fp.Predicted(fp.ComputedTorque(LAW), inputs=-0.1)
+    with pytest.raises(
+        InvalidValue, match=r"DeadTime.inputs\['Q1'\]: expected a finite number of at least 0, got -0.1"
+    ):
+        fp.DeadTime(inputs={"Q1": -0.1})
     with pytest.raises(InvalidValue, match="3000 cycles of dead time, more than 1000"):
         fp.simulate(TWO_MASS, fp.Predicted(fp.ComputedTorque(LAW), inputs=3.0), seed=0)
     cart_pole = fp.load_problem("cart_pole")

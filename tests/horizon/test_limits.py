@@ -173,7 +173,6 @@ def test_limits_in_a_closed_loop(case):
         (fp.Limits(paths={"calm": fp.Ellipsoid({"angel": 1.0})}), (), "'angel' is no state, output or input.*'angle'"),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.vector, upper=1.0)}), (), "one scalar"),
         (fp.Limits(soft={"angle": 1.0}), (), "soft: limit of"),
-        (fp.Limits(states={"angle": (0, 1)}, soft={"angle": -1.0}), (), "positive"),
         (fp.Limits(), ("angel",), "angle"),
     ],
 )
@@ -279,7 +278,7 @@ def test_prices_are_refused_by_who_cannot_take_them():
 def test_an_ellipsoid_that_is_none_is_refused():
     for given, said in (
         ({"axes": {}}, "expected a half axis by name of at least one"),
-        ({"axes": {"angle": 0.0}}, r"Ellipsoid\(axes={'angle': 0.0}\): expected a positive number"),
+        ({"axes": {"angle": 0.0}}, r"axes\['angle'\]: expected a finite number above 0"),
         ({"axes": {"angle": 1.0}, "centre": {"angel": 1.0}}, "'angel' has no axis.*'angle'"),
     ):
         with pytest.raises(FpirhcError, match=said):

@@ -459,10 +459,13 @@ WRONG: dict[str, tuple[Any, str]] = {
     "a reset": (lambda: loose(reset_deadline=-1.0), "reset_deadline: expected a finite number above 0, got -1.0"),
     "half a hold": (lambda: loose(holds=1.5), "holds: expected a whole number of at least 0, got 1.5"),
     "an option": (lambda: loose(dead_times={}), "no field 'dead_times'. Did you mean 'dead_time'?"),
-    "a dead time": (lambda: loose(dead_time=0.002), "dead_time: expected {name: a number}, got 0.002; give it a name"),
+    "a dead time": (
+        lambda: loose(dead_time=0.002),
+        "dead_time: expected {name: a finite number of at least 0}, got 0.002; give",
+    ),
     "a negative one": (
         lambda: task(reality=loose(dead_time={"u": -0.1})),
-        "dead_time: 'u' must be a number of at least 0",
+        "dead_time['u']: expected a finite number of at least 0, got -0.1",
     ),
     "an input": (lambda: task(reality=loose(dead_time={"v": 0.1})), "dead_time: input 'v' is unknown. Valid: u."),
     "parameters alone": (lambda: loose(parameters=GAIN), "a body that stands cannot take parameters; write make="),

@@ -132,8 +132,8 @@ def test_review_judges_the_stated_lag():
     ("facts", "words"),
     [
         ({"lag": {"v": 0.1}}, "input 'v' is unknown"),
-        ({"lag": {"u": -0.1}}, "lag of u is -0.1; expected a time of at least 0 s"),
-        ({"lag": {"u": math.inf}}, "lag of u is inf"),
+        ({"lag": {"u": -0.1}}, r"lag\['u'\]: expected a finite number of at least 0, got -0.1"),
+        ({"lag": {"u": math.inf}}, r"lag\['u'\]: .*got inf"),
         ({"lag": {"u": "slow"}}, "lag"),
         ({"dead_time": {"v": 0.1}}, "'v'"),
     ],

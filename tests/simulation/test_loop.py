@@ -167,7 +167,7 @@ def test_signals_by_name():
 BAD: dict[str, dict[str, Any]] = {
     "'angel' is unknown. Did you mean 'angle'": {"start": {"angel": 0.0}},
     "coordinate 'angle' has no first value": {"start": {}},
-    "must be a finite number, got inf": {"start": {"angle": float("inf")}},
+    "expected a finite number, got inf": {"start": {"angle": float("inf")}},
     "Problem.period: expected a number from 1e-12": {"period": 0.0},
     "lower 2.0 above upper 1.0": {"limits": fp.Limits(inputs={"torque": (2.0, 1.0)})},
     "input 'torqe' is unknown": {"limits": fp.Limits(inputs={"torqe": (0.0, 1.0)})},
