@@ -40,17 +40,20 @@ def identity(value: Any) -> tuple[str, tuple[object, ...]]:
 
     These are classes, functions and values of other kinds, such as the formula of a cost. They are held by the key.
     """
-    return repr(describe(value)), tuple(_Same(one) for one in _named(value))
+    return repr(describe(value)), tuple(Same(one) for one in _named(value))
 
 
 @dataclass(frozen=True, eq=False)
-class _Same:
-    """An object that equals itself alone."""
+class Same:
+    """A key that equals itself alone, whether its value can be hashed or not.
+
+    It keeps the value: the address of one that is gone is given to another, which would then be taken for it.
+    """
 
     value: object
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.value is self.value
+        return isinstance(other, Same) and other.value is self.value
 
     def __hash__(self) -> int:
         return id(self.value)

@@ -13,6 +13,7 @@ from typing import ClassVar, Literal, cast
 import casadi as ca
 import numpy as np
 
+from fpirhc.describe import Same
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
@@ -126,7 +127,7 @@ _REMEDIES = {
 
 def built(optimiser: Optimiser, ocp: OptimalControl, form: Literal["step", "converging"]) -> ca.Function:
     """Return the Function `step` or `converging`, built once: horizons that differ in numbers of settings only share it."""
-    key = form, plans_are_compiled(), _Same(optimiser)
+    key = form, plans_are_compiled(), Same(optimiser)
     if key not in ocp.functions:
         ocp.functions[key] = getattr(optimiser, form)(ocp.opened())
     return ocp.functions[key]
@@ -300,19 +301,3 @@ def first_plan(
     memory[layout.slice("plan_inputs")] = np.tile(lower + reach / 2, ocp.stages).ravel(order="F")
     other = improved(optimiser, ocp, state, data, memory, calls=calls)
     return other if other[1][4] == Status.OK and other[1][0] < first[1][0] else first
-
-
-class _Same:
-    """A value as a key that equals itself alone, whether it can be hashed or not.
-
-    The key keeps the value: the address of one that is gone is given to another, which would then find its Function.
-    """
-
-    def __init__(self, value: object) -> None:
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.value is self.value
-
-    def __hash__(self) -> int:
-        return id(self.value)

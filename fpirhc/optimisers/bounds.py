@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl, answered_curvature
-from fpirhc.horizon.riccati import Expansion
+from fpirhc.horizon.riccati import Expansion, in_reverse
 from fpirhc.optimisers.base import FEASIBLE, KEPT, clip
 from fpirhc.symbolic.expression import FINITE, is_finite
 
@@ -322,8 +322,8 @@ def _adjoint(ocp: OptimalControl, limits: Limited, p: Expansion, push: ca.MX) ->
     after = costate + more
     stage = ca.Function("fpirhc_certified_stage", y, [by_state + a.T @ after, by_input + b.T @ after])
     pushed = limits.on_states(push)
-    turned = [_turned(v, n) for v in (p.a, p.b, p.by_state, p.by_input, pushed)]
-    return _turned(stage.mapaccum("fpirhc_certified_stages", n)(p.tail, *turned)[1], n)
+    turned = [in_reverse(v, n) for v in (p.a, p.b, p.by_state, p.by_input, pushed)]
+    return in_reverse(stage.mapaccum("fpirhc_certified_stages", n)(p.tail, *turned)[1], n)
 
 
 def largest_gap(p: Expansion, scales: Scales) -> ca.MX:
@@ -357,7 +357,3 @@ def _stage_product(stacked: ca.MX, costates: ca.MX, columns: int, rows: int, n: 
     """A_i' lambda_{i+1} for every stage, (columns, N)."""
     a, costate = ca.SX.sym("a", rows, columns), ca.SX.sym("l", rows)
     return ca.Function("fpirhc_stage_product", [a, costate], [a.T @ costate]).map(n)(stacked, costates)
-
-
-def _turned(stacked: ca.MX, stages: int) -> ca.MX:
-    return ca.horzcat(*reversed(ca.horzsplit(stacked, stacked.shape[1] // stages))) if stages > 1 else stacked
