@@ -311,12 +311,12 @@ class Gate:
 
         This and `_after` are scalar code: a graph would pass over these few numbers one operation after the other.
         """
-        symbols, judged = self._judged()
+        symbols, judged = self._judged
         return _scalar("before", symbols, [judged.fits, self._told.join(judged.told), judged.passes])
 
     def _after(self) -> ca.Function:
         """Function (sample, kept, time, usable, fine, status, command) -> (status, kept one cycle later)."""
-        symbols, judged = self._judged()
+        symbols, judged = self._judged
         own, status, gap = self.kept.split(symbols[1]), ca.SX.sym("status", int("status" in self.inner.trace)), self.gap
         usable, fine, command = (
             ca.SX.sym(n, k) for n, k in (("usable", 1), ("fine", 1), ("command", judged.held.numel()))
@@ -335,6 +335,7 @@ class Gate:
         ended = ca.if_else(fits, ca.if_else(fine, ended, int(Status.NON_FINITE)), int(Status.BAD_SAMPLE))
         return _scalar("after", [*symbols, usable, fine, status, command], [ended, self.kept.join(following)])
 
+    @cached_property
     def _judged(self) -> tuple[list[ca.SX], _Judged]:
         """Symbols of (sample, kept, time), and what they say."""
         inputs = self.problem.plant.input.size
