@@ -17,6 +17,7 @@ import fpirhc as fp
 from fpirhc.errors import NotSupported
 from fpirhc.export.lab import lab as module
 from fpirhc.export.lab.lab import Lab, make_lab, page, with_parameter
+from fpirhc.symbolic.paths import changed_at
 
 CASES = {
     "two_mass": ("RHC", "RHC+FPI"),
@@ -26,7 +27,7 @@ CASES = {
 }
 DRIVER = """
 const asked = JSON.parse(require("fs").readFileSync(process.argv[2]));
-globalThis.postMessage = (said) => { if (said.ready) return onmessage({ data: { number: 1, numbers: asked.numbers } });
+globalThis.postMessage = (said) => { if (said.ready) return onmessage({ data: { ...asked, loops: undefined, number: 1 } });
   console.log(JSON.stringify(said, (_, v) => (v instanceof Float64Array ? [...v] : v))); };
 """
 
@@ -50,7 +51,13 @@ def answers(lab: Lab, moved: dict[str, float], folder: Path) -> Any:
         ]
         for k in range(len(lab.loops))
     ]
-    (folder / "asked.json").write_text(json.dumps({"loops": data["loops"], "numbers": numbers}))
+    series = [
+        {"table": table, "column": column, "ratio": moved[s["path"]] / s["value"]}
+        for s in data["sliders"]
+        if s["path"] in moved
+        for table, column in s["series"]
+    ]
+    (folder / "asked.json").write_text(json.dumps({"loops": data["loops"], "numbers": numbers, "series": series}))
     end = "\nonmessage({ data: { loops: asked.loops } });\n"
     (folder / "worker.cjs").write_text(data["worker"].replace("onmessage =", "globalThis.onmessage =") + DRIVER + end)
     done = subprocess.run(
@@ -64,7 +71,7 @@ def answers(lab: Lab, moved: dict[str, float], folder: Path) -> Any:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
-    """Every curve and the sums of squares, with parameters of plant and model and a gain moved: 1e-12 of the largest."""
+    """Every curve and the sums of squares, with parameters of plant and model, a gain and the noise moved: 1e-12 of the largest."""
     pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
@@ -75,12 +82,17 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
         path = next(p for p in paths if p.startswith(ends[0]) and p.endswith(ends[1]))
         moved[path] = ratio * paths[path].value
     exact, approximate, gain = moved
+    noise = [s.path for s in lab.sliders if s.series]
+    assert noise == (["sensing.sensors.speed.noise.deviation"] if name == "noisy_motor" else [])
+    moved |= {path: 0.7 * paths[path].value for path in noise}
     said = answers(lab, moved, tmp_path)
     for loop, one in zip(lab.loops, said, strict=True):
         problem = variant = loop.ready.problem
         for path in (exact, approximate):
             side, _, key = path.partition(".")
             variant = with_parameter(variant, key, side, moved[path])
+        for path in noise:
+            variant = changed_at(variant, path, moved[path])
         settings = {gain: moved[gain]} if gain in loop.ready.live.paths else {}
         run = loop.ready.run(seed=0, variant=variant, settings=settings)
         assert one["cycles"] == problem.cycles

@@ -54,7 +54,8 @@ function changed() {
   waiting = false;
   began = performance.now();
   const numbers = DATA.loops.map((_, j) => DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : s.places[j].map((place) => ({ place, value: now[k] })))));
-  worker.postMessage({ numbers, number: ++sent });
+  const series = DATA.sliders.flatMap((s, k) => s.series.map(([table, column]) => ({ table, column, ratio: now[k] / s.value })));
+  worker.postMessage({ numbers, series, number: ++sent });
   remember();
 }
 
@@ -107,12 +108,15 @@ function remember() {
   const moved = DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : [[s.path, now[k]]]));
   history.replaceState(null, "", moved.length ? "#" + moved.map(([p, v]) => encodeURIComponent(p) + "=" + v).join("&") : location.pathname + location.search);
   const of = (side) => moved.filter(([p]) => p.startsWith(side + ".")).map(([p, v]) => [p.slice(side.length + 1), v]);
-  const settings = moved.filter(([p]) => !/^(exact|approximate)\./.test(p));
+  const noise = moved.filter(([p]) => DATA.sliders.some((s) => s.path === p && s.series.length));
+  const settings = moved.filter(([p]) => !/^(exact|approximate)\./.test(p) && !noise.some(([q]) => p === q));
   const parts = (list) => list.map(([p, v]) => `"${p}": ${v}`).join(", ");
   const lines = ["import fpirhc as fp", "from dataclasses import replace", "", `task = fp.load_problem(${JSON.stringify(DATA.file)})`, "problem = task.problem"];
   for (const side of ["exact", "approximate"])
     if (of(side).length) lines.push(`parameters = {**problem.plant.parameters}`, ...of(side).map(([n, v]) => `parameters["${n}"] = replace(parameters["${n}"], ${side}=${v})`),
       "problem = replace(problem, plant=replace(problem.plant, parameters=parameters))");
+  if (noise.length) lines.splice(2, 0, "from fpirhc.symbolic.paths import changed_at");
+  for (const [p, v] of noise) lines.push(`problem = changed_at(problem, "${p}", ${v})`);
   for (const loop of DATA.loops) {
     const own = settings.filter(([p]) => loop.live.includes(p));
     const given = own.length ? `, settings={${parts(own)}}` : "";

@@ -1,8 +1,8 @@
 """A page with sliders: the closed loops of a problem as WebAssembly, run anew in the browser while a slider moves.
 
-Sliders write numbers into the loop's first memory, where parameters and live settings are. One whose number changes anything else
-there, which Python would have to compute, is left out, and the page says why. Automatic settings and scales of plans stay those of
-the build, as in a controller that is deployed.
+Sliders write numbers into the loop's first memory, where parameters and live settings are, or scale the random series of a run. One
+whose number changes anything else there, which Python would have to compute, is left out, and the page says why. Automatic settings
+and scales of plans stay those of the build, as in a controller that is deployed.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.simulate import Simulator, run_tables, simulator
 from fpirhc.symbolic.driver import SIGNATURE
 from fpirhc.symbolic.live import PREFIX
-from fpirhc.symbolic.paths import paths_to
+from fpirhc.symbolic.paths import changed_at, content_at, paths_to
 from fpirhc.task.problem import Problem
 from fpirhc.whole_file import write_whole
 
 _POINTS = 2000  # of a curve
 _SPAN = 4.0  # a slider goes from a fourth to four times its number
+_RANDOM = ("sensing", "disturbances")  # parts of a problem with random series
 _SETTINGS = ("gain", "rate")  # sliders where nobody asks for others, beside the limits of inputs
 
 
@@ -45,12 +46,13 @@ class Slider:
     """A number that is moved in the page.
 
     Args:
-        path: of a live setting, or exact.NAME and approximate.NAME of a parameter.
+        path: of a live setting, exact.NAME and approximate.NAME of a parameter, or that of a deviation of noise in the problem.
         unit: of it.
         value: number of the build.
         low: smallest number.
         high: largest number.
         places: entries of the loops' memories, by the number of the loop.
+        series: (table, column) of what the loops read that has the size of this number.
     """
 
     path: str
@@ -59,6 +61,7 @@ class Slider:
     low: float
     high: float
     places: dict[int, list[int]]
+    series: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +198,7 @@ def make_lab(
         raise NotSupported(
             f"no controller of the lab can have '{lost[0]}' live: {without.get(lost[0], 'it is not there')}"
         )
-    sliders = [*_settings(loops, without), *_parameters(problem, loops, without)]
+    sliders = [*_settings(loops, without), *_parameters(problem, loops, without), *_noise(problem, loops, without)]
     return Lab(title, about, file, tuple(loops), tuple(sliders), without)
 
 
@@ -243,6 +246,27 @@ def with_parameter(problem: Problem, name: str, side: str, value: float) -> Prob
     parameter = problem.plant.parameters[name]
     changed = replace(parameter, exact=value) if side == "exact" else replace(parameter, approximate=value)
     return replace(problem, plant=replace(problem.plant, parameters={**problem.plant.parameters, name: changed}))
+
+
+def _noise(problem: Problem, loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:
+    """Sliders of the deviations of sensors and disturbances: the series that the loops read are proportional to them."""
+    sliders = []
+    for path in (f"{part}.{inside}" for part in _RANDOM for inside in paths_to("deviation", getattr(problem, part))):
+        value = float(content_at(problem, path, "the problem"))  # type: ignore[arg-type]
+        twice = run_tables(changed_at(problem, path, 2 * value), 0, problem.cycles)
+        tables = loops[0].tables
+        series = tuple(
+            (k, int(column))
+            for k, table in enumerate(tables)
+            for column in np.flatnonzero((twice[k] != table).any(axis=0))
+        )
+        if not series:
+            without[path] = "it is zero: nothing says how far a slider would go"
+        elif any(not np.array_equal(twice[k][:, column], 2 * tables[k][:, column]) for k, column in series):
+            without[path] = "the series that it belongs to is not proportional to it"
+        else:
+            sliders.append(Slider(path, "", value, value / _SPAN, value * _SPAN, {}, series))
+    return sliders
 
 
 def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:
@@ -360,6 +384,7 @@ def _loop_data(loop: LabLoop) -> dict[str, Any]:
         "start": loop.start.tolist(),
         "tables": [base64.b64encode(np.ascontiguousarray(t, dtype="<f8").tobytes()).decode() for t in loop.tables],
         "every": loop.every,
+        "cycles": loop.ready.problem.cycles,
         "shown": len(loop.shown),
         "errors": len(loop.ready.loop.trace[loop.error].columns),
         "live": list(loop.ready.live.paths),

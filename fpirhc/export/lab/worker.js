@@ -11,14 +11,20 @@ async function made(loop) {
   const { instance } = await WebAssembly.instantiate(bytes(loop.module), {});
   const e = instance.exports;
   if (e._initialize) e._initialize();
-  loop.tables.forEach((table, k) => new Uint8Array(e.memory.buffer, e["table_" + k](), bytes(table).length).set(bytes(table)));
-  return { ...loop, exports: e };
+  const drawn = loop.tables.map((table) => new Float64Array(bytes(table).buffer));
+  drawn.forEach((table, k) => new Float64Array(e.memory.buffer, e["table_" + k](), table.length).set(table));
+  return { ...loop, drawn, exports: e };
 }
 
-function run(loop, numbers) {
+function run(loop, numbers, series) {
   const e = loop.exports, memory = new Float64Array(e.memory.buffer, e.memory_at(), loop.start.length);
   memory.set(loop.start);
   for (const { place, value } of numbers) memory[place] = value;
+  for (const { table, column, ratio } of series) {
+    const drawn = loop.drawn[table], width = drawn.length / loop.cycles;
+    const read = new Float64Array(e.memory.buffer, e["table_" + table](), drawn.length);
+    for (let k = column; k < drawn.length; k += width) read[k] = ratio * drawn[k];
+  }
   const began = performance.now(), cycles = e.run();
   const rows = Math.ceil(cycles / loop.every), width = loop.shown;
   const kept = new Float64Array(e.memory.buffer, e.kept_at(), rows * width);
@@ -32,7 +38,7 @@ onmessage = async ({ data }) => {
     if (data.loops) {
       loops = await Promise.all(data.loops.map(made));
       postMessage({ ready: true });
-    } else postMessage({ number: data.number, answers: loops.map((loop, k) => run(loop, data.numbers[k])) });
+    } else postMessage({ number: data.number, answers: loops.map((loop, k) => run(loop, data.numbers[k], data.series)) });
   } catch (error) {
     postMessage({ error: String(error) });
   }
