@@ -5,50 +5,53 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
+from fpirhc.task.problem import Problem
 
 Values = Mapping[str, float]
 _DIGITS = 4  # of every number that is tried, so that a written number is exactly the tried one
 
 
-def with_settings(controller: Controller, values: Values) -> Controller:
-    """Return the controller with other values of some settings.
+Owner = TypeVar("Owner", Controller, Problem)
+
+
+def with_settings(owner: Owner, values: Values) -> Owner:
+    """Return a controller, or a problem, with other values of some settings.
 
     Args:
-        controller: the controller; it stays as it is.
+        owner: the controller or the problem; it stays as it is.
         values: path -> number. A path leads through fields, keys of mappings and places of tuples, with dots in between:
-            'deformation.gain', 'cost.states.q1'.
+            'deformation.gain', 'cost.states.q1', of a problem 'plant.parameters.mass.exact'.
 
     Raises:
         InvalidName: no such setting; the nearest one is offered.
         InvalidValue: the setting is not a number, or does not accept this one.
     """
-    changed: Any = controller
+    changed = owner
     for path, value in values.items():
-        current_setting(controller, path)
+        current_setting(owner, path)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InvalidValue(f"setting '{path}': expected a number, got {value!r}")
-        if is_whole(controller, path) and not isinstance(value, int):
+        if is_whole(owner, path) and not isinstance(value, int):
             raise InvalidValue(f"setting '{path}': expected a whole number, got {value!r}")
         changed = changed_at(changed, path, value)
-    assert isinstance(changed, Controller)
     return changed
 
 
-def current_setting(controller: Controller, path: str) -> float:
+def current_setting(owner: Controller | Problem, path: str) -> float:
     """Return the number at a path.
 
     Raises:
         InvalidName: no such setting; the nearest one is offered.
         InvalidValue: the setting is not a number.
     """
-    value = content_at(controller, path)
+    value = content_at(owner, path, "the problem" if isinstance(owner, Problem) else "the controller")
     if isinstance(value, bool) or not isinstance(value, int | float):
         hint = (
             " give it a number first"
@@ -59,11 +62,11 @@ def current_setting(controller: Controller, path: str) -> float:
     return value
 
 
-def is_whole(controller: Controller, path: str) -> bool:
+def is_whole(owner: Controller | Problem, path: str) -> bool:
     """Whether the setting at a path is declared as a whole number."""
     parent, _, name = path.rpartition(".")
-    owner: Any = content_at(controller, parent) if parent else controller
-    return is_dataclass(owner) and expects_whole_number(type(owner), name)
+    part: Any = content_at(owner, parent) if parent else owner
+    return is_dataclass(part) and expects_whole_number(type(part), name)
 
 
 @dataclass(frozen=True)

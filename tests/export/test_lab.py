@@ -16,7 +16,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.errors import NotSupported
 from fpirhc.export.lab import lab as module
-from fpirhc.export.lab.lab import Lab, make_lab, page, with_parameter
+from fpirhc.export.lab.lab import Lab, make_lab, page
 from fpirhc.symbolic.paths import changed_at
 
 CASES = {
@@ -51,13 +51,13 @@ def answers(lab: Lab, moved: dict[str, float], folder: Path) -> Any:
         ]
         for k in range(len(lab.loops))
     ]
-    series = [
-        {"table": table, "column": column, "ratio": moved[s["path"]] / s["value"]}
+    rows = [
+        {**one, "value": moved[s["path"]], "ratio": moved[s["path"]] / (s["value"] or 1)}
         for s in data["sliders"]
         if s["path"] in moved
-        for table, column in s["series"]
+        for one in s["rows"]
     ]
-    (folder / "asked.json").write_text(json.dumps({"loops": data["loops"], "numbers": numbers, "series": series}))
+    (folder / "asked.json").write_text(json.dumps({"loops": data["loops"], "numbers": numbers, "rows": rows}))
     end = "\nonmessage({ data: { loops: asked.loops } });\n"
     (folder / "worker.cjs").write_text(data["worker"].replace("onmessage =", "globalThis.onmessage =") + DRIVER + end)
     done = subprocess.run(
@@ -82,15 +82,16 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
         path = next(p for p in paths if p.startswith(ends[0]) and p.endswith(ends[1]))
         moved[path] = ratio * paths[path].value
     exact, approximate, gain = moved
-    noise = [s.path for s in lab.sliders if s.series]
+    noise = [s.path for s in lab.sliders if s.rows]
     assert noise == (["sensing.sensors.speed.noise.deviation"] if name == "noisy_motor" else [])
+    assert all(paths[path].unit == "rad/s" for path in noise)
     moved |= {path: 0.7 * paths[path].value for path in noise}
     said = answers(lab, moved, tmp_path)
     for loop, one in zip(lab.loops, said, strict=True):
         problem = variant = loop.ready.problem
         for path in (exact, approximate):
             side, _, key = path.partition(".")
-            variant = with_parameter(variant, key, side, moved[path])
+            variant = changed_at(variant, f"plant.parameters.{key}.{side}", moved[path])
         for path in noise:
             variant = changed_at(variant, path, moved[path])
         settings = {gain: moved[gain]} if gain in loop.ready.live.paths else {}
@@ -102,6 +103,30 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
         error = np.reshape(run[loop.error], (problem.cycles, -1))
         counted = error[int(np.ceil(problem.measure_from / problem.period - 1e-9)) :]
         assert np.allclose(one["squares"], (counted**2).sum(axis=0), rtol=1e-9, atol=0)
+
+
+def test_dead_time_and_set_points_have_the_numbers_of_a_task_that_states_them(tmp_path):
+    """Dead time of an input that has none, and two set-points of one coordinate: 1e-12 of the largest number."""
+    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    task, name = fp.load_problem("two_mass"), "CTC+FPI (eq 6)"
+    steps: Any = {"q1": [(0.0, 0.1), (0.3, 0.2)], "q2": 1.0}
+    reference = fp.Setpoint(steps, rate=20.0, start={"q1": 0.0, "q2": 0.9})
+    problem = replace(task.problem, duration=0.6, measure_from=0.0, reference=reference)
+    lab = make_lab("two_mass", "", "two_mass", problem, {name: task.controllers[name]})
+    paths = {s.path: s for s in lab.sliders}
+    wait, first, second = paths["dead_time.inputs.Q1"], paths["setpoints.q1.0"], paths["setpoints.q1.1"]
+    assert (wait.value, wait.low, wait.unit, first.unit) == (0.0, 0.0, "s", "m")
+    assert wait.high == pytest.approx(5 * problem.period, rel=1e-5)
+    assert [(r.first, r.last) for r in first.rows + second.rows] == [(0, 300), (300, 600)]
+    moved = {wait.path: 2.5 * problem.period, first.path: 0.15, second.path: 0.05}
+    said = answers(lab, moved, tmp_path)[0]
+    late = replace(problem, dead_time=fp.DeadTime(inputs={"Q1": 2.5 * problem.period}))
+    run = fp.simulate(late, task.controllers[name], seed=0, setpoints={"q1": [(0.0, 0.15), (0.3, 0.05)]})
+    for column, values in zip(lab.loops[0].shown, said["columns"], strict=True):
+        wanted = np.ravel(run[column])
+        assert np.abs(np.array(values) - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max()), column
 
 
 def test_a_slider_that_needs_python_is_left_out_and_says_why(monkeypatch):

@@ -262,3 +262,12 @@ def test_a_search_space_that_is_missing_is_offered_for_a_controller_that_adapts(
     alone = replace(task, controllers={"RHC": task.controllers["RHC"]}, headline=None)
     with pytest.raises(InvalidProblem, match=r"tuning = \{'RHC': \{'tracking\.rate'"):
         fp.tune(alone, trials=1, seed=0, folder=tmp_path)
+
+
+def test_settings_of_a_problem():
+    """A parameter by its path; the problem stays as it is, and a wrong name is of the problem."""
+    problem = fp.load_problem("two_mass").problem
+    changed = fp.with_settings(problem, {"plant.parameters.m1.exact": 1.25})
+    assert (changed.plant.parameters["m1"].exact, problem.plant.parameters["m1"].exact) == (1.25, 1.0)
+    with pytest.raises(fp.FpirhcError, match=r"'plant\.parameters' of the problem has no 'm3'"):
+        fp.with_settings(problem, {"plant.parameters.m3.exact": 1.0})

@@ -54,8 +54,8 @@ function changed() {
   waiting = false;
   began = performance.now();
   const numbers = DATA.loops.map((_, j) => DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : s.places[j].map((place) => ({ place, value: now[k] })))));
-  const series = DATA.sliders.flatMap((s, k) => s.series.map(([table, column]) => ({ table, column, ratio: now[k] / s.value })));
-  worker.postMessage({ numbers, series, number: ++sent });
+  const rows = DATA.sliders.flatMap((s, k) => s.rows.map((one) => ({ ...one, value: now[k], ratio: now[k] / s.value })));
+  worker.postMessage({ numbers, rows, number: ++sent });
   remember();
 }
 
@@ -107,19 +107,26 @@ function verdict(answers) {
 function remember() {
   const moved = DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : [[s.path, now[k]]]));
   history.replaceState(null, "", moved.length ? "#" + moved.map(([p, v]) => encodeURIComponent(p) + "=" + v).join("&") : location.pathname + location.search);
-  const of = (side) => moved.filter(([p]) => p.startsWith(side + ".")).map(([p, v]) => [p.slice(side.length + 1), v]);
-  const noise = moved.filter(([p]) => DATA.sliders.some((s) => s.path === p && s.series.length));
-  const settings = moved.filter(([p]) => !/^(exact|approximate)\./.test(p) && !noise.some(([q]) => p === q));
-  const parts = (list) => list.map(([p, v]) => `"${p}": ${v}`).join(", ");
-  const lines = ["import fpirhc as fp", "from dataclasses import replace", "", `task = fp.load_problem(${JSON.stringify(DATA.file)})`, "problem = task.problem"];
-  for (const side of ["exact", "approximate"])
-    if (of(side).length) lines.push(`parameters = {**problem.plant.parameters}`, ...of(side).map(([n, v]) => `parameters["${n}"] = replace(parameters["${n}"], ${side}=${v})`),
-      "problem = replace(problem, plant=replace(problem.plant, parameters=parameters))");
-  if (noise.length) lines.splice(2, 0, "from fpirhc.symbolic.paths import changed_at");
-  for (const [p, v] of noise) lines.push(`problem = changed_at(problem, "${p}", ${v})`);
+  const among = (test) => moved.filter(([p]) => test(p));
+  const sides = /^(exact|approximate)\.(.*)/, late = /^dead_time\.inputs\.(.*)/, points = /^setpoints\.(.*)\.(\d+)$/;
+  const scaled = (p) => DATA.sliders.some((s) => s.path === p && s.rows.some((one) => one.scaled));
+  const listed = (list) => list.map(([p, v]) => `"${p}": ${v}`).join(", ");
+  const numbers = among((p) => sides.test(p) || scaled(p)).map(([p, v]) => [p.replace(sides, "plant.parameters.$2.$1"), v]);
+  const waits = among((p) => late.test(p)).map(([p, v]) => [p.replace(late, "$1"), v]);
+  const aims = structuredClone(DATA.setPoints), changed = new Set();
+  for (const [p, v] of among((p) => points.test(p))) {
+    const [, name, k] = p.match(points);
+    aims[name][k][1] = v;
+    changed.add(name);
+  }
+  const settings = among((p) => ![sides, late, points].some((one) => one.test(p)) && !scaled(p));
+  const lines = ["import fpirhc as fp", ...(waits.length ? ["from dataclasses import replace"] : []), "", `task = fp.load_problem(${JSON.stringify(DATA.file)})`, "problem = task.problem"];
+  if (numbers.length) lines.push(`problem = fp.with_settings(problem, {${listed(numbers)}})`);
+  if (waits.length) lines.push(`inputs = {**problem.dead_time.inputs, ${listed(waits)}}`, "problem = replace(problem, dead_time=replace(problem.dead_time, inputs=inputs))");
+  const aimed = changed.size ? `, setpoints={${[...changed].map((name) => `"${name}": ${JSON.stringify(aims[name])}`).join(", ")}}` : "";
   for (const loop of DATA.loops) {
     const own = settings.filter(([p]) => loop.live.includes(p));
-    const given = own.length ? `, settings={${parts(own)}}` : "";
+    const given = (own.length ? `, settings={${listed(own)}}` : "") + aimed;
     lines.push(`print(fp.simulate(problem, task.controllers[${JSON.stringify(loop.name)}], seed=0${given}))`);
   }
   say("python", lines.join("\n"));

@@ -1,8 +1,8 @@
 """A page with sliders: the closed loops of a problem as WebAssembly, run anew in the browser while a slider moves.
 
-Sliders write numbers into the loop's first memory, where parameters and live settings are, or scale the random series of a run. One
-whose number changes anything else there, which Python would have to compute, is left out, and the page says why. Automatic settings
-and scales of plans stay those of the build, as in a controller that is deployed.
+Sliders write numbers into the loop's first memory, where parameters and live settings are, or into what it reads in every cycle:
+set-points, and random series in proportion. One whose number changes anything else there, which Python would have to compute, is
+left out, and the page says why. Automatic settings and scales of plans stay those of the build, as in a deployed controller.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from fpirhc.errors import FpirhcError, NotSupported, package
 from fpirhc.export.binaries import web_module
 from fpirhc.export.device import c_of
 from fpirhc.export.targets.c import template, with_own_math
+from fpirhc.plant.motion import forcing_units
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.log import judged_motion
@@ -33,12 +34,29 @@ from fpirhc.symbolic.driver import SIGNATURE
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.symbolic.paths import changed_at, content_at, paths_to
 from fpirhc.task.problem import Problem
+from fpirhc.task.reference import pairs
 from fpirhc.whole_file import write_whole
 
 _POINTS = 2000  # of a curve
 _SPAN = 4.0  # a slider goes from a fourth to four times its number
+_WAIT = 5  # cycles of dead time that an input without any may get
 _RANDOM = ("sensing", "disturbances")  # parts of a problem with random series
 _SETTINGS = ("gain", "rate")  # sliders where nobody asks for others, beside the limits of inputs
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A part of a column of what the loops read in every cycle: rows `first` to before `last`.
+
+    Args:
+        scaled: whether the part is proportional to a slider's number; else it is this number.
+    """
+
+    table: int
+    column: int
+    first: int
+    last: int
+    scaled: bool
 
 
 @dataclass(frozen=True)
@@ -46,13 +64,14 @@ class Slider:
     """A number that is moved in the page.
 
     Args:
-        path: of a live setting, exact.NAME and approximate.NAME of a parameter, or that of a deviation of noise in the problem.
+        path: of a live setting, exact.NAME and approximate.NAME of a parameter, that of a deviation of noise in the problem, or
+            setpoints.NAME.K of the K-th set-point of a coordinate.
         unit: of it.
         value: number of the build.
         low: smallest number.
         high: largest number.
         places: entries of the loops' memories, by the number of the loop.
-        series: (table, column) of what the loops read that has the size of this number.
+        rows: of what the loops read in every cycle.
     """
 
     path: str
@@ -61,7 +80,7 @@ class Slider:
     low: float
     high: float
     places: dict[int, list[int]]
-    series: tuple[tuple[int, int], ...] = ()
+    rows: tuple[Rows, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,14 +210,20 @@ def make_lab(
     package("ziglang", "compiler", "a lab")
     loops, without = [], dict[str, str]()
     for name, controller in controllers.items():
-        wanted = list(live) or _usual(problem, controller)
-        loops.append(LabLoop(name, _with_live(problem, controller, wanted, without)))
+        roomy = _with_room(problem, controller)
+        wanted = list(live) or _usual(roomy, controller)
+        loops.append(LabLoop(name, _with_live(roomy, controller, wanted, without)))
     lost = [path for path in live if not any(loop.opens(path) for loop in loops)]
     if lost:
         raise NotSupported(
             f"no controller of the lab can have '{lost[0]}' live: {without.get(lost[0], 'it is not there')}"
         )
-    sliders = [*_settings(loops, without), *_parameters(problem, loops, without), *_noise(problem, loops, without)]
+    sliders = [
+        *_settings(loops, without),
+        *_parameters(problem, loops, without),
+        *_noise(problem, loops, without),
+        *_set_points(problem, loops),
+    ]
     return Lab(title, about, file, tuple(loops), tuple(sliders), without)
 
 
@@ -208,7 +233,22 @@ def _usual(problem: Problem, controller: Controller) -> list[str]:
     return [
         *found,
         *(f"limits.inputs.{name}" for name, ends in problem.limits.inputs.items() if np.isfinite(ends).any()),
+        *(f"dead_time.inputs.{name}" for name in problem.dead_time.inputs),
+        *(["dead_time.measurement"] if problem.dead_time.measurement else []),
     ]
+
+
+def _with_room(problem: Problem, controller: Controller) -> Problem:
+    """The problem with a queue for every input, where the controller can have one: its dead time is then a number in the memory."""
+    late = problem.dead_time
+    rooms = {name: _WAIT * problem.period for name in problem.plant.inputs if name not in late.queued}
+    inputs = {**dict.fromkeys(rooms, 0.0), **late.inputs}
+    roomy = replace(problem, dead_time=replace(late, inputs=inputs, longest={**late.longest, **rooms}))
+    try:
+        simulator(roomy, controller, compiled=False)
+    except FpirhcError:
+        return problem
+    return roomy
 
 
 def _with_live(problem: Problem, controller: Controller, wanted: list[str], without: dict[str, str]) -> Simulator:
@@ -229,7 +269,7 @@ def _parameters(problem: Problem, loops: Sequence[LabLoop], without: dict[str, s
     sliders = []
     for name, parameter in problem.plant.parameters.items():
         for side, value in (("exact", parameter.exact), ("approximate", parameter.approximate)):
-            other = with_parameter(problem, name, side, value * (1 + 2**-10))
+            other = changed_at(problem, f"plant.parameters.{name}.{side}", value * (1 + 2**-10))
             path = f"{side}.{name}"
             if not value:
                 without[path] = "it is zero: nothing says how far a slider would go"
@@ -241,32 +281,61 @@ def _parameters(problem: Problem, loops: Sequence[LabLoop], without: dict[str, s
     return sliders
 
 
-def with_parameter(problem: Problem, name: str, side: str, value: float) -> Problem:
-    """Return a problem with another parameter, "exact" or "approximate"."""
-    parameter = problem.plant.parameters[name]
-    changed = replace(parameter, exact=value) if side == "exact" else replace(parameter, approximate=value)
-    return replace(problem, plant=replace(problem.plant, parameters={**problem.plant.parameters, name: changed}))
-
-
 def _noise(problem: Problem, loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:
     """Sliders of the deviations of sensors and disturbances: the series that the loops read are proportional to them."""
     sliders = []
     for path in (f"{part}.{inside}" for part in _RANDOM for inside in paths_to("deviation", getattr(problem, part))):
         value = float(content_at(problem, path, "the problem"))  # type: ignore[arg-type]
         twice = run_tables(changed_at(problem, path, 2 * value), 0, problem.cycles)
-        tables = loops[0].tables
-        series = tuple(
-            (k, int(column))
-            for k, table in enumerate(tables)
-            for column in np.flatnonzero((twice[k] != table).any(axis=0))
-        )
-        if not series:
+        rows = _moved(loops[0].tables, twice, scaled=True)
+        if not rows:
             without[path] = "it is zero: nothing says how far a slider would go"
-        elif any(not np.array_equal(twice[k][:, column], 2 * tables[k][:, column]) for k, column in series):
+        elif any(
+            not np.array_equal(twice[r.table][:, r.column], 2 * loops[0].tables[r.table][:, r.column]) for r in rows
+        ):
             without[path] = "the series that it belongs to is not proportional to it"
         else:
-            sliders.append(Slider(path, "", value, value / _SPAN, value * _SPAN, {}, series))
+            unit = _unit_read(loops[0], rows[0])
+            sliders.append(Slider(path, unit, value, value / _SPAN, value * _SPAN, {}, rows))
     return sliders
+
+
+def _set_points(problem: Problem, loops: Sequence[LabLoop]) -> list[Slider]:
+    """Sliders of the set-points of a run, each in force until the next one; the filter begins where it does in the file."""
+    sliders, units = [], dict(zip(problem.plant.chains, problem.plant.output.units, strict=False))
+    steps = {name: pairs(name, given) for name, given in problem.reference.set_points.items()}
+    for name, own in steps.items():
+        values = [value for _, value in own]
+        span = max(values) - min(values) or max(abs(values[0]), 1.0)
+        for k, (time, value) in enumerate(own):
+            other = {name: [*own[:k], (time, value + span), *own[k + 1 :]]}
+            rows = _moved(loops[0].tables, run_tables(problem, 0, problem.cycles, setpoints=other), scaled=False)
+            if rows:
+                sliders.append(
+                    Slider(f"setpoints.{name}.{k}", units[name], value, value - span, value + span, {}, rows)
+                )
+    return sliders
+
+
+def _moved(tables: Sequence[np.ndarray], others: Sequence[np.ndarray], *, scaled: bool) -> tuple[Rows, ...]:
+    """The parts of columns in which tables differ from others."""
+    parts = []
+    for number, (table, other) in enumerate(zip(tables, others, strict=True)):
+        for column in np.flatnonzero((other != table).any(axis=0)).tolist():
+            at = np.flatnonzero(other[:, column] != table[:, column])
+            parts.append(Rows(number, column, int(at[0]), int(at[-1]) + 1, scaled))
+    return tuple(parts)
+
+
+def _unit_read(loop: LabLoop, rows: Rows) -> str:
+    """The unit of a random series: that of the signal to which it adds."""
+    plant, trace = loop.ready.problem.plant, loop.ready.loop.trace
+    name = loop.ready.loop.reads.signals[rows.table].elements[rows.column].removesuffix(" noise")
+    units = dict(zip(plant.names, forcing_units(plant), strict=True))
+    signals = [trace["measured"]] if rows.table and "measured" in trace else [plant.input]
+    for signal in signals:
+        units |= dict(zip(signal.elements, signal.entry_units, strict=True))
+    return units.get(name, "")
 
 
 def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:
@@ -282,7 +351,9 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
         size = max(abs(value), 1e-3)
         low, high = (
             max(low, min(value / _SPAN, value * _SPAN, value - size)),
-            min(high, max(value / _SPAN, value * _SPAN)),
+            min(high, max(value / _SPAN, value * _SPAN))
+            if value
+            else min(high, max(size, _WAIT * having[0].ready.problem.period)),
         )
         step = value + 1e-4 * ((high - value) or (low - value))
         if step == value:
@@ -294,9 +365,18 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
 
         places = _places(loops, started, path, without)
         if places:
-            unit = having[0].ready.live.signals[PREFIX + path].entry_units[0]
-            sliders.append(Slider(path, unit, value, low, high, places))
+            sliders.append(Slider(path, _unit_of(path, having[0].ready.problem), value, low, high, places))
     return sliders
+
+
+def _unit_of(path: str, problem: Problem) -> str:
+    """The unit of a live setting, where its kind says it."""
+    kind, _, name = path.rpartition("inputs.")
+    if kind == "limits.":
+        return dict(zip(problem.plant.inputs, problem.plant.input.entry_units, strict=True))[
+            name.rpartition(".")[0] or name
+        ]
+    return problem.time_unit if path.startswith("dead_time.") else ""
 
 
 def _places(
@@ -352,7 +432,15 @@ def page(lab: Lab) -> str:
         "worker": _own("worker.js"),
         "colors": list(PALETTE),
         "loops": [_loop_data(loop) for loop in lab.loops],
-        "sliders": [{**vars(s), "places": [s.places.get(k, []) for k in range(len(lab.loops))]} for s in lab.sliders],
+        "sliders": [
+            {
+                **vars(s),
+                "places": [s.places.get(k, []) for k in range(len(lab.loops))],
+                "rows": [vars(r) for r in s.rows],
+            }
+            for s in lab.sliders
+        ],
+        "setPoints": {name: pairs(name, own) for name, own in problem.reference.set_points.items()},
         "without": lab.without,
         "charts": _charts(lab),
     }

@@ -16,14 +16,14 @@ async function made(loop) {
   return { ...loop, drawn, exports: e };
 }
 
-function run(loop, numbers, series) {
+function run(loop, numbers, parts) {
   const e = loop.exports, memory = new Float64Array(e.memory.buffer, e.memory_at(), loop.start.length);
   memory.set(loop.start);
   for (const { place, value } of numbers) memory[place] = value;
-  for (const { table, column, ratio } of series) {
+  for (const { table, column, first, last, scaled, value, ratio } of parts) {
     const drawn = loop.drawn[table], width = drawn.length / loop.cycles;
     const read = new Float64Array(e.memory.buffer, e["table_" + table](), drawn.length);
-    for (let k = column; k < drawn.length; k += width) read[k] = ratio * drawn[k];
+    for (let k = first * width + column; k < last * width; k += width) read[k] = scaled ? ratio * drawn[k] : value;
   }
   const began = performance.now(), cycles = e.run();
   const rows = Math.ceil(cycles / loop.every), width = loop.shown;
@@ -38,7 +38,7 @@ onmessage = async ({ data }) => {
     if (data.loops) {
       loops = await Promise.all(data.loops.map(made));
       postMessage({ ready: true });
-    } else postMessage({ number: data.number, answers: loops.map((loop, k) => run(loop, data.numbers[k], data.series)) });
+    } else postMessage({ number: data.number, answers: loops.map((loop, k) => run(loop, data.numbers[k], data.rows)) });
   } catch (error) {
     postMessage({ error: String(error) });
   }
