@@ -18,6 +18,7 @@ from fpirhc.controllers.gate import BRIDGED
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.c_text import portable
+from fpirhc.export.straight import condensed
 from fpirhc.simulation.clock import most_missed
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
@@ -26,6 +27,7 @@ from fpirhc.symbolic.native import generate, native
 from fpirhc.task.problem import Problem
 
 _RAW = "fpirhc_native"  # name of the generated function, before it has its own
+_INSIDE = re.compile(r"if \((casadi_f\d+)\(arg1, res1, iw, w, 0\)\) return 1;")  # the call of scalar code
 _DRIVER = re.compile(r"\bfpirhc_(\w+_driver)\b")
 _SAMPLE = ("time", "state", "output", "realised", "measured", "taken")
 _C_WORDS = frozenset(
@@ -165,16 +167,22 @@ class BareStep:
 def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, int]]:
     """Return the C files of a Function, whose name in C is NAME_raw, and the sizes of its work: arg, res, iw, w.
 
+    Who calls it passes rows for all that it reads and writes.
+
     Raises:
         NotSupported: a part of it cannot be written as C.
     """
     texts, files = generate(function), []
+    sizes = {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", texts[0])}
+    inside = _INSIDE.findall(texts[0]) if function.is_a("SXFunction") else []
+    if len(inside) == 1:  # scalar code has variables of its own, and needs no copies around it
+        texts = (condensed(texts[0].replace("return casadi_f0(", f"return {inside[0]}(")), *texts[1:])
+        sizes = {"arg": function.n_in(), "res": function.n_out(), "iw": 1, "w": 1}
     for text in texts:
         entry = re.match(r"#define ENTRY (\w+)\n", text)
         visible = entry[1] if entry else _RAW
         own = portable(re.sub(r"\bENTRY\b", visible, text[entry.end() :]) if entry else text, visible)
         files.append(_DRIVER.sub(rf"{name}_\1", re.sub(rf"\b{_RAW}\b", f"{name}_raw", own)))
-    sizes = {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", texts[0])}
     return tuple(files), sizes
 
 
