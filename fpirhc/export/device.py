@@ -18,7 +18,7 @@ from fpirhc.controllers.gate import BRIDGED
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.c_text import portable
-from fpirhc.export.straight import condensed
+from fpirhc.export.straight import condensed, without_detours
 from fpirhc.simulation.clock import most_missed
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
@@ -174,16 +174,29 @@ def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, i
     """
     texts, files = generate(function), []
     sizes = {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", texts[0])}
-    inside = _INSIDE.findall(texts[0]) if function.is_a("SXFunction") else []
-    if len(inside) == 1:  # scalar code has variables of its own, and needs no copies around it
-        texts = (condensed(texts[0].replace("return casadi_f0(", f"return {inside[0]}(")), *texts[1:])
-        sizes = {"arg": function.n_in(), "res": function.n_out(), "iw": 1, "w": 1}
+    text, sizes["w"] = _without_wrapper(texts[0], sizes["w"])
+    if function.is_a("SXFunction") and text != texts[0]:  # scalar code has variables of its own
+        text, sizes = condensed(text), {"arg": function.n_in(), "res": function.n_out(), "iw": 1, "w": 1}
+    texts = (without_detours(text), *texts[1:])
     for text in texts:
         entry = re.match(r"#define ENTRY (\w+)\n", text)
         visible = entry[1] if entry else _RAW
         own = portable(re.sub(r"\bENTRY\b", visible, text[entry.end() :]) if entry else text, visible)
         files.append(_DRIVER.sub(rf"{name}_\1", re.sub(rf"\b{_RAW}\b", f"{name}_raw", own)))
     return tuple(files), sizes
+
+
+def _without_wrapper(text: str, work: int) -> tuple[str, int]:
+    """The C without the copies around the call that its outermost function is, and the work of what is called.
+
+    Results are written where the caller wants them, which is not where the arguments are.
+    """
+    outer = text[text.index("static int casadi_f0(") :]
+    called = _INSIDE.findall(outer)
+    if len(called) != 1:
+        return text, work
+    own = [int(place) for place in re.findall(r"=w\+(\d+)", outer)]
+    return text.replace("return casadi_f0(", f"return {called[0]}("), max(1, min([work, *own]))
 
 
 def identifiers(names: Sequence[str]) -> list[str]:

@@ -69,16 +69,16 @@ static pair times(pair a, pair b) {
   return sum(p.high, p.low);
 }
 
-/* exp(x + low) for a small rest: 1 + r + r^2/2 + ... after r = x - n ln 2. */
+/* exp(x + low) for a small rest: 1 + r + r^2/2 + ... after r = x - n ln 2; the series beyond is interpolated at Chebyshev's nodes. */
 static double exponential(double x, double low) {
-  double n, high, rest, r, q = 1.0 / 6227020800.0;
+  double n, high, rest, r, q = 2.509554606865001e-08;
   if (x != x) return x;
   if (x > 709.79) return HUGE_VAL;
   if (x < -745.2) return 0;
   n = whole(x * 1.4426950408889634), high = x - n * LN2, rest = n * LN2_REST - low, r = high - rest;
-  q = q * r + 1.0 / 479001600.0, q = q * r + 1.0 / 39916800.0, q = q * r + 1.0 / 3628800.0, q = q * r + 1.0 / 362880.0;
-  q = q * r + 1.0 / 40320.0, q = q * r + 1.0 / 5040.0, q = q * r + 1.0 / 720.0, q = q * r + 1.0 / 120.0;
-  q = q * r + 1.0 / 24.0, q = q * r + 1.0 / 6.0, q = q * r + 0.5;
+  q = q * r + 2.7613795667584423e-07, q = q * r + 2.755728008252803e-06, q = q * r + 2.4801536408860383e-05;
+  q = q * r + 1.9841269854330848e-04, q = q * r + 1.3888888905871448e-03, q = q * r + 8.333333333332157e-03;
+  q = q * r + 4.1666666666651364e-02, q = q * r + 1.6666666666666666e-01, q = q * r + 0.5;
   return scaled(1 + (high + (r * r * q - rest)), (int)n);
 }
 
@@ -102,13 +102,14 @@ static int has_no_log(double x, double* value) {
 
 double @name@_exp(double x) { return exponential(x, 0); }
 
-/* log(1 + f) = 2 atanh(s), s = f / (2 + f) = f - f^2/2 + s (f^2/2 + R). */
+/* log(1 + f) = 2 atanh(s), s = f / (2 + f) = f - f^2/2 + s (f^2/2 + R); R is interpolated at Chebyshev's nodes. */
 double @name@_log(double x) {
-  int k, j;
-  double f, s, z, half, series = 2.0 / 25;
+  int k;
+  double f, s, z, half, series = 0.14425745969553938;
   if (has_no_log(x, &f)) return f;
   f = mantissa(x, &k) - 1, s = f / (2 + f), z = s * s, half = 0.5 * f * f;
-  for (j = 23; j >= 3; j -= 2) series = series * z + 2.0 / j;
+  series = series * z + 0.15347854217867402, series = series * z + 0.18182383516054826, series = series * z + 0.22222218306451125;
+  series = series * z + 0.2857142858132756, series = series * z + 0.3999999999999595, series = series * z + 0.6666666666666666;
   return k * LN2 - ((half - (s * (half + series * z) + k * LN2_REST)) - f);
 }
 
@@ -166,7 +167,10 @@ static pair reduced(double x, int* quarter) {
   }
   n = whole(r.high * 0.63661977236758138), *quarter = (int)n & 3; /* below 2^20 */
   if (n == 0) return r;
-  for (k = 0; k < 4; ++k) p = sum(r.high, -(n * TURN[k])), r.low += p.low, r.high = p.high;
+  r.high -= n * TURN[0]; /* without rounding */
+  p = sum(r.high, -(n * TURN[1])), r.low += p.low, r.high = p.high;
+  if (fabs(n * TURN[2]) >= 1e-19 * fabs(r.high)) /* else the rest does not count */
+    for (k = 2; k < 4; ++k) p = sum(r.high, -(n * TURN[k])), r.low += p.low, r.high = p.high;
   return sum(r.high, r.low);
 }
 
