@@ -85,15 +85,13 @@ class _Traffic:
 
     def write(self, command: np.ndarray) -> None:
         """Send one message per identifier."""
-        data: dict[int, bytearray] = {}
+        data: dict[tuple[int, bool], bytearray] = {}
         for at, value in zip(self._sent, command, strict=True):
             number, whole = float(value) / at.scale, at.format[-1] not in "efd"
-            content = data.setdefault(at.identifier, bytearray())
+            content = data.setdefault((at.identifier, at.extended), bytearray())
             content.extend(bytes(max(at.byte + struct.calcsize(at.format) - len(content), 0)))
             struct.pack_into(at.format, content, at.byte, round(number) if whole else number)
-        extended = {at.identifier: at.extended for at in self._sent}
-        for identifier, content in data.items():
-            wide = extended[identifier]
+        for (identifier, wide), content in data.items():
             self._bus.send(self._can.Message(arbitration_id=identifier, data=content, is_extended_id=wide))
 
     def read(self) -> Iterator[tuple[float, float]]:

@@ -64,12 +64,9 @@ class _Car:
     """
 
     def __init__(self, kind: str, speed: float, vehicle: int, steps: int, inputs: tuple[str, ...]) -> None:
-        of = {
-            name: package(f"vehiclemodels.{name}", "outside") for name in (f"vehicle_dynamics_{kind}", f"init_{kind}")
-        }
-        number = f"parameters_vehicle{vehicle}"
-        self._rate, self._start = (getattr(module, name) for name, module in of.items())
-        self._car: Any = getattr(package(f"vehiclemodels.{number}", "outside"), number)()
+        names = f"vehicle_dynamics_{kind}", f"init_{kind}", f"parameters_vehicle{vehicle}"
+        of: list[Any] = [getattr(package(f"vehiclemodels.{name}", "outside"), name) for name in names]
+        self._rate, self._start, self._car = of[0], of[1], of[2]()
         self._kind, self._speed, self._steps, self._inputs = kind, speed, steps, inputs
         self.read: list[tuple[int, int]] = []
 

@@ -67,9 +67,9 @@ def modbus_body(
         NotSupported: pymodbus is not installed.
         InvalidProblem: a quantity that the model does not have, or an input without register.
     """
-    client, now = package("pymodbus.client", "outside").ModbusTcpClient(host, port=port), clock or RealTime()
-    setup = Setup("modbus_body", period, oldest, holds, now, "Register(40)")
-    return device(setup, model, measures, inputs, lambda sent, read: _Unit(client, unit, sent, read, alive, now))
+    client = package("pymodbus.client", "outside").ModbusTcpClient(host, port=port)
+    setup = Setup("modbus_body", period, oldest, holds, clock, "Register(40)")
+    return device(setup, model, measures, inputs, lambda sent, read: _Unit(client, unit, sent, read), alive)
 
 
 class _Unit:
@@ -80,42 +80,31 @@ class _Unit:
         unit: number of the device.
         sent: registers of the inputs.
         read: registers of the measurements.
-        alive: register that counts.
-        now: its clock measures for how long it stands still.
     """
 
-    def __init__(
-        self, client: Any, unit: int, sent: list[Register], read: list[Register], alive: Register | None, now: RealTime
-    ) -> None:
-        self._client, self._unit, self._sent, self._read, self._alive, self._now = client, unit, sent, read, alive, now
+    def __init__(self, client: Any, unit: int, sent: list[Register], read: list[Register]) -> None:
+        self._client, self._unit, self._sent, self._read = client, unit, sent, read
         weakref.finalize(self, client.close)
-        self._types, self._count, self._since = client.DATATYPE, np.nan, 0.0
 
     def open(self) -> None:
         """Connect anew."""
         self._client.close()
         if not self._client.connect():
             raise InvalidProblem(f"no device answers at {self._client.comm_params.host}")
-        self._count, self._since = np.nan, self._now.clock()
 
     def write(self, command: np.ndarray) -> None:
         """Write the registers of every input."""
         for at, value in zip(self._sent, command, strict=True):
-            kind, number = self._types[at.type], float(value) / at.scale
+            kind, number = self._client.DATATYPE[at.type], float(value) / at.scale
             words = self._client.convert_to_registers(number if "FLOAT" in at.type else round(number), kind)
             self._good(self._client.write_registers(at.address, words, device_id=self._unit), at)
 
     def read(self) -> Iterator[tuple[float, float]]:
-        """Values, and for how long the register `alive` stands still."""
-        if self._alive is not None:
-            count, now = self._value(self._alive), self._now.clock()
-            if count != self._count:
-                self._count, self._since = count, now
-        age = 0.0 if self._alive is None else self._now.clock() - self._since
-        return ((self._value(at), age) for at in self._read)
+        """Values; their ages are not known."""
+        return ((self._value(at), 0.0) for at in self._read)
 
     def _value(self, at: Register) -> float:
-        kind = self._types[at.type]
+        kind = self._client.DATATYPE[at.type]
         ask = self._client.read_input_registers if at.readonly else self._client.read_holding_registers
         words = self._good(ask(at.address, count=kind.value[1], device_id=self._unit), at).registers
         return at.scale * float(self._client.convert_from_registers(words, kind))

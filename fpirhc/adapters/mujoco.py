@@ -18,6 +18,9 @@ from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
+_Values = Mapping[str, float]
+_Places = Mapping[str, tuple[int, int]]
+
 
 def mujoco_body(
     mjcf: str | Path,
@@ -26,7 +29,7 @@ def mujoco_body(
     period: float,
     joints: Mapping[str, str] | None = None,
     actuators: Mapping[str, str] | None = None,
-    start: Mapping[str, float] | None = None,
+    start: _Values | None = None,
 ) -> ExternalPlant:
     """Return a body of MuJoCo as a reality.
 
@@ -43,25 +46,22 @@ def mujoco_body(
         InvalidProblem: a name that the body or the model does not have, or a period that is no whole number of time steps.
     """
     mujoco = package("mujoco", "outside")
-    body = (
-        mujoco.MjModel.from_xml_string(mjcf)
-        if str(mjcf).lstrip().startswith("<")
-        else mujoco.MjModel.from_xml_path(str(mjcf))
-    )
+    text = str(mjcf)
+    from_text, from_file = mujoco.MjModel.from_xml_string, mujoco.MjModel.from_xml_path
+    body = from_text(text) if text.lstrip().startswith("<") else from_file(text)
     units, mistakes = quantities(model), Mistakes("mujoco_body")
     free = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
     scalar = [joint for joint in map(body.joint, range(body.njnt)) if int(joint.type[0]) in free]
     of_joint = {j.name: (j.qposadr[0], j.dofadr[0], j.dofadr[0]) for j in scalar}
     joint = counterparts(mistakes, "joint", dict.fromkeys(base_and_order(q)[0] for q in units), joints or {}, of_joint)
-    actuator = counterparts(
-        mistakes, "actuator", model.inputs, actuators or {}, (body.actuator(k).name for k in range(body.nu))
-    )
+    motors = {body.actuator(k).name: k for k in range(body.nu)}
+    actuator = counterparts(mistakes, "actuator", model.inputs, actuators or {}, motors)
     mistakes.unknown("start: quantity", start or {}, [q for q in units if base_and_order(q)[1] < 2])
     mistakes.raise_if_any()
     count = steps_per_cycle("mujoco_body", period, body.opt.timestep)
     places = {q: (order, of_joint[joint[name]][order]) for q, (name, order) in ((q, base_and_order(q)) for q in units)}
-    motors = [body.actuator(name).id for name in actuator.values()]
-    return ExternalPlant(_Body(mujoco, body, count, motors, places, start or {}), measures=units)
+    driven = [motors[name] for name in actuator.values()]
+    return ExternalPlant(_Body(mujoco, body, count, driven, places, start or {}), measures=units)
 
 
 class _Body:
@@ -76,15 +76,7 @@ class _Body:
         start: quantity -> value.
     """
 
-    def __init__(
-        self,
-        mujoco: Any,
-        model: Any,
-        steps: int,
-        motors: list[int],
-        places: Mapping[str, tuple[int, int]],
-        start: Mapping[str, float],
-    ) -> None:
+    def __init__(self, mujoco: Any, model: Any, steps: int, motors: list[int], places: _Places, start: _Values) -> None:
         self._mujoco, self._model, self._data = mujoco, model, mujoco.MjData(model)
         self._steps, self._motors, self._places, self._start = steps, motors, places, start
 

@@ -2,6 +2,7 @@
 
 A bus is a link: it is opened, takes the values of the inputs, and gives those of the measurements with their ages. A bad status
 is an exception of the link, and a value that is too old is one of the device: both are bad answers, see `ExternalPlant`.
+A bus without time stamps has a counter in their place: the values are as old as the time for which it stands still.
 """
 
 from __future__ import annotations
@@ -82,6 +83,7 @@ def device(
     measures: Mapping[str, Address],
     inputs: Mapping[str, Address],
     connect: Callable[[list[Address], list[Address]], Link],
+    counter: Address | None = None,
 ) -> ExternalPlant:
     """Return a device on a bus as a reality.
 
@@ -91,6 +93,7 @@ def device(
         measures: quantity of the model -> address that holds it.
         inputs: input of the model -> address that takes it; all inputs.
         connect: function (addresses of the inputs, of the measurements) -> link.
+        counter: address of a value that changes whenever the device has measured.
 
     Raises:
         InvalidProblem: a quantity that the model does not have, or an input without address.
@@ -101,9 +104,33 @@ def device(
     for name in (name for name in model.inputs if name not in inputs):
         mistakes.add(f"inputs: {name} has no address; add inputs={{'{name}': {setup.example}}}")
     mistakes.raise_if_any()
-    link = connect([inputs[name] for name in model.inputs], list(measures.values()))
-    body = _Device(link, tuple(measures), setup)
+    counted = [] if counter is None else [counter]
+    link = connect([inputs[name] for name in model.inputs], [*counted, *measures.values()])
+    body = _Device(link, tuple(measures), setup, bool(counted))
     return ExternalPlant(body, measures={name: units[name] for name in measures}, holds=setup.holds)
+
+
+class _Standstill:
+    """For how long a counter has shown the same.
+
+    Args:
+        now: its clock.
+    """
+
+    def __init__(self, now: RealTime) -> None:
+        self._now = now
+        self.begin()
+
+    def begin(self) -> None:
+        """Whatever the counter shows first is new."""
+        self._count, self._since = np.nan, 0.0
+
+    def age(self, count: float) -> float:
+        """Return the time since the counter changed, s, now that it shows this count."""
+        now = self._now.clock()
+        if count != self._count:
+            self._count, self._since = count, now
+        return now - self._since
 
 
 class _Device:
@@ -113,16 +140,20 @@ class _Device:
         link: to the device.
         names: of what is measured.
         setup: see `Setup`.
+        counts: whether the link reads a counter first.
     """
 
-    def __init__(self, link: Link, names: tuple[str, ...], setup: Setup) -> None:
+    def __init__(self, link: Link, names: tuple[str, ...], setup: Setup, counts: bool) -> None:
         self._link, self._names, self._setup, self._clock = link, names, setup, setup.clock or RealTime()
+        self._still = _Standstill(self._clock) if counts else None
 
     def reset(self, seed: int) -> np.ndarray:
         """Connect, and measure."""
         del seed
         self._link.open()
         self._clock.begin()
+        if self._still is not None:
+            self._still.begin()
         return self._measured()
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
@@ -132,9 +163,12 @@ class _Device:
         return self._measured()
 
     def _measured(self) -> np.ndarray:
-        oldest, values = self._setup.oldest, []
-        for name, (value, age) in zip(self._names, self._link.read(), strict=True):
-            if oldest is not None and age > oldest:
-                raise InvalidProblem(f"{name} is {age:.3g} s old, and the oldest that is used is {oldest:g} s")
+        oldest, values, shown = self._setup.oldest, [], iter(self._link.read())
+        still = 0.0 if self._still is None else self._still.age(next(shown)[0])
+        for name, (value, age) in zip(self._names, shown, strict=True):
+            if oldest is not None and max(age, still) > oldest:
+                raise InvalidProblem(
+                    f"{name} is {max(age, still):.3g} s old, and the oldest that is used is {oldest:g} s"
+                )
             values.append(value)
         return np.array(values)

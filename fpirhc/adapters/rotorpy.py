@@ -19,6 +19,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
 _SEEN = [name + dash for dash in ("", "'", "''") for name in ("x", "y", "z")]
+_State = dict[str, np.ndarray]
 _SENT = ("thrust_x", "thrust_y", "thrust_z")
 
 
@@ -53,47 +54,35 @@ def rotorpy_body(
         mistakes.add(f"the model has no {name}; it needs x, y, z and thrust_x, thrust_y, thrust_z")
     mistakes.raise_if_any()
     parameters = vehicle or package("rotorpy.vehicles.hummingbird_params", "outside").quad_params
-    first = [(start or {}).get(name, 0.0) for name in _SEEN[:6]]
+    at = [(start or {}).get(name, 0.0) for name in _SEEN[:6]]
+    first = {"x": np.array(at[:3]), "v": np.array(at[3:]), "wind": np.array(wind), **_hovering(parameters)}
+    loaded = {**deepcopy(parameters), "mass": parameters["mass"] + payload}
+    multirotor = package("rotorpy.vehicles.multirotor", "outside").Multirotor
+    flown = multirotor(loaded, initial_state=first, control_abstraction="cmd_acc", aero=True)
     order = [list(model.inputs).index(name) for name in _SENT]
-    units = {name: quantities(model)[name] for name in _SEEN}
-    return ExternalPlant(_Quadrotor(parameters, payload, np.array(wind), first, period, order), measures=units)
+    body = _Quadrotor(flown, first, period, order, parameters["mass"] / loaded["mass"])
+    return ExternalPlant(body, measures={name: quantities(model)[name] for name in _SEEN})
+
+
+def _hovering(parameters: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Upright and at rest, with rotors that carry the vehicle alone."""
+    hover = np.sqrt(parameters["mass"] * 9.81 / 4 / parameters["k_eta"])
+    return {"q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3), "rotor_speeds": np.full(4, hover)}
 
 
 class _Quadrotor:
     """The vehicle under the thrust that is asked for.
 
     Args:
-        parameters: of the package, of the vehicle alone.
-        payload: kg.
-        wind: m/s.
-        first: position and velocity.
+        vehicle: of the package, with its load.
+        first: state at the start.
         period: s.
         order: places of the thrusts among the commands.
+        share: of the mass that is not load.
     """
 
-    def __init__(
-        self,
-        parameters: Mapping[str, Any],
-        payload: float,
-        wind: np.ndarray,
-        first: Sequence[float],
-        period: float,
-        order: list[int],
-    ) -> None:
-        own = dict(deepcopy(parameters))
-        self._share, own["mass"] = own["mass"] / (own["mass"] + payload), own["mass"] + payload
-        hover = np.sqrt(parameters["mass"] * 9.81 / 4 / own["k_eta"])
-        self._first = {
-            "x": np.array(first[:3]),
-            "v": np.array(first[3:]),
-            "q": np.array([0.0, 0.0, 0.0, 1.0]),
-            "w": np.zeros(3),
-            "wind": wind,
-            "rotor_speeds": np.full(4, hover),
-        }
-        multirotor = package("rotorpy.vehicles.multirotor", "outside").Multirotor
-        self._vehicle = multirotor(own, initial_state=self._first, control_abstraction="cmd_acc", aero=True)
-        self._period, self._order = period, order
+    def __init__(self, vehicle: Any, first: _State, period: float, order: list[int], share: float) -> None:
+        self._vehicle, self._first, self._period, self._order, self._share = vehicle, first, period, order, share
 
     def reset(self, seed: int) -> np.ndarray:
         """Go to the start; there is nothing random."""
