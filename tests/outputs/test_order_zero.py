@@ -359,16 +359,6 @@ def test_rivals_control_an_output_of_order_zero(name: str) -> None:
 
 
 REFUSED: dict[str, tuple[Callable[[], Controller], dict[str, Any], str]] = {
-    "surface": (
-        lambda: fp.rivals.SlidingMode(rate=1.0, gain=1.0, width=1.0),
-        {},
-        r"the command moves 'power' at once \(order 0\), so there is no surface to slide on",
-    ),
-    "Lyapunov": (
-        lambda: fp.rivals.LyapunovMRAC(rate=1.0, adaptation=1.0),
-        {},
-        "LyapunovMRAC proves that errors vanish by a derivative .* power is of order 0",
-    ),
     "slot": (
         lambda: fp.Slotted([fp.Slot("power", LAWLESS)], fp.Periodic({"power": 1.0}), blend=0.1),
         {},

@@ -1,0 +1,273 @@
+"""Every member serves every form of a problem, or says why it cannot: no pair is forgotten.
+
+A form is a way to say a plant (coordinates of any order, outputs of states, a static map, a map of steps) or what lies between
+plant and controller (dead time, estimators, beliefs, another plant, a body outside). The law of a pair: the run with a wrong
+model stays near its reference, and a Stepper that is given the run's measurements has the run's commands. A pair that is not
+served stands below with the sentence that its user reads; every other refusal is a defect. Members are found by search, so a
+new one is tried on all forms, and a new form with all members.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.conformance.loops import anything
+from fpirhc.controllers.contract import Controller
+from fpirhc.errors import FpirhcError
+from fpirhc.members import examples, member_classes
+from fpirhc.simulation.sample import raw_measurements
+
+# Forms of one thing to be moved: y follows 0.5 sin 2t, its mass is believed 15 % too large.
+
+CYCLE, CYCLES, REPLAYED = 5e-3, 480, 40
+PARAMETERS = {"m": fp.Parameter(1.15, 1.0, "kg"), "k": fp.Parameter(2.0, 3.0, "N/m")}
+NEAR = 0.2  # m, rms in the last quarter; that of the reference is 0.42
+TESTS = Path(__file__).parents[1]
+
+
+def chain(order: int) -> fp.Plant:
+    responses: dict[int, Any] = {
+        1: lambda q, u, p: {"y": (u.F - p.k * q.y) / p.m},
+        2: lambda q, v, u, p: {"y": (u.F - p.k * ca.sin(q.y)) / p.m},
+        3: lambda q, v, a, u, p: {"y": (u.F - p.k * q.y - 3 * v.y - 2 * a.y) / p.m},
+    }
+    return fp.Plant({"y": "m"}, {"F": "N"}, PARAMETERS, responses[order], order=order)
+
+
+def of_states(states: Mapping[str, str], rates: Callable[..., Any], y: Callable[..., Any]) -> fp.Plant:
+    outputs = {"y": fp.Output("m", y)}
+    return fp.Plant.of_states(states=states, inputs={"F": "N"}, parameters=PARAMETERS, rates=rates, outputs=outputs)
+
+
+MASS = of_states(
+    {"a": "m", "w": "m/s"}, lambda x, u, p: {"a": x.w, "w": (u.F - p.k * ca.sin(x.a)) / p.m}, lambda x, p: x.a
+)
+CURVE = of_states({"x": "m"}, lambda x, u, p: {"x": (u.F - p.k * x.x) / p.m}, lambda x, p: p.m * x.x + 0.1 * x.x**3)
+AT_ONCE = of_states({"x": "N"}, lambda x, u, p: {"x": 20 * (u.F - x.x)}, lambda x, u, p: p.m * u.F + 0.3 * x.x)
+STEPS = fp.Plant.discrete(
+    states={"x": "m", "z": "m/s"},
+    inputs={"F": "N"},
+    parameters=PARAMETERS,
+    next=lambda x, u, p: {"x": x.x + CYCLE * x.z, "z": x.z + CYCLE * (u.F - p.k * x.x) / p.m},
+    step=CYCLE,
+    outputs={"y": fp.Output("m", lambda x, p: x.x)},
+)
+
+
+class Body:
+    """The mass, integrated by hand."""
+
+    def reset(self, seed: int) -> Any:
+        del seed
+        self.state = np.array([0.1, 0.0])
+        return self._seen(0.0)
+
+    def step(self, time: float, command: Any) -> Any:
+        del time
+        for _ in range(10):
+            self.state[1] += CYCLE / 10 * (command[0] - 3 * np.sin(self.state[0]))
+            self.state[0] += CYCLE / 10 * self.state[1]
+        return self._seen(command[0])
+
+    def _seen(self, force: float) -> Any:
+        return np.array([*self.state, force - 3 * np.sin(self.state[0])])
+
+
+def moved(plant: fp.Plant, order: int, /, **settings: Any) -> tuple[fp.Problem, int]:
+    """A problem of the plant, and the order of y."""
+    of = "outputs" if plant.outputs else "states"
+    start = {n: 0.1 if k == 0 else 0.0 for k, n in enumerate(plant.state.elements)}
+    usual: dict[str, Any] = {
+        "horizon": fp.Horizon(stages=12, step=5 * CYCLE),
+        "cost": fp.Quadratic(**{of: {"y": 100.0}}, effort={"F": 1e-3}),
+        "limits": fp.Limits(inputs={"F": (-60.0, 60.0)}),
+    }
+    sine = fp.Trajectory(lambda t: {"y": 0.5 * ca.sin(2 * t)})
+    return fp.Problem(
+        plant, sine, start, period=CYCLE, duration=CYCLES * CYCLE, measure_from=0.0, **usual | settings
+    ), order
+
+
+LATE: dict[str, Any] = {"dead_time": fp.DeadTime(inputs={"F": CYCLE}, measurement=CYCLE)}
+ENCODER: dict[str, Any] = {"sensors": {"y": fp.Sensor()}, "estimator": fp.PositionDifference()}
+SEEN = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
+FORMS = {
+    "order 1": moved(chain(1), 1),
+    "order 2": moved(chain(2), 2),
+    "order 3": moved(chain(3), 3),
+    "states": moved(MASS, 2),
+    "curve": moved(CURVE, 1),
+    "at once": moved(AT_ONCE, 0),
+    "map": moved(STEPS, 2),
+    "late": moved(chain(2), 2, **LATE),
+    "late curve": moved(CURVE, 1, **LATE),
+    "encoder": moved(chain(2), 2, sensing=fp.Sensing(**ENCODER)),
+    "believed": moved(MASS, 2, sensing=fp.Sensing(**ENCODER, measured=("y",), observer=fp.ModelStates())),
+    "reality": moved(chain(2), 2, reality=fp.Reality(MASS, start={"a": 0.1, "w": 0.0})),
+    "outside": moved(chain(2), 2, reality=fp.ExternalPlant(Body(), measures=SEEN)),
+}
+
+# Members, with settings for a thing of one mass
+
+TRACK, MAP, PLAN = fp.Exponential(6.0), fp.Affine(gain=-0.2), fp.FixedPoint(iterations=2, tolerance=1e-3)
+TORQUE = fp.ComputedTorque(TRACK, MAP)
+UNCERTAIN = fp.Uncertain(lower=0.5, upper=3.0, deviation=0.5)
+
+
+def filtered(order: int) -> Controller:
+    """A disturbance of the response; as many quantities are measured as there are derivatives."""
+    noise = {"y" + "'" * k: 10.0 ** (k - 3) for k in range(order + 1)}
+    return fp.Estimating(fp.ComputedTorque(TRACK), fp.DisturbanceKalman({"y": 5.0}, noise))
+
+
+PIDS: dict[int, Controller] = {  # by the order of y
+    0: fp.PID({"y": 0.1}, {"y": 10.0}),
+    1: fp.PID({"y": 60.0}, {"y": 60.0}),
+    2: fp.PID({"y": 60.0}, {"y": 60.0}, {"y": 12.0}),
+    3: fp.PID({"y": 60.0}, {"y": 40.0}, {"y": (30.0, 4.0)}),
+}
+CONTROLLERS: dict[str, Callable[[int], Controller]] = {
+    "ComputedTorque": lambda order: TORQUE,
+    "RecedingHorizon": lambda order: fp.RecedingHorizon(PLAN, MAP),
+    "Predicted": lambda order: fp.Predicted(TORQUE, inputs=CYCLE, measurement=CYCLE),
+    "ExactModel": lambda order: fp.ExactModel(TORQUE),
+    "Estimating": filtered,
+    "PID": lambda order: PIDS[order],
+    "ADRC": lambda order: fp.rivals.ADRC(6.0, observer=40.0),
+    "AccelerationFeedback": lambda order: fp.rivals.AccelerationFeedback(TRACK, gain=0.5, time_constant=0.1),
+    "BacksteppingMRAC": lambda order: fp.rivals.BacksteppingMRAC(6.0, (6.0,) * order, MAP),
+    "DisturbanceObserver": lambda order: fp.rivals.DisturbanceObserver(TRACK, bandwidth=30.0),
+    "ForceMRAC": lambda order: fp.rivals.ForceMRAC(TRACK, MAP),
+    "INDI": lambda order: fp.rivals.INDI(TRACK, frequency=30.0),
+    "IntelligentPID": lambda order: fp.rivals.IntelligentPID(TRACK, {"y": 0.77}, window=20),
+    "L1Adaptive": lambda order: fp.rivals.L1Adaptive(TRACK, bandwidth=30.0),
+    "LyapunovMRAC": lambda order: fp.rivals.LyapunovMRAC(6.0, adaptation=3.0, leakage=0.02),
+    "RepetitiveControl": lambda order: fp.rivals.RepetitiveControl(TRACK, repeats=0.5, gain=0.2, smoothing=0.05),
+    "ResolvedAccelerationRate": lambda order: fp.rivals.ResolvedAccelerationRate(6.0),
+    "SlidingMode": lambda order: fp.rivals.SlidingMode(rate=6.0, gain=30.0, width=1.0),
+}
+ELSEWHERE = {  # members that need a plant of their own, with the tests that try them on forms
+    "AdaptiveInverseDynamics": "controllers/test_adaptive_rivals.py",
+    "SlotineLi": "controllers/test_adaptive_rivals.py",
+    "Cascade": "outputs/test_cascade.py",
+    "FeedforwardOnly": "outputs/test_order_zero.py",
+    "Slotted": "controllers/test_slots.py",
+}
+
+
+def around(member: Any, family: str, order: int) -> Controller:
+    """A controller with this member of a family."""
+    if family == "deformations":
+        return fp.ComputedTorque(TRACK, member)
+    if family == "tracking laws":
+        return fp.ComputedTorque(member, MAP)
+    if family == "optimisers":
+        return fp.RecedingHorizon(member, MAP)
+    return fp.Estimating(fp.ComputedTorque(TRACK), member)
+
+
+LEARNERS = (
+    fp.RecursiveLeastSquares({"m": UNCERTAIN}, noise={"y": 0.1}, time=1.0),
+    fp.MovingHorizon({"m": UNCERTAIN}, noise={"y": 0.1}, window=10, time=1.0),
+)
+MEMBERS: dict[str, Callable[[int], Controller]] = dict(CONTROLLERS)
+for family, found in (
+    ("deformations", examples("deformations", MAP)),
+    ("tracking laws", examples("tracking laws")),
+    ("optimisers", examples("optimisers", PLAN)),
+    ("estimators", LEARNERS),
+):
+    MEMBERS |= {f"{type(e).__name__} {k}": partial(around, e, family) for k, e in enumerate(found)}
+
+
+# Pairs that are not served, with the sentence that their user reads
+
+WRONG_SIGN = "has the wrong sign, so every cycle enlarges the error"
+WRONG_PAIR = "so the iteration converges only for effective gains below 0"
+BY_TIME = "a derivative with respect to time, and {}; use ComputedTorque with a deformation"
+AT_ONCE_SAID, STEPS_SAID = BY_TIME.format("y is of order 0"), BY_TIME.format("a map has differences of its steps")
+NOT_AT_ONCE = (
+    "DisturbanceKalman: y'' is estimated {} cycles late, and the filter needs it at once; measure states alone"
+)
+REFUSED: dict[tuple[str, str], str] = {
+    **{("Sigmoid 11", form): WRONG_SIGN for form in FORMS},
+    **{("Sigmoid 12", form): WRONG_SIGN for form in FORMS},
+    **{("FullSpaceFixedPoint 2", form): "serves problems without limits only (it is a baseline)" for form in FORMS},
+    **{("Paired 15", form): WRONG_PAIR for form in ("map", "encoder", "believed")},
+    (
+        "Estimating",
+        "states",
+    ): "no stationary gain makes the filter stable; give noise={'a': ...}, or measure more states",
+    ("Estimating", "map"): NOT_AT_ONCE.format("2"),
+    ("Estimating", "encoder"): NOT_AT_ONCE.format("0.5"),
+    ("Estimating", "believed"): NOT_AT_ONCE.format("0.5"),
+    ("ADRC", "at once"): "ADRC observes a chain of integrators, and the command moves 'y' at once (order 0)",
+    ("IntelligentPID", "at once"): "'y' is moved at once (order 0); it needs an order from 1 to the window",
+    ("L1Adaptive", "at once"): "predicts a derivative below the response, and the command moves 'y' at once (order 0)",
+    ("SlidingMode", "at once"): "the command moves 'y' at once (order 0), so there is no surface to slide on",
+    ("BacksteppingMRAC", "at once"): "rates=()): expected positive numbers, 1/s",
+    ("LyapunovMRAC", "at once"): f"proves that errors vanish by {AT_ONCE_SAID}",
+    ("LyapunovMRAC", "map"): f"proves that errors vanish by {STEPS_SAID}",
+    ("ResolvedAccelerationRate", "at once"): f"prescribes {AT_ONCE_SAID}",
+    ("ResolvedAccelerationRate", "map"): f"prescribes {STEPS_SAID}",
+    ("ModelReferenced 3", "map"): "a map has no lag, and no dead time of parts of a cycle",
+    ("ExactModel", "reality"): "no coordinate y, which the model has: it cannot be the exact model of this controller",
+    ("ExactModel", "outside"): "a foreign reality has no equations that could be the exact model; leave ExactModel out",
+}
+YOUNG = "order 1", "curve", "at once", "late", "late curve"
+FARTHER = {  # pairs that are served and leave their reference
+    **{("Paired 15", form): "its pairs are three cycles old, where nothing is late by three" for form in YOUNG},
+    ("Sigmoid 9", "order 3"): "its scale of 1 m/s^3 is less than the change that a cycle asks for",
+}
+
+
+def test_every_member_is_among_them():
+    """A new controller has a line above, or a test that names its forms."""
+    named = set(CONTROLLERS) | set(ELSEWHERE)
+    assert named == {c.__name__ for c in member_classes("controllers")}
+    for file in ELSEWHERE.values():
+        assert (TESTS / file).is_file()
+    learners = {"DisturbanceKalman", *(type(e).__name__ for e in LEARNERS)}
+    assert learners == {c.__name__ for c in member_classes("estimators")}
+
+
+def test_the_tables_name_what_there_is():
+    """A pair that is served now must leave the table, or nobody would notice when it is lost again."""
+    for member, form in (*REFUSED, *FARTHER):
+        assert member in MEMBERS
+        assert form in FORMS
+
+
+def replayed(problem: fp.Problem, controller: Controller, run: fp.Run) -> np.ndarray:
+    """Commands of a Stepper that is given what the run measured."""
+    stepper = fp.Stepper(problem, controller, compiled=False, bounded=False, plausible=anything(problem))
+    memory, measured, commands = stepper.start(), raw_measurements(run), []
+    for k in range(REPLAYED):
+        command, memory = stepper.step_measured(float(run.time[k]), measured[k], memory)
+        commands.append(command)
+    return np.array(commands)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("member", MEMBERS)
+def test_a_member_serves_a_form_or_says_why_not(member: str, form: str) -> None:
+    problem, order = FORMS[form]
+    if words := REFUSED.get((member, form)):
+        with pytest.raises(FpirhcError, match=re.escape(words)):
+            fp.simulate(problem, MEMBERS[member](order), seed=0, compiled=False)
+        return
+    controller = MEMBERS[member](order)
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert run.stop is None
+    error = float(np.sqrt(np.mean(run["true_error"][-CYCLES // 4 :] ** 2)))
+    assert (error < NEAR) == ((member, form) not in FARTHER)
+    np.testing.assert_allclose(replayed(problem, controller, run), run["command"][:REPLAYED], rtol=1e-9, atol=1e-9)
