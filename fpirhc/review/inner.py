@@ -22,6 +22,7 @@ from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.evaluate import require_unsolved
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.roots import Equations
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
 
@@ -30,7 +31,6 @@ _STEPS = 100_000
 _DECAYS = 20.0  # times in a run, by which the error of outputs at the start decays
 _FASTEST = 0.1  # of the cycle, the rate of this decay
 _SHORTEST = 2000  # steps of a run at least
-_NEWTON = 50  # steps to a rest
 _AWAY = 1e9  # of the start, from which a motion runs away
 _ROUNDING = 1e-9
 _WHOLE = 1e-6  # share of a cycle by which a time may be rounded
@@ -113,7 +113,7 @@ def _at_rest(problem: Problem, places: Sequence[int], parameters: np.ndarray, co
 def _rest(problem: Problem, parameters: np.ndarray) -> np.ndarray | None:
     """The state in which the controlled outputs are on the reference and nothing moves, shape (nx,); None where none is found.
 
-    Newton's steps begin at the start of the problem.
+    The search begins at the start of the problem.
     """
     plant = problem.plant
     x, u, p = plant.symbols()
@@ -122,19 +122,10 @@ def _rest(problem: Problem, parameters: np.ndarray) -> np.ndarray | None:
     wanted = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
     places = [plant.output.elements.index(name) for name in plant.controlled_names]
     off = plant.equations.output(x, u, p, calm)[places] - wanted[places]
-    both = ca.vertcat(x, u)
-    residual = ca.densify(ca.vertcat(drift, off))
-    newton = ca.Function("fpirhc_rest", [both, p], [residual, ca.densify(ca.jacobian(residual, both))])
-    at = np.concatenate([problem.start_state, problem.inputs_before])
-    for _ in range(_NEWTON):
-        value, slope = (np.asarray(m.full()) for m in newton(at, parameters))
-        if not (np.isfinite(value).all() and np.isfinite(slope).all()):
-            return None
-        step = np.linalg.lstsq(slope, -value.ravel(), rcond=None)[0]
-        at = at + step
-        if (np.abs(step) <= _ROUNDING * np.maximum(1.0, np.abs(at))).all():
-            return at[: plant.state.size]
-    return None
+    root = Equations(ca.vertcat(x, u), [p], ca.vertcat(drift, off)).root(
+        np.concatenate([problem.start_state, problem.inputs_before]), parameters
+    )
+    return None if root is None else root.at[: plant.state.size]
 
 
 def _cycle(problem: Problem, places: list[int]) -> ca.Function:

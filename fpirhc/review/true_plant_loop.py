@@ -25,14 +25,11 @@ from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Points, thinned, usable
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.symbolic.roots import Equations
 from fpirhc.task.problem import Problem
 from fpirhc.task.reality import Reality
 
-Carrying: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
-Settling: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
-_STEPS = 60  # of Newton's method
-_CARRYING_STEPS = 30  # of Newton's method
-_SMALL = 1e-10  # last step, relative
+Guided: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
 _LEFT = 1e-6  # of an equation, relative to the size of its terms
 _POINTS = 5  # of the reference
 _SLOW = 0.05  # frequency of slow requests, as a share of the slowest of the poles that the model lacks
@@ -126,34 +123,32 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     return Extra(modes, np.linalg.eigvals(gain @ np.linalg.inv(assumed)))
 
 
-def _settling(problem: Problem, free: list[int]) -> Settling:
+def _settling(problem: Problem, free: list[int]) -> Guided:
     """Function (state, input, response) -> settled state and the input that gives the response, or None."""
     reality, model = problem.truth, problem.plant
     plant = reality.plant
     x, u, p = plant.symbols()
-    calm = ca.SX.zeros(len(plant.names))
+    kept = [k for k in range(plant.state.size) if k not in free]
     wanted = ca.SX.sym("wanted", len(model.controlled_names))
-    response = reality.function(response_names(model))(x, u, p, calm)
+    response = reality.function(response_names(model))(x, u, p, ca.SX.zeros(len(plant.names)))
     rate = plant.equations.rate(x, u, p)
-    # One by one: an empty selection of a column with one entry is that entry.
-    residual = ca.vertcat(*(rate[k] for k in free), response - wanted)
-    unknown = ca.vertcat(*(x[k] for k in free), u)
-    newton = ca.Function("fpirhc_point", [x, u, p, wanted], [residual, ca.densify(ca.jacobian(residual, unknown))])
+    unknown = ca.vertcat(_entries(x, free), u)
+    equations = Equations(unknown, [_entries(x, kept), p, wanted], ca.vertcat(_entries(rate, free), response - wanted))
 
     def solve(state: np.ndarray, command: np.ndarray, responses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        at, held = state.copy(), np.array(command, dtype=float)
-        for _ in range(_STEPS):
-            left, slope = (np.asarray(m.full()) for m in newton(at, held, plant.exact, responses))
-            if not (np.isfinite(left).all() and np.isfinite(slope).all()):
-                return None
-            step = np.linalg.lstsq(slope, -left.ravel(), rcond=None)[0]
-            at[free] += step[: len(free)]
-            held += step[len(free) :]
-            if np.abs(step).max() <= 1e-10 * (1 + max(np.abs(at).max(), np.abs(held).max())):
-                return (at, held) if np.abs(left).max() <= 1e-6 * (1 + np.abs(responses).max()) else None
-        return None
+        root = equations.root(np.append(state[free], command), state[kept], plant.exact, responses)
+        if root is None or root.left > _LEFT * (1 + np.abs(responses).max()):
+            return None
+        settled = state.copy()
+        settled[free] = root.at[: len(free)]
+        return settled, root.at[len(free) :]
 
     return solve
+
+
+def _entries(column: ca.SX, places: list[int]) -> ca.SX:
+    """Some entries of a column, one by one: an empty selection of a column with one entry is that entry."""
+    return ca.vertcat(ca.SX(0, 1), *(column[k] for k in places))
 
 
 def _beyond(every: np.ndarray, settled: np.ndarray) -> np.ndarray:
@@ -165,7 +160,7 @@ def _beyond(every: np.ndarray, settled: np.ndarray) -> np.ndarray:
     return rest[np.abs(rest) > _MOVES * max(1.0, float(np.abs(every).max(initial=0.0)))]
 
 
-def _carrying(reality: Reality, model: Plant) -> Carrying | None:
+def _carrying(reality: Reality, model: Plant) -> Guided | None:
     """The function (first guess of state, of input, wanted y ... y^(r)) -> state and input where all moves along, or None.
 
         y^(k) = y^N(k)  for k <= r,        y^(k) = 0  for r < k <= m,
@@ -191,23 +186,13 @@ def _carrying(reality: Reality, model: Plant) -> Carrying | None:
     places = [(reality.true_name(c), k) for k in range(count + 1) for c in names]
     chain = derivatives_function(plant, places)(x, u, p, ca.SX.zeros(len(plant.names)))
     left = chain - ca.vertcat(wanted, ca.SX.zeros(len(places) - wanted.numel()))
-    slope = ca.densify(ca.jacobian(left, ca.vertcat(x, u)))
-    newton = ca.Function("fpirhc_carried", [x, u, p, wanted], [left, slope])
+    equations = Equations(ca.vertcat(x, u), [p, wanted], left)
 
     def solve(state: np.ndarray, command: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        at = np.concatenate([state, command]).astype(float)
-        for _ in range(_CARRYING_STEPS):
-            error, by = (np.asarray(m.full()) for m in newton(at[: state.size], at[state.size :], plant.exact, values))
-            if not (np.isfinite(error).all() and np.isfinite(by).all()):
-                return None
-            sizes = np.abs(by).max(axis=1)  # rows differ by powers of the fastest rate
-            sizes[sizes == 0] = 1.0
-            step = np.linalg.lstsq(by / sizes[:, None], -error.ravel() / sizes, rcond=None)[0]
-            at += step
-            if np.abs(step).max() <= _SMALL * (1 + np.abs(at).max()):
-                solved = np.abs(error.ravel() / sizes).max() <= _LEFT * (1 + np.abs(at).max())
-                return (at[: state.size], at[state.size :]) if solved else None
-        return None
+        root = equations.root(np.append(state, command), plant.exact, values)
+        if root is None or root.left > _LEFT * (1 + np.abs(root.at).max()):
+            return None
+        return root.at[: state.size], root.at[state.size :]
 
     return solve
 

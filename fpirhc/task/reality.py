@@ -22,6 +22,7 @@ from fpirhc.plant.maps import check_time, over, unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
+from fpirhc.symbolic.roots import Equations
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,7 +369,6 @@ def _check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes)
         )
 
 
-_STEPS = 60  # of Newton's method
 _REST = 1e-8  # largest rate of a state at rest, as a share of its rate at the first guess
 
 
@@ -377,7 +377,7 @@ def settled(
 ) -> np.ndarray | None:
     """Return the state in which the rates of its free entries are zero; None where there is no such state.
 
-    Newton's method from the entries of `state`. Where many values are at rest, the nearest is taken (steps of least length).
+    Where many values are at rest, a near one is taken, see `fpirhc.symbolic.roots`.
 
     Args:
         plant: the plant.
@@ -387,18 +387,15 @@ def settled(
         free: places of the entries that settle.
     """
     places = list(free)
-    x, u, p = plant.symbols()
-    rate = plant.equations.rate(x, u, p)[places]
-    step_of = ca.Function("fpirhc_settling", [x, u, p], [rate, ca.densify(ca.jacobian(rate, x)[:, places])])
-    at, largest = np.array(state, dtype=float), 0.0
-    for count in range(_STEPS):
-        rates, slope = (np.asarray(m.full()) for m in step_of(at, command, parameters))
-        if not (np.isfinite(rates).all() and np.isfinite(slope).all()):
-            return None
-        size = float(np.abs(rates).max(initial=0.0))
-        largest = size if count == 0 else largest
-        step = np.linalg.lstsq(slope, -rates.ravel(), rcond=None)[0]
-        at[places] += step
-        if float(np.abs(step).max(initial=0.0)) <= 1e-12 * (1 + float(np.abs(at[places]).max(initial=0.0))):
-            return at if size <= _REST * max(1.0, largest) else None
-    return None
+    held, u, p = plant.symbols()
+    x = ca.SX(held)
+    moving = ca.SX.sym("moving", len(places))
+    x[places] = moving
+    root = Equations(moving, [held, u, p], plant.equations.rate(x, u, p)[places]).root(
+        state[places], state, command, parameters
+    )
+    if root is None or root.left > _REST * max(1.0, root.first):
+        return None
+    at = np.array(state, dtype=float)
+    at[places] = root.at
+    return at
