@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from fpirhc.studies.open_loop import Solved
     from fpirhc.studies.operating_limits import OperatingLimit, OperatingLimits
     from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
+    from fpirhc.studies.sweep import Sweep
     from fpirhc.task.problem import Problem
 
     Draw: TypeAlias = Callable[[Axes, Run, Sequence[str]], None]
@@ -361,6 +362,99 @@ def _draw_limit(axis: Axes, one: OperatingLimit, colour: str, edge: float) -> No
     for style, failed in (("o", False), ("x", True)):
         places = [k for k, p in enumerate(one.points) if bool(p.why) is failed]
         axis.plot([values[k] for k in places], [errors[k] for k in places], style, color=colour, ms=4)
+
+
+_FAILED = "#d8d8d8"
+
+
+def sweep_figure(found: Sweep) -> Drawing:
+    """Return the figure of a sweep: lines over one setting; over two a map per controller, and one of who is best."""
+    return _sweep_lines(found) if len(found.axes) == 1 else _sweep_maps(found)
+
+
+def _sweep_lines(found: Sweep) -> Drawing:
+    [over] = found.axes
+    figure = new_figure(9.0, 4.5, f"{found.problem}: over {over.path}")
+    axis = figure.subplots()
+    for one, colour in zip(found.maps, PALETTE * len(found.maps), strict=False):
+        shown = np.where(one.outcomes == "finished", one.values, np.nan)
+        axis.plot(
+            over.values, [found.aim.told(v) for v in shown], ".-", color=colour, lw=1.5, label=literal(one.controller)
+        )
+        failed = [v for v, outcome in zip(over.values, one.outcomes, strict=True) if outcome != "finished"]
+        axis.plot(
+            failed, [1.0] * len(failed), "x", color=colour, ms=5, transform=axis.get_xaxis_transform(), clip_on=False
+        )
+        if over.path in one.now:
+            axis.axvline(one.now[over.path], color=colour, ls=":", lw=1)
+    _scale_of(axis, found)
+    axis.set_xlabel(literal(over.path))
+    axis.set_ylabel(literal(_figure_label(found)))
+    axis.grid(visible=True, alpha=0.25)
+    draw_legend(axis)
+    return figure
+
+
+def _sweep_maps(found: Sweep) -> Drawing:
+    from matplotlib.colors import ListedColormap, LogNorm, Normalize
+
+    several = len(found.maps) > 1
+    count = len(found.maps) + several
+    columns = min(count, _PANELS)
+    rows = -(-count // columns)
+    figure = new_figure(4.6 * columns, 3.9 * rows, f"{found.problem}: {_figure_label(found)}")
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    told = [np.vectorize(found.aim.told)(np.where(m.outcomes == "finished", m.values, np.inf)) for m in found.maps]
+    numbers = np.concatenate([values[np.isfinite(values)] for values in told])
+    low, high = (float(numbers.min()), float(numbers.max())) if numbers.size else (0.1, 1.0)
+    high = high if high > low else low + 1
+    norm = LogNorm(low, high) if low > 0 else Normalize(low, high)
+    drawn = None
+    for axis, one, values in zip(panels, found.maps, told, strict=False):
+        drawn = _draw_map(axis, found, values, cmap="viridis", norm=norm)
+        axis.set_title(literal(one.controller))
+        if all(path.path in one.now for path in found.axes):
+            axis.plot(*(one.now[over.path] for over in found.axes), "o", mfc="none", mec="white", mew=1.5)
+    if several:
+        axis = panels[len(found.maps)]
+        colours = [PALETTE[k % len(PALETTE)] for k in range(len(found.maps))]
+        best = np.where(found.winners >= 0, found.winners, np.nan)
+        _draw_map(axis, found, best, cmap=ListedColormap(colours), norm=Normalize(-0.5, len(colours) - 0.5))
+        for one, colour in zip(found.maps, colours, strict=True):
+            axis.plot([], [], "s", color=colour, label=literal(one.controller))
+        axis.set_title("best")
+        draw_legend(axis)
+    for axis in panels[count:]:
+        axis.remove()
+    if drawn is not None:
+        figure.colorbar(drawn, ax=panels[: len(found.maps)], label=literal(_figure_label(found)))
+    return figure
+
+
+def _draw_map(axis: Axes, found: Sweep, values: np.ndarray, **colours: Any) -> Any:
+    """One map; cells without a number are grey."""
+    across, along = found.axes
+    axis.set_facecolor(_FAILED)
+    masked = np.ma.masked_invalid(values.T)
+    mesh = axis.pcolormesh(across.values, along.values, masked, shading="nearest", **colours)
+    for over, scale, label in ((across, axis.set_xscale, axis.set_xlabel), (along, axis.set_yscale, axis.set_ylabel)):
+        if over.logarithmic:
+            scale("log" if over.values[0] > 0 else "symlog")
+        label(literal(over.path))
+    return mesh
+
+
+def _scale_of(axis: Axes, found: Sweep) -> None:
+    [over] = found.axes
+    if over.logarithmic:
+        axis.set_xscale("log" if over.values[0] > 0 else "symlog")
+    finished = [v for one in found.maps for v in one.values[one.outcomes == "finished"]]
+    if finished and min(finished) > 0 and max(finished) > 10 * min(finished):
+        axis.set_yscale("log")
+
+
+def _figure_label(found: Sweep) -> str:
+    return f"{found.aim.name} [{found.aim.unit}]" if found.aim.unit not in ("", "1") else found.aim.name
 
 
 def _medians(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:

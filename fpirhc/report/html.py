@@ -20,7 +20,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.report.figures import contraction_figure, limits_figure, lyapunov_figure, mismatch_figure, pair_figures
+from fpirhc.report.figures import (
+    contraction_figure,
+    limits_figure,
+    lyapunov_figure,
+    mismatch_figure,
+    pair_figures,
+    sweep_figure,
+)
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
 from fpirhc.simulation.log import shown_motion
 from fpirhc.simulation.pictures.base import readable
@@ -39,6 +46,7 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.entry import Entry
     from fpirhc.studies.operating_limits import OperatingLimits
     from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
+    from fpirhc.studies.sweep import Sweep
     from fpirhc.studies.view import View
 
 
@@ -64,6 +72,12 @@ _LIMITS = (
     "One point per run, crosses are failed ones: above the dashed line by their error, at the upper edge they ended early, below "
     "the line they left a limit of a state. The first point of a line is the problem as it stands."
 )
+
+_SWEEP = (
+    "One cell per run, all maps in one scale of colours. Grey cells failed; rings are the settings as they stand. The last map "
+    "shows which controller is best."
+)
+_LINES = "One point per run; crosses at the upper edge are runs that failed, dotted lines the settings as they stand."
 
 
 @dataclass(frozen=True)
@@ -221,6 +235,17 @@ def write_limits(found: OperatingLimits, path: Path) -> None:
     """
     figure = limits_figure(found) if found.limits else None
     chart = Image(figure.address, "Error against what grows", _LIMITS) if figure else None
+    write_whole(render_page("scenarios.html", found.view, chart=chart, own=()), path, "report")
+
+
+def write_sweep(found: Sweep, path: Path) -> None:
+    """Write the report, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    name = " and ".join(axis.path for axis in found.axes)
+    chart = Image(sweep_figure(found).address, f"Over {name}", _SWEEP if len(found.axes) > 1 else _LINES)
     write_whole(render_page("scenarios.html", found.view, chart=chart, own=()), path, "report")
 
 

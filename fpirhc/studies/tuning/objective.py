@@ -76,6 +76,10 @@ class Objective:
             return in_percent(value)
         return self.metric.text(self._sign * value) + self._unit
 
+    def told(self, value: float) -> float:
+        """Return a value with the sign that the metric has; what is infinite is not a number."""
+        return self._sign * value if math.isfinite(value) else math.nan
+
     def difference(self, value: float) -> str:
         """Return a difference of two values as text."""
         if not math.isfinite(value):

@@ -1,0 +1,105 @@
+"""`fpirhc sweep PROBLEM --over PATH=LOW:HIGH:COUNT`: what every controller does over one setting, or over two."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import math
+import shlex
+
+from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_out, add_problem, add_seed
+from fpirhc.cli.output import RESULTS, results_folder, resumable
+from fpirhc.cli.verb import ExitCode, Verb
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    add_problem(parser)
+    text = "a setting with its values, COUNT of them from LOW to HIGH, by equal factors with :log; once or twice"
+    parser.add_argument("--over", action="append", required=True, metavar="PATH=LOW:HIGH:COUNT", help=text)
+    add_controllers(parser)
+    text = "figure of merit, such as settling.q1 (default: the problem's headline metric, or the relative error)"
+    parser.add_argument("--metric", metavar="NAME", help=text)
+    add_seed(parser, "noise, the same in every run")
+    add_out(parser, "results/PROBLEM/sweep_PATH...")
+    add_no_compile(parser)
+    add_json(parser, "the table")
+
+
+def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.problem_files.problem_file import load_problem
+
+    task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
+    from fpirhc.report.figures import save_figure, sweep_figure
+    from fpirhc.report.html import write_sweep
+    from fpirhc.report.terminal import progress_bars, show
+    from fpirhc.studies.sweep import LEDGER, Axis, sweep
+    from fpirhc.studies.view import to_json
+    from fpirhc.whole_file import write_whole
+
+    axes = [Axis.parsed(text) for text in options.over]
+    folder = results_folder(options.out, task.name, "_".join(["sweep", *(axis.path for axis in axes)]))
+    with resumable(folder / LEDGER), progress_bars() as progress:
+        found = sweep(
+            task,
+            axes,
+            folder=folder,
+            controllers=options.controllers,
+            metric=options.metric,
+            seed=options.seed,
+            compiled=not options.no_compile,
+            command=_command(options),
+            progress=progress,
+        )
+    rows = list(found.rows())
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0])
+    writer.writeheader()
+    writer.writerows({k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in row.items()} for row in rows)
+    write_whole(text.getvalue(), folder / "sweep.csv", "table")
+    write_sweep(found, folder / "report.html")
+    write_whole(f"{to_json(found.view.facts)}\n", folder / RESULTS, "report")
+    save_figure(sweep_figure(found), folder / "sweep.png")
+    if options.json:
+        print(to_json(found.view.facts))
+    else:
+        show(found.view, folder / "report.html")
+    return ExitCode.FINISHED
+
+
+def _command(options: argparse.Namespace) -> str:
+    words = ["fpirhc", "sweep", options.problem, "--seed", str(options.seed)]
+    words += [word for text in options.over for word in ("--over", text)]
+    words += ["--controllers", *options.controllers] if options.controllers else []
+    words += ["--metric", options.metric] if options.metric else []
+    return shlex.join([*words, *(["--no-compile"] if options.no_compile else [])])
+
+
+VERB = Verb(
+    name="sweep",
+    summary="draw a map of what every controller does over one setting, or over two",
+    group="run",
+    add=_add,
+    run=_run,
+    codes={
+        ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
+        ExitCode.INTERRUPTED: "interrupted from the keyboard; the same command continues",
+    },
+    examples=(
+        ("fpirhc sweep two_mass --over deformation.gain=-3:-0.1:30", "errors over the gain, a line per controller"),
+        (
+            "fpirhc sweep two_mass --over deformation.gain=-3:-0.1:30 --over exact.m1=0.5:2:20:log --controllers RHC RHC+FPI",
+            "two maps, and which of the two is better where",
+        ),
+        (
+            'fpirhc sweep two_mass --over start.q1=-1:1:21 --over "start.q1\'=-5:5:21" --controllers RHC+FPI',
+            "from where it converges",
+        ),
+    ),
+    notes="""
+A path that begins with exact. (the parameter of what moves), approximate., known., start. or a field of the problem, such as
+limits.inputs.Q1.1 or dead_time.inputs.Q1, is the problem's. Every other path is the controllers'; those without it are the same
+along it. Settings that can be live are numbers of one compiled loop; for others every value has a loop of its own, and the
+report says so. Finished runs are kept, and the same command goes on with them. sweep.csv has a row per run.
+""",
+)

@@ -1,0 +1,593 @@
+"""Maps of behaviour: what every controller does over one setting, or over two.
+
+A cell of the map is a case of the problem with settings of the controller. Cells are kept in a ledger one by one, so that an
+interrupted sweep goes on. Settings that can be live are numbers of one loop; for others every value has a loop of its own.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fpirhc.describe import describe
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, Mistakes, nearest
+from fpirhc.fields.checked import Checked, checked_call
+from fpirhc.fields.kinds import CountOrZero, Seed
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
+from fpirhc.studies.comparison.compare import check_gains, select, versions
+from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
+from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.ledger import Ledger
+from fpirhc.studies.tuning.objective import Objective, objective
+from fpirhc.studies.view import View
+from fpirhc.summary import Column, Table, in_percent, line, number
+from fpirhc.symbolic.paths import names_in
+from fpirhc.task.cases import Cases
+from fpirhc.task.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LEDGER = "sweep.jsonl"
+_MOST = 2  # settings of a map
+_LOG = "log"
+_FORM = "PATH=LOW:HIGH:COUNT, or PATH=LOW:HIGH:COUNT:log"
+_OF_PARAMETERS = "exact", "approximate", "known"
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A setting and its values.
+
+    Args:
+        path: of the setting: of a case of the problem, such as 'exact.m1', 'start.q1' or 'dead_time.inputs.Q1', or of the
+            controllers, such as 'deformation.gain'.
+        values: numbers in ascending or descending order, at least two.
+        logarithmic: whether equal factors lie between them.
+
+    Raises:
+        InvalidValue: fewer than two different finite values.
+    """
+
+    path: str
+    values: tuple[float, ...]
+    logarithmic: bool = False
+
+    def __post_init__(self) -> None:
+        steps = np.diff(self.values)
+        if len(self.values) < 2 or not np.isfinite(self.values).all() or not ((steps > 0).all() or (steps < 0).all()):
+            shown = ", ".join(map(number, self.values))
+            raise InvalidValue(
+                f"sweep over '{self.path}': expected at least two finite numbers in order, got ({shown})"
+            )
+
+    @classmethod
+    def parsed(cls, text: str) -> Axis:
+        """Return the axis that a text states: 'deformation.gain=-2:-0.1:40', or 'exact.m1=0.5:2:9:log' by equal factors.
+
+        Raises:
+            InvalidValue: another form, no number, an empty range, or equal factors from one sign to the other.
+        """
+        path, _, span = text.partition("=")
+        parts = span.split(":")
+        form = f"--over {text}: expected {_FORM}, such as deformation.gain=-2:-0.1:40"
+        if not path or len(parts) not in (3, 4) or parts[3:] not in ([], [_LOG]):
+            raise InvalidValue(form)
+        try:
+            low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
+        except ValueError:
+            raise InvalidValue(form) from None
+        if not (math.isfinite(low) and math.isfinite(high)) or low == high or count < 2:
+            raise InvalidValue(
+                f"--over {text}: an empty range; expected two different finite ends and at least 2 values"
+            )
+        logarithmic = bool(parts[3:])
+        if logarithmic and not low * high > 0:
+            raise InvalidValue(f"--over {text}: equal factors need two ends of one sign that are not zero")
+        values = (np.geomspace if logarithmic else np.linspace)(low, high, count)
+        return cls(path, tuple(float(f"{v:.10g}") for v in values), logarithmic)
+
+
+@dataclass(frozen=True)
+class CellFields(Checked):
+    """The fields of the record of one cell."""
+
+    controller: str
+    cell: CountOrZero
+    outcome: str
+    value: float | None
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class SweepMap:
+    """What one controller does.
+
+    Args:
+        controller: its name.
+        values: the figure that is judged, an entry per value of every setting; smaller is better, and infinite where a run failed.
+        outcomes: 'finished', 'diverged', 'ended early' or 'refused', of the same shape.
+        reasons: why a first run of each outcome did not finish; '' where it only diverged.
+        without: paths of settings that it does not have: its numbers are the same along these axes.
+        rebuilt: paths of settings of which every value needed a loop of its own.
+        now: its settings and those of the problem as they stand, by path.
+    """
+
+    controller: str
+    values: np.ndarray
+    outcomes: np.ndarray
+    reasons: Mapping[str, str]
+    without: tuple[str, ...]
+    rebuilt: tuple[str, ...]
+    now: Mapping[str, float]
+
+    @property
+    def failed(self) -> float:
+        """Share of the cells whose run did not finish."""
+        return float((self.outcomes != "finished").mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The result of `sweep`.
+
+    Args:
+        problem: name of the problem.
+        title: its title.
+        description: its description.
+        axes: one setting or two.
+        maps: one per controller.
+        aim: the figure that is judged.
+        seed: of the noise, the same in all cells.
+        settings: settings of the problem and the controllers.
+        versions: versions of fpirhc and of what its numbers depend on.
+        command: the command line.
+        elapsed: wall time, s.
+    """
+
+    problem: str
+    title: str
+    description: str
+    axes: tuple[Axis, ...]
+    maps: tuple[SweepMap, ...]
+    aim: Objective
+    seed: int
+    settings: Mapping[str, Any]
+    versions: Mapping[str, str]
+    command: str
+    elapsed: float
+
+    def __repr__(self) -> str:
+        names = " x ".join(f"{len(axis.values)} {axis.path}" for axis in self.axes)
+        return line(
+            self, self.problem, names, *(f"{one.controller}: {in_percent(one.failed)} failed" for one in self.maps)
+        )
+
+    def _repr_html_(self) -> str:
+        return self.view.html()
+
+    def of(self, controller: str) -> SweepMap:
+        """Return the map of a controller.
+
+        Raises:
+            InvalidName: there is none.
+        """
+        found = {one.controller: one for one in self.maps}
+        if controller not in found:
+            raise InvalidName(f"no map of '{controller}'.{nearest(controller, found)}")
+        return found[controller]
+
+    @cached_property
+    def winners(self) -> np.ndarray:
+        """Place of the controller with the best number among `maps`, per cell; -1 where all failed, or the best are equal."""
+        values = np.array([one.values for one in self.maps])
+        least = values.min(axis=0)
+        alone = np.isfinite(least) & ((values == least).sum(axis=0) == 1)
+        return np.where(alone, values.argmin(axis=0), -1)
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield a row for every cell and controller: settings, controller, figure as it is told, outcome."""
+        for one in self.maps:
+            for place in np.ndindex(one.values.shape):
+                settings = {axis.path: axis.values[k] for axis, k in zip(self.axes, place, strict=True)}
+                value = self.aim.told(float(one.values[place]))
+                yield {
+                    **settings,
+                    "controller": one.controller,
+                    self.aim.name: value,
+                    "outcome": str(one.outcomes[place]),
+                }
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return the rows as a pandas DataFrame."""
+        import pandas as pd
+
+        return pd.DataFrame(self.rows())
+
+    @property
+    def view(self) -> View:
+        """What every output says of it."""
+        return _view(self)
+
+
+@checked_call
+def sweep(
+    task: Task,
+    over: Sequence[Axis],
+    *,
+    folder: Path,
+    controllers: Sequence[str] | None = None,
+    metric: str | None = None,
+    seed: Seed = 0,
+    compiled: bool = True,
+    command: str = "",
+    progress: Progress | None = None,
+) -> Sweep:
+    """Run every controller at every value of one setting, or of two, and return the maps.
+
+        axes = [Axis("deformation.gain", (-2.0, -1.0, -0.5)), Axis("exact.m1", (0.5, 1.0, 2.0))]
+        sweep(fp.load_problem("two_mass"), axes, folder=Path("map"), controllers=["CTC+FPI"]).to_dataframe()
+
+    Args:
+        task: the loaded problem file.
+        over: one setting or two. A path that begins with a field of the problem, or with exact., approximate., known. or start., is
+            the problem's, see `Cases`; any other is the controllers', and those that do not have it are the same along it.
+        folder: folder to which finished cells are written; those that it holds are not repeated.
+        controllers: names of controllers; None: all.
+        metric: figure of merit, such as 'settling.q1'; None: the problem's headline metric, or the relative error.
+        seed: of the noise, the same in all cells.
+        compiled: whether runs use compiled C.
+        command: the command line, for the report.
+        progress: function of (controller, cells done, cells in all).
+
+    Raises:
+        InvalidName: a path that leads nowhere; an unknown metric.
+        InvalidProblem: unknown controllers, gains of the wrong sign.
+        InvalidValue: no setting or more than two, a value that the problem does not accept, a metric without better direction.
+        OutputError: the folder cannot be written, or holds results under other conditions.
+    """
+    begin = time.perf_counter()
+    chosen = select(task, controllers)
+    check_gains(task, chosen)
+    axes = tuple(replace(axis, path=_canonical(task, axis.path)) for axis in over)
+    of_problem = _checked_axes(replace(task, controllers=chosen), axes)
+    aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
+    grid = _Grid(axes, of_problem, seed)
+    measured = [m for m in task.metrics if m.name in ("rms_error", aim.metric.name if aim.metric else "")]
+    task = replace(task, controllers=chosen, cases=grid.cases, metrics=measured)
+    conditions = Conditions(seed, COMPARING, 0.0, compiled, named=True)
+    header = {**fingerprint(task, conditions), "axes": describe(axes), "metric": aim.name}
+    with Ledger(folder / LEDGER, header, CellFields) as ledger:
+        maps = tuple(_Runner(task, name, grid, conditions, aim, ledger).map(progress) for name in chosen)
+    return Sweep(
+        problem=task.name,
+        title=task.title,
+        description=task.description,
+        axes=axes,
+        maps=maps,
+        aim=aim,
+        seed=seed,
+        settings={"problem": describe(task.problem), **{n: describe(c) for n, c in chosen.items()}},
+        versions=versions(),
+        command=command,
+        elapsed=time.perf_counter() - begin,
+    )
+
+
+# --- The grid ------------------------------------------------------------------------------------------------------------
+
+
+def _canonical(task: Task, path: str) -> str:
+    """'m1.exact' is 'exact.m1'."""
+    name, _, word = path.rpartition(".")
+    named = word in _OF_PARAMETERS and (name in task.problem.plant.parameters or name in task.problem.moved.parameters)
+    return f"{word}.{name}" if named else path
+
+
+def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
+    """Return the paths that are the problem's.
+
+    Raises:
+        InvalidName, InvalidValue: mistakes, all together.
+    """
+    if not 0 < len(axes) <= _MOST:
+        raise InvalidValue(
+            f"a sweep has one setting or two, got {len(axes)}; a third one is another sweep, with run --set"
+        )
+    if len({axis.path for axis in axes}) < len(axes):
+        raise InvalidValue(f"'{axes[0].path}' is given twice")
+    words = {f.name for f in fields(task.problem)} | {*_OF_PARAMETERS, "start"}
+    of_problem = frozenset(axis.path for axis in axes if axis.path.partition(".")[0] in words)
+    mistakes = Mistakes("sweep")
+    for axis in axes:
+        try:
+            if axis.path in of_problem:
+                ends = (axis.values[0], axis.values[-1])
+                Cases({f"{axis.path} = {number(v)}": {axis.path: v} for v in ends}).check(task.problem)
+            else:
+                _check_controllers(task, axis, words)
+        except FpirhcError as error:
+            mistakes.add(str(error))
+    mistakes.raise_if_any()
+    return of_problem
+
+
+def _check_controllers(task: Task, axis: Axis, words: Collection[str]) -> None:
+    """Raise where no controller has the setting, or one that has it cannot take a value."""
+    lacking = []
+    for name, controller in task.controllers.items():
+        try:
+            current_setting(controller, axis.path)
+        except FpirhcError as error:
+            lacking.append(f"{name}: {error}")
+            continue
+        if is_whole(controller, axis.path) and any(v % 1 for v in axis.values):
+            shown = ", ".join(map(number, axis.values))
+            raise InvalidValue(
+                f"'{axis.path}' of '{name}' is a whole number, and the values are {shown}; choose another COUNT"
+            )
+    if len(lacking) < len(task.controllers):
+        return
+    word, fields_of = axis.path.partition(".")[0], {n for one in task.controllers.values() for n in names_in(one)}
+    if word in fields_of:
+        raise InvalidName(f"no controller has '{axis.path}'. {lacking[-1]}")
+    parameter = f" The parameter is 'exact.{word}'." if word in task.problem.moved.parameters else ""
+    hint = parameter or nearest(word, sorted({*words, *fields_of}))
+    raise InvalidName(f"neither the problem nor a controller has '{axis.path}'.{hint}")
+
+
+def _of_problem(problem: Problem, path: str) -> float | None:
+    """The number of the problem at the path of a case; None where there is none yet."""
+    word, _, name = path.partition(".")
+    if word == "exact":
+        return problem.moved.parameters[name].exact
+    if word in _OF_PARAMETERS:
+        return problem.plant.parameters[name].approximate
+    if word == "start":
+        return float(problem.start_state[problem.plant.state.elements.index(name)])
+    try:
+        return float(current_setting(problem, path))
+    except FpirhcError:
+        return None
+
+
+class _Grid:
+    """The cells, by number: the last axis is the fastest.
+
+    Args:
+        axes: the settings.
+        of_problem: paths that are the problem's.
+        seed: of the noise of every case.
+    """
+
+    def __init__(self, axes: Sequence[Axis], of_problem: frozenset[str], seed: int) -> None:
+        self.axes, self.of_problem = axes, of_problem
+        self.shape = tuple(len(axis.values) for axis in axes)
+        self._case_axes = [axis for axis in axes if axis.path in of_problem]
+        cases = [
+            dict(zip([a.path for a in self._case_axes], values, strict=True))
+            for values in itertools.product(*(a.values for a in self._case_axes))
+        ]
+        self.cases = Cases({str(k): {**case, "seed": seed} for k, case in enumerate(cases)})
+
+    def case(self, place: Sequence[int]) -> int:
+        """Return the number of a cell's case."""
+        places = [k for k, axis in zip(place, self.axes, strict=True) if axis in self._case_axes]
+        sizes = [len(axis.values) for axis in self._case_axes]
+        return int(np.ravel_multi_index(places, sizes)) if places else 0
+
+    def settings(self, place: Sequence[int], paths: Sequence[str]) -> dict[str, float]:
+        """Return the numbers of a cell's settings."""
+        return {axis.path: axis.values[k] for axis, k in zip(self.axes, place, strict=True) if axis.path in paths}
+
+
+class _Runner:
+    """Runs the cells of one controller: with one loop where its settings can be live, else with one for each value."""
+
+    def __init__(
+        self, task: Task, name: str, grid: _Grid, conditions: Conditions, aim: Objective, ledger: Ledger
+    ) -> None:
+        self._task, self._name, self._grid = replace(task, controllers={name: task.controllers[name]}), name, grid
+        self._conditions, self._aim, self._ledger = conditions, aim, ledger
+        self._controller = task.controllers[name]
+        own = [axis.path for axis in grid.axes if axis.path not in grid.of_problem]
+        self._now = {path: value for path in own if (value := self._current(path)) is not None}
+        self._without = tuple(path for path in own if path not in self._now)
+        self._of_problem = {path: v for path in grid.of_problem if (v := _of_problem(task.problem, path)) is not None}
+        self._rebuilt: tuple[dict[str, float], Bench] | None = None
+
+    def map(self, progress: Progress | None) -> SweepMap:
+        """Return the map; cells that the ledger has are not run again."""
+        known = {r["cell"]: r for r in self._ledger.records if r["controller"] == self._name}
+        places = [p for p in np.ndindex(*self._grid.shape) if self._stands_for_others(p)]
+        # Settings are the outer loop: what must be built anew is built once.
+        places.sort(key=lambda p: tuple(self._settings(p).values()))
+        for done, place in enumerate(places):
+            cell = self._number(place)
+            if cell not in known:
+                known[cell] = self._record(cell, place)
+                self._ledger.append(known[cell])
+            if progress:
+                progress(self._name, done + 1, len(places))
+        values, outcomes = np.full(self._grid.shape, math.inf), np.empty(self._grid.shape, dtype=object)
+        reasons: dict[str, str] = {}
+        for place in np.ndindex(*self._grid.shape):
+            record = known[self._number(self._representative(place))]
+            values[place] = math.inf if record["value"] is None else record["value"]
+            outcomes[place] = record["outcome"]
+            if record["outcome"] != "finished":
+                reasons.setdefault(record["outcome"], record["reason"])
+        rebuilt = () if self._live else tuple(self._now)
+        return SweepMap(
+            self._name, values, outcomes, reasons, self._without, rebuilt, {**self._now, **self._of_problem}
+        )
+
+    def _current(self, path: str) -> float | None:
+        try:
+            return float(current_setting(self._controller, path))
+        except FpirhcError:
+            return None
+
+    def _representative(self, place: Sequence[int]) -> tuple[int, ...]:
+        """The cell that is run for this one: the first along settings that the controller does not have."""
+        axes = zip(place, self._grid.axes, strict=True)
+        return tuple(0 if axis.path in self._without else k for k, axis in axes)
+
+    def _stands_for_others(self, place: tuple[int, ...]) -> bool:
+        return self._representative(place) == place
+
+    def _number(self, place: Sequence[int]) -> int:
+        return int(np.ravel_multi_index(tuple(place), self._grid.shape))
+
+    def _settings(self, place: Sequence[int]) -> dict[str, float]:
+        found = self._grid.settings(place, list(self._now))
+        return {p: round(v) if is_whole(self._controller, p) else v for p, v in found.items()}
+
+    @cached_property
+    def _bench(self) -> Bench:
+        return Bench(self._task, self._conditions, {self._name: list(self._now)})
+
+    @cached_property
+    def _live(self) -> bool:
+        return not self._now or self._bench.changes(self._name)
+
+    def _record(self, cell: int, place: tuple[int, ...]) -> dict[str, Any]:
+        settings, case = self._settings(place), self._grid.case(place)
+        try:
+            record = self._run(settings, case)
+        except FpirhcError as error:
+            record = {"skipped": str(error)}
+        reason = record.get("skipped") or record.get("stop") or ""
+        value = math.inf if "skipped" in record else self._aim.value(record)
+        return {
+            "controller": self._name,
+            "cell": cell,
+            "outcome": record.get("outcome", "refused"),
+            "value": value if math.isfinite(value) else None,
+            "reason": reason.partition(";")[0],
+        }
+
+    def _run(self, settings: Mapping[str, float], case: int) -> dict[str, Any]:
+        if self._live:
+            return self._bench.record(case, self._name, settings or None)
+        if self._rebuilt is None or self._rebuilt[0] != settings:
+            changed = with_settings(self._controller, settings)
+            bench = Bench(replace(self._task, controllers={self._name: changed}), self._conditions)
+            self._rebuilt = dict(settings), bench
+        return self._rebuilt[1].record(case, self._name)
+
+
+# --- What is said of it --------------------------------------------------------------------------------------------------
+
+
+def _view(found: Sweep) -> View:
+    cells = math.prod(len(axis.values) for axis in found.axes)
+    over = " and ".join(
+        f"{axis.path} from {number(axis.values[0])} to {number(axis.values[-1])} in {len(axis.values)} values"
+        + (" by equal factors" if axis.logarithmic else "")
+        for axis in found.axes
+    )
+    conditions = (
+        f"{cells} runs of a controller over {over}, with the noise of seed {found.seed}; {found.aim.name} is judged. A run "
+        "fails if it ends early, diverges (an rms error above the reference's range) or is refused; best and worst "
+        "are of those that finished."
+    )
+    heads = [Column(head) for head in ("controller", "failed", "best", "at", "worst")]
+    table = Table(f"{found.problem}: over {' and '.join(axis.path for axis in found.axes)}", heads, conditions)
+    for one in found.maps:
+        table.add([one.controller, in_percent(one.failed), *_extremes(found, one)])
+    reasons = [
+        f"{one.controller}: {int((one.outcomes == kind).sum())} {kind}{f', such as: {why}' if why else ''}"
+        for one in found.maps
+        for kind, why in one.reasons.items()
+    ]
+    built = [
+        f"{one.controller}: {', '.join(one.rebuilt)} cannot be live, so every value has a loop of its own"
+        for one in found.maps
+        if one.rebuilt
+    ]
+    same = [
+        f"{one.controller} has no {', '.join(one.without)}: it is the same along it"
+        for one in found.maps
+        if one.without
+    ]
+    lists = {"Why runs failed": reasons, "How it was run": [*built, *same]}
+    return View(
+        title=found.title,
+        about=found.description,
+        sentences=[(text, None) for text in _sentences(found)],
+        conditions=conditions,
+        tables=(table,),
+        lists={name: texts for name, texts in lists.items() if texts},
+        skipped={},
+        settings=found.settings,
+        versions=found.versions,
+        command=found.command,
+        elapsed=found.elapsed,
+        facts=_facts(found),
+    )
+
+
+def _extremes(found: Sweep, one: SweepMap) -> list[str]:
+    """The best number, where it is, and the largest one of a run that finished."""
+    if not np.isfinite(one.values).any():
+        return ["none", "", ""]
+    best = np.unravel_index(int(np.argmin(one.values)), one.values.shape)
+    at = ", ".join(
+        f"{axis.path} = {number(axis.values[k])}"
+        for axis, k in zip(found.axes, best, strict=True)
+        if axis.path not in one.without
+    )
+    finished = one.values[one.outcomes == "finished"]
+    largest = found.aim.text(float(finished.max())) if finished.size else "none"
+    return [found.aim.text(float(one.values[best])), at, largest]
+
+
+def _sentences(found: Sweep) -> Iterator[str]:
+    """Who is best where, and who fails."""
+    cells, places = found.winners.size, found.winners.ravel()
+    if len(found.maps) > 1:
+        shares = sorted(((int((places == k).sum()), one.controller) for k, one in enumerate(found.maps)), reverse=True)
+        told = ", ".join(f"{name} in {count}" for count, name in shares if count)
+        yield f"{found.aim.subject[0].upper()}{found.aim.subject[1:]} is best with: {told or 'none alone'} of {cells} cells."
+    for one in found.maps:
+        failed = int((one.outcomes != "finished").sum())
+        yield f"{one.controller} fails in {failed} of {cells} cells." if failed else f"{one.controller} fails nowhere."
+
+
+def _facts(found: Sweep) -> dict[str, Any]:
+    return {
+        "problem": found.problem,
+        "title": found.title,
+        "seed": found.seed,
+        "figure": found.aim.name,
+        "axes": [{"path": a.path, "values": list(a.values), "logarithmic": a.logarithmic} for a in found.axes],
+        "maps": [
+            {
+                "controller": one.controller,
+                "values": [found.aim.told(float(v)) for v in one.values.ravel()],
+                "outcomes": [str(v) for v in one.outcomes.ravel()],
+                "reasons": dict(one.reasons),
+                "without": list(one.without),
+                "rebuilt": list(one.rebuilt),
+                "as it stands": dict(one.now),
+            }
+            for one in found.maps
+        ],
+        "order": "the last setting is the fastest",
+        "sentences": list(_sentences(found)),
+        "settings": found.settings,
+        "versions": found.versions,
+        "command": found.command,
+    }
