@@ -31,7 +31,7 @@ from fpirhc.review.dead_time_variants import is_late, scaled
 from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger, Records
-from fpirhc.studies.scenarios.paired import median_interval, middle, summarise, verdict
+from fpirhc.studies.scenarios.paired import median_interval, middle, share_interval, summarise, verdict
 from fpirhc.studies.scenarios.processes import DEATHS, Workers
 
 LINE = line_text(
@@ -208,8 +208,38 @@ def test_failures_are_counted_and_are_worse_than_any_error():
     assert one.difference.median == 0  # two gains, one tie, two losses
     sentences = " ".join(verdict([summarise("A", plain, None, seed=0), one], {"C": "no horizon"}))
     assert "B and A show no clear difference" in sentences
-    assert "B fails in 3 of 5 scenarios (3 ended early)" in sentences
+    assert (
+        "B fails in 3 of 5 scenarios (3 ended early): 14.7 % to 94.7 % of what is drawn so, with 95 % confidence."
+        in sentences
+    )
     assert "Not run: C (no horizon)" in sentences
+
+
+def test_failures_of_named_cases_are_no_sample():
+    """Cases are what they are: a share of others cannot be said."""
+    failing = summarise("B", _records("B", [0.01, None]), None, seed=0)
+    sentences = verdict([failing], {}, "cases")
+    assert "B fails in 1 of 2 cases (1 ended early)." in sentences
+
+
+def test_that_nobody_failed_bounds_the_share():
+    """1 - 0.05^(1/300) of all plants would show a failure in 95 of 100 studies: the rule of three, 3 / 300."""
+    fine = summarise("A", _records("A", [0.1] * 300), None, seed=0)
+    sentences = verdict([fine], {})
+    assert (
+        "A fails in none of 300 scenarios: in at most 0.994 % of what is drawn so, with 95 % confidence." in sentences
+    )
+
+
+@pytest.mark.parametrize(("count", "total"), [(1, 5), (3, 5), (2, 1000), (999, 1000)])
+def test_the_share_of_failures_is_that_of_the_exact_binomial_test(count, total):
+    exact = stats.binomtest(count, total).proportion_ci(0.95, "exact")
+    assert share_interval(count, total) == pytest.approx((exact.low, exact.high), rel=1e-9)
+
+
+def test_at_the_ends_the_whole_level_is_on_the_other_side():
+    assert share_interval(0, 300) == pytest.approx((0.0, 1 - 0.05 ** (1 / 300)))
+    assert share_interval(300, 300) == pytest.approx((0.05 ** (1 / 300), 1.0))
 
 
 def test_an_error_as_large_as_the_motion_has_diverged(task):

@@ -92,7 +92,7 @@ VERB = Verb(
             "two maps, and which of the two is better where",
         ),
         (
-            'fpirhc sweep two_mass --over start.q1=-1:1:21 --over "start.q1\'=-5:5:21" --controllers RHC+FPI',
+            'fpirhc sweep two_mass --over start.q1=1:3.4:13 --over "start.q1\'=-15:15:13" --controllers RHC+FPI',
             "from where it converges",
         ),
     ),

@@ -13,6 +13,7 @@ from fpirhc.by_name import FoundByName
 from fpirhc.simulation.metrics import Metric, known_metrics
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.tuning.objective import Objective
+from fpirhc.summary import in_percent
 
 Record = Mapping[str, Any]
 
@@ -76,6 +77,11 @@ class Summary(FoundByName):
     def failures(self) -> int:
         """Scenarios that ended early or diverged."""
         return sum(n for outcome, n in self.outcomes.items() if outcome != "finished")
+
+    @property
+    def failure_share(self) -> tuple[float, float]:
+        """The exact interval of the share of failures, see `share_interval`."""
+        return share_interval(self.failures, self.errors.size)
 
 
 def summarise(
@@ -182,6 +188,7 @@ def verdict(
         worst = (f"{s.name} {figure.text(s.worst)} in {s.worst_name}" for s in summaries)
         sentences.append(f"Worst {what}: {'; '.join(worst)}.")
     sentences += [_failed(s, what) for s in summaries if s.failures]
+    sentences += _nowhere([s for s in summaries if not s.failures], what)
     if skipped:
         sentences.append("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + ".")
     return tuple(sentences)
@@ -207,12 +214,47 @@ def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> 
 
 def _failed(one: Summary, what: str) -> str:
     parts = [f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished"]
-    return f"{one.name} fails in {one.failures} of {one.errors.size} {what} ({', '.join(parts)})."
+    said = f"{one.name} fails in {one.failures} of {one.errors.size} {what} ({', '.join(parts)})"
+    if what == noun(True):
+        return f"{said}."
+    low, high = map(in_percent, one.failure_share)
+    return f"{said}: {low} to {high} of what is drawn so, with 95 % confidence."
+
+
+def _nowhere(none: Sequence[Summary], what: str) -> list[str]:
+    """What it shows that nobody failed; named cases are no sample of anything."""
+    if not none or what == noun(True):
+        return []
+    names = " and ".join(filter(None, (", ".join(s.name for s in none[:-1]), none[-1].name)))
+    verb = "fail" if len(none) > 1 else "fails"
+    most = in_percent(none[0].failure_share[1])
+    return [
+        f"{names} {verb} in none of {none[0].errors.size} {what}: in at most {most} of what is drawn so, with 95 % confidence."
+    ]
 
 
 RESAMPLES = 4000
 LEVEL = 0.95
 _AT_ONCE = 2_000_000  # largest number of values that are drawn at once
+
+
+def share_interval(count: int, total: int) -> tuple[float, float]:
+    """Return the exact interval of the share of an event that was seen `count` times in `total` independent trials.
+
+        P(X >= count | low) = P(X <= count | high) = (1 - LEVEL) / 2,        X binomial,
+
+    and the whole of the level at the other end where it was never seen, or always: never in n trials is at most 1 - 0.05^(1/n).
+
+    References:
+        C. J. Clopper, E. S. Pearson, The use of confidence or fiducial limits illustrated in the case of the binomial, Biometrika
+        26(4), 1934.
+    """
+    from scipy.special import betaincinv  # it takes longer to import than a verdict to write
+
+    tail = (1 - LEVEL) / (1 if count in (0, total) else 2)
+    low = float(betaincinv(count, total - count + 1, tail)) if count else 0.0
+    high = float(betaincinv(count + 1, total - count, 1 - tail)) if count < total else 1.0
+    return low, high
 
 
 @dataclass(frozen=True)

@@ -220,6 +220,7 @@ def _summary(one: Summary) -> dict[str, Any]:
         "rms_error": one.rms_error,
         "metrics": one.metrics,
         "outcomes": one.outcomes,
+        "failure_share": one.failure_share,
         "statuses": one.statuses,
         "worst_metrics": one.worst_metrics,
         "errors": one.errors.tolist(),
