@@ -6,10 +6,10 @@
 A record is one run of one controller in one scenario, with its metrics: processor time, the smallest of many, bytes
 of memory are those of a thousand more records that are read from a file.
 
-Libraries are compiled before anything is timed. In every round the three ways take turns, so that whatever else the machine does
-falls on all: one process, two processes, and, for what the machine can give, the same work cut in halves by hand and run as two
-independent commands at once. Ratios are those of the medians. CPU seconds show what sharing itself costs, also on a
-machine with other work.
+Libraries are compiled before anything is timed. In every round the four ways take turns, so that whatever else the machine does
+falls on all: one process, two processes, two workers of a local Dask cluster, and, for what the machine can give, the same work
+cut in halves by hand and run as two independent commands at once. Ratios are those of the medians. CPU seconds show what sharing
+itself costs, also on a machine with other work.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ STUDIES = (("two_mass", ("CTC", "CTC+FPI (eq 6)"), 2000), ("van_der_pol", ("RHC"
 
 
 def command(
-    name: str, controllers: tuple[str, ...], count: int, processes: int, folder: Path, seed: int = 0
+    name: str, controllers: tuple[str, ...], count: int, processes: int, folder: Path, *more: str, seed: int = 0
 ) -> list[str]:
     return [
         *(
@@ -60,7 +60,7 @@ def command(
             "--seed",
             f"{seed}",
         ),
-        *("--processes", f"{processes}", "--out", str(folder), "--controllers", *controllers),
+        *("--processes", f"{processes}", "--out", str(folder), *more, "--controllers", *controllers),
     ]
 
 
@@ -75,16 +75,18 @@ def measured(*commands: list[str]) -> tuple[float, float]:
 
 def study(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ...]:
     """One row: medians over the rounds."""
-    taken: dict[str, list[tuple[float, float]]] = {"one": [], "two": [], "halves": []}
+    taken: dict[str, list[tuple[float, float]]] = {"one": [], "two": [], "dask": [], "halves": []}
     for _ in range(ROUNDS):
         with tempfile.TemporaryDirectory() as base:
-            folders = [Path(base) / f"{k}" for k in range(4)]
+            folders = [Path(base) / f"{k}" for k in range(5)]
             taken["one"].append(measured(command(name, controllers, count, 1, folders[0])))
             taken["two"].append(measured(command(name, controllers, count, 2, folders[1])))
+            dask = command(name, controllers, count, 2, folders[4], "--cluster", "local")
+            taken["dask"].append(measured(dask))
             halves = [command(name, controllers, count // 2, 1, folders[k + 2], seed=k) for k in (0, 1)]
             taken["halves"].append(measured(*halves))
-            ledgers = [sorted((f / "scenarios.jsonl").read_text().splitlines()) for f in folders[:2]]
-            assert ledgers[0] == ledgers[1], "results depend on the number of processes"
+            ledgers = [sorted((f / "scenarios.jsonl").read_text().splitlines()) for f in (*folders[:2], folders[4])]
+            assert ledgers[0] == ledgers[1] == ledgers[2], "results depend on who computes them"
     wall = {way: float(np.median([w for w, _ in times])) for way, times in taken.items()}
     cpu = {way: float(np.median([c for _, c in times])) for way, times in taken.items()}
     return (
@@ -93,9 +95,11 @@ def study(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ...
         f"{wall['one']:.1f}",
         f"{wall['two']:.1f}",
         f"{wall['one'] / wall['two']:.2f}",
+        f"{wall['one'] / wall['dask']:.2f}",
         f"{wall['one'] / wall['halves']:.2f}",
         f"{cpu['one']:.1f}",
         f"{cpu['two']:.1f}",
+        f"{cpu['dask']:.1f}",
     )
 
 
@@ -145,8 +149,8 @@ def main() -> None:
             measured(command(name, controllers, 1, 1, Path(folder)))  # compiles
         rows.append(study(name, controllers, count))
     heads_of_commands = (
-        *("problem", "runs", "s, one process", "s, two processes", "times faster", "halves by hand: times faster"),
-        *("CPU s, one process", "CPU s, two processes"),
+        *("problem", "runs", "s, one process", "s, two processes", "times faster", "two Dask workers: times faster"),
+        *("halves by hand: times faster", "CPU s, one process", "CPU s, two processes", "CPU s, two Dask workers"),
     )
     write_table("scenarios", heads_of_commands, rows)
 

@@ -70,6 +70,18 @@ def find_compiler() -> str | None:
     return None
 
 
+def machine_facts() -> dict[str, str]:
+    """Return what decides the last bits of numbers on this machine, apart from packages: compiler, C library, wide registers."""
+    compiler = find_compiler()
+    lines = _version(compiler).splitlines() if compiler else []
+    return {
+        "compiler": lines[0] if lines else "none",
+        "C library": " ".join(platform.libc_ver()).strip(),
+        "wide registers": " ".join(flag for flag in ("avx2", "fma", "avx512f") if f" {flag} " in _processor())
+        or "none",
+    }
+
+
 def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool = False, calls: int = 0) -> Native:
     """Return `function` compiled, or as it is with the reason why not.
 
@@ -215,13 +227,17 @@ def _unit(source: str, compiler: str, more: Sequence[str]) -> _Unit:
 
 
 @cache
+def _processor() -> str:
+    """What Linux says of the processors; empty elsewhere."""
+    try:
+        return Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
 def _machine_flags() -> tuple[str, ...]:
     """Definitions for this machine: where it has wide registers, the loops of optimisers leave out the code for those without."""
-    try:
-        facts = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        facts = ""
-    return ("-DALWAYS_WIDE",) if platform.machine() == "x86_64" and " avx2 " in facts else ()
+    return ("-DALWAYS_WIDE",) if platform.machine() == "x86_64" and " avx2 " in _processor() else ()
 
 
 def _note(function: ca.Function, compiler: str, more: Sequence[str], calls: int) -> Path | None:

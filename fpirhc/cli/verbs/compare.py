@@ -39,6 +39,10 @@ _EXAMPLES = (
         "fpirhc compare my_arm.py --scenarios 50 --mismatch 30 --controllers RHC RHC+FPI --baseline RHC --out results/arm",
         "two controllers, compared with the first",
     ),
+    (
+        "fpirhc compare two_mass --scenarios 10000 --mismatch 20 --cluster tcp://10.0.0.1:8786",
+        "on the workers of a Dask cluster (pip install 'fpirhc[cluster]'); local: a cluster of this machine",
+    ),
     ("fpirhc compare my_arm.py --cases all --headline settling.q1", "by another number than the error"),
     ("fpirhc compare my_arm.py --cases all", "every case of the problem file; the worst one is named"),
     ("fpirhc compare anaesthesia --cases elderly 'patient 0*' --processes 2", "cases by name, or by group"),
@@ -144,6 +148,8 @@ def _add_scenarios(parser: argparse.ArgumentParser) -> None:
     add_cases(group, "run every controller in these cases of the problem file")
     add_mismatch(group, None)
     add_processes(group)
+    text = "run scenarios on the workers of a Dask cluster, tcp://HOST:PORT; local: of N processes here"
+    group.add_argument("--cluster", metavar="ADDRESS", help=text)
     text = "controller that the others are compared with (default: the first)"
     group.add_argument("--baseline", metavar="NAME", help=text)
     text = "run every N-th scenario from the K-th on, here; 'fpirhc merge' joins the folders"
@@ -165,7 +171,7 @@ def _check(options: argparse.Namespace) -> None:
             "--cases have the parameters that they state; leave --mismatch out, or compare --scenarios N"
         )
     if options.scenarios is None and not options.cases:
-        named = [n for n in ("mismatch", "baseline", "shard") if getattr(options, n) is not None]
+        named = [n for n in ("mismatch", "baseline", "shard", "cluster") if getattr(options, n) is not None]
         named += ["processes"] if options.processes != 1 else []
         if named:
             raise InvalidValue(f"--{named[0]} needs --scenarios N, the number of scenarios")
@@ -221,6 +227,7 @@ def _compared(options: argparse.Namespace, task: Task, folder: Path) -> Scenario
             baseline=options.baseline,
             headline=options.headline,
             processes=options.processes,
+            cluster=options.cluster,
             tuned=tuned.values if tuned else None,
             tuning=tuned.notes if tuned else None,
             compiled=not options.no_compile,

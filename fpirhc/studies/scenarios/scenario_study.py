@@ -21,6 +21,7 @@ from fpirhc.simulation.metrics import Metric
 from fpirhc.simulation.metrics.measuring import Column
 from fpirhc.studies.comparison.compare import check_gains, select, versions
 from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint, scenario_numbers
+from fpirhc.studies.scenarios.cluster import Cluster
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import Record, Summary, noun, summarise, verdict
@@ -47,6 +48,7 @@ def compare_scenarios(
     baseline: str | None = None,
     headline: str | None = None,
     processes: int = 1,
+    cluster: str | None = None,
     tuned: Mapping[str, Values] | None = None,
     tuning: Mapping[str, str] | None = None,
     compiled: bool = True,
@@ -67,6 +69,8 @@ def compare_scenarios(
         baseline: name of the controller with which the others are compared; None: the first.
         headline: number by which controllers are compared, 'in_band' or 'rms_error.q1'; None: the problem's, or the relative error.
         processes: number of processes; more than 1 need a task that is the same as its file.
+        cluster: address of a scheduler of Dask, 'tcp://HOST:PORT', whose workers run the scenarios; 'local': a cluster of so many
+            processes on this machine. It needs such a task too.
         tuned: settings to change, by controller and path.
         tuning: sentences about the origin of these settings, by controller.
         compiled: whether runs use compiled C.
@@ -78,7 +82,8 @@ def compare_scenarios(
         InvalidProblem: unknown controllers or settings, gains of the wrong sign, draws that could leave physical
             bounds.
         OutputError: the folder cannot be written, or holds results under other conditions.
-        WorkerDied: processes die again and again.
+        NotSupported: Dask is not installed.
+        WorkerDied: processes die again and again, or the scheduler of a cluster is gone.
     """
     begin = time.perf_counter()
     figure = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
@@ -91,9 +96,13 @@ def compare_scenarios(
     conditions = Conditions(seed, COMPARING, float(percent), compiled, named=cases is not None)
     bench, header = Bench(task, conditions), fingerprint(task, conditions)
     opening = {"path": str(task.path.resolve()), "tuned": tuned or {}, "conditions": asdict(conditions)}
-    workers = Workers(__package__ + ".worker", opening, header, processes)
+    workers: Workers | Cluster | None = None
+    if cluster is not None:
+        workers = Cluster(cluster, opening, header, processes)
+    elif processes > 1:
+        workers = Workers(__package__ + ".worker", opening, header, processes)
     with Ledger(folder / LEDGER, header, RecordFields) as ledger:
-        records, skipped = _completed(ledger, bench, workers if processes > 1 else None, numbers, names, progress)
+        records, skipped = _completed(ledger, bench, workers, numbers, names, progress)
     summaries = _summaries(records, seed, task.metrics, figure)
     return ScenarioComparison(
         problem=task.name,
@@ -140,7 +149,7 @@ def _of_shard(numbers: Sequence[int], part: int, parts: int) -> Sequence[int]:
 def _completed(
     ledger: Ledger,
     bench: Bench,
-    workers: Workers | None,
+    workers: Workers | Cluster | None,
     numbers: Sequence[int],
     names: Sequence[str],
     progress: Progress | None,
@@ -168,7 +177,9 @@ def _completed(
     return {n: records.at(places[n][list(numbers)].tolist()) for n in names if n not in skipped}, skipped
 
 
-def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, str]]) -> Generator[dict[str, Any]]:
+def _answers(
+    bench: Bench, workers: Workers | Cluster | None, jobs: Sequence[tuple[int, str]]
+) -> Generator[dict[str, Any]]:
     """Records of the jobs in the order in which they come; without workers this process runs the jobs."""
     if workers is None:
         for number, name in jobs:

@@ -10,6 +10,8 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, TextIO
 
 from fpirhc.errors import FpirhcError
@@ -18,25 +20,52 @@ from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
 from fpirhc.studies.tuning.tuned_file import with_tuned
 
 
+@dataclass(frozen=True, eq=False)
+class Study:
+    """What a worker runs.
+
+    Args:
+        bench: runs scenarios.
+        greeting: facts on which the numbers depend.
+    """
+
+    bench: Bench
+    greeting: Mapping[str, Any]
+
+
+def study(opening: Mapping[str, Any]) -> Study:
+    """Return the study that an opening states: the path of the problem file, tuned settings, conditions.
+
+    Raises:
+        FpirhcError: the file cannot be loaded, or the settings do not fit it.
+    """
+    task = with_tuned(load_problem(opening["path"]), opening["tuned"])
+    conditions = Conditions(**opening["conditions"])
+    return Study(Bench(task, conditions), fingerprint(task, conditions))
+
+
+def answered(bench: Bench, number: int, name: str) -> dict[str, Any]:
+    """Return the record of a job, or {"error": why} where nobody expected an error."""
+    try:
+        return bench.record(number, name)
+    except Exception as error:  # noqa: BLE001 -- a process that dies of it would be started again and again
+        return {"error": f"scenario {number}, controller '{name}': {error}"}
+
+
 def main() -> None:
     """Answer until the input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one ends the others
     answers = _private_output()
     opening = json.loads(sys.stdin.readline())
     try:
-        task = with_tuned(load_problem(opening["path"]), opening["tuned"])
-        conditions = Conditions(**opening["conditions"])
-        bench = Bench(task, conditions)
-        _answer(answers, fingerprint(task, conditions))
+        ready = study(opening)
+        _answer(answers, ready.greeting)
     except FpirhcError as error:
         _answer(answers, {"error": str(error)})
         return
     for line in sys.stdin:
         number, name = json.loads(line)
-        try:
-            _answer(answers, bench.record(number, name))
-        except Exception as error:  # noqa: BLE001 -- a process that dies of it would be started again and again
-            _answer(answers, {"error": f"scenario {number}, controller '{name}': {error}"})
+        _answer(answers, answered(ready.bench, number, name))
 
 
 def _private_output() -> TextIO:

@@ -1,0 +1,165 @@
+"""Scenarios on many machines: a cluster of Dask answers the jobs of a study, see `processes` for those of one machine.
+
+The client alone writes the ledger. A worker builds the study from the file's content, says on which facts its numbers depend, and
+answers only where they are the client's, so that records are the same bit by bit wherever they are computed.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import logging
+import math
+import shutil
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Self
+
+from fpirhc.errors import FpirhcError, InvalidValue, WorkerDied, package
+from fpirhc.studies.scenarios.worker import Study, answered, study
+from fpirhc.symbolic.native import machine_facts
+
+LOCAL = "local"  # in place of an address: a cluster of this machine's cores
+_CHUNK = 0.2  # s of work in a task, beside which the milliseconds of its transport do not count
+_MOST = 200  # jobs in a task
+_WAIT = 10  # s for an answer of the scheduler
+_ONE_AT_A_TIME = threading.Lock()  # a worker may have several threads, and a loop serves one
+
+Job = tuple[int, str]
+
+
+class Cluster:
+    """Answers to jobs from a cluster.
+
+    Args:
+        address: of the scheduler, such as 'tcp://10.0.0.1:8786'; 'local': a cluster that lives as long as this value.
+        opening: what a worker needs to build the study, as for processes.
+        greeting: facts on which the numbers depend; a worker with others is refused.
+        count: number of workers of a local cluster.
+
+    Raises:
+        InvalidValue: nothing answers at the address.
+        NotSupported: Dask is not installed.
+    """
+
+    def __init__(self, address: str, opening: Mapping[str, Any], greeting: Mapping[str, Any], count: int) -> None:
+        self._opening = json.dumps(opening)
+        self._content = Path(opening["path"]).read_bytes()
+        self._greeting = {**greeting, **machine_facts()}
+        self._dask = package("distributed", "cluster", "--cluster")
+        self._stack = contextlib.ExitStack()
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what is lost is said by errors here
+        self._client = self._connected(address, count)
+
+    def _connected(self, address: str, count: int) -> Any:
+        where: Any = address
+        if address == LOCAL:
+            local = self._dask.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0")
+            where = self._stack.enter_context(local)
+        try:
+            return self._stack.enter_context(self._dask.Client(where, timeout=_WAIT, set_as_default=False))
+        except (OSError, ValueError, TypeError) as error:
+            self._stack.close()
+            raise InvalidValue(
+                f"--cluster {address}: no scheduler answers there ({' '.join(str(error).split())[:120]}); start one with 'dask "
+                f"scheduler' and give its address, or --cluster {LOCAL}"
+            ) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(Exception):  # a scheduler that is gone cannot be left in good order
+            self._stack.close()
+
+    def answers(self, jobs: Sequence[Job], own: Callable[[Job], Any] | None = None) -> Iterator[Any]:
+        """Yield the answer of every job as it comes, in no particular order.
+
+        Raises:
+            FpirhcError: a worker's numbers would depend on other facts.
+            WorkerDied: workers die again and again at one task, or the scheduler is gone.
+        """
+        del own  # this process has the ledger to write
+        try:
+            for answers in self._chunks(deque(jobs)):
+                yield from answers
+        except (OSError, TimeoutError, CancelledError) as error:
+            raise _lost("the cluster does not answer any more", error) from None
+
+    def _chunks(self, waiting: deque[Job]) -> Iterator[list[Any]]:
+        """Answers of one task after the other; tasks get longer until their transport does not count."""
+        size, running = 1, 0
+        pool = self._dask.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
+        while waiting or running:
+            while waiting and running < self._room():
+                chunk = [waiting.popleft() for _ in range(min(size, len(waiting)))]
+                pool.add(self._client.submit(run_jobs, self._opening, self._content, self._greeting, chunk, pure=False))
+                running += 1
+            future, result = next(pool)
+            running -= 1
+            if future.status != "finished":
+                raise _lost("the cluster lost a task", result)
+            answers, seconds = result
+            future.release()  # a worker that is killed would compute every result that it holds anew
+            size = min(max(size, math.ceil(_CHUNK * len(answers) / max(seconds, 1e-6))), 2 * size, _MOST)
+            yield answers
+
+    def _room(self) -> int:
+        """Number of tasks that are sent before an answer has come; workers may come and go."""
+        return 2 * max(1, sum(self._client.nthreads().values()))
+
+
+def _lost(what: str, why: Any) -> WorkerDied:
+    error = why[1] if isinstance(why, tuple) and len(why) > 1 else why  # Dask has (class, error, traceback)
+    text = " ".join(str(error).split())[:160]
+    return WorkerDied(
+        f"{what} ({type(error).__name__}: {text}); finished results are kept, and the same command continues from them"
+    )
+
+
+def run_jobs(
+    opening: str, content: bytes, greeting: Mapping[str, Any], jobs: Sequence[Job]
+) -> tuple[list[dict[str, Any]], float]:
+    """Answer jobs on a worker; return the records and the seconds that they took.
+
+    Args:
+        opening: what the study is built from, as JSON.
+        content: of the problem file.
+        greeting: facts on which the client's numbers depend.
+        jobs: (number of the scenario, name of the controller).
+    """
+    with _ONE_AT_A_TIME:
+        try:
+            ready = _study(opening, content)
+        except FpirhcError as error:
+            return [{"error": f"a worker cannot load the problem: {error}"}], 0.0
+        other = _differences(greeting, {**ready.greeting, **machine_facts()})
+        if other:
+            return [{"error": f"a worker would compute other numbers: {other}"}], 0.0
+        begin = time.perf_counter()
+        return [answered(ready.bench, number, name) for number, name in jobs], time.perf_counter() - begin
+
+
+def _differences(wanted: Mapping[str, Any], there: Mapping[str, Any]) -> str:
+    names = [n for n in dict.fromkeys([*wanted, *there]) if wanted.get(n) != there.get(n)]
+    return "; ".join(f"{n} is {there.get(n)!r} there and {wanted.get(n)!r} here" for n in names)
+
+
+@lru_cache(maxsize=2)  # of this study, and of the one before
+def _study(opening: str, content: bytes) -> Study:
+    """The study of a worker: from the file where it is the same one here, else from a copy of its content."""
+    values = json.loads(opening)
+    path = Path(values["path"])
+    if not path.is_file() or path.read_bytes() != content:
+        folder = tempfile.mkdtemp(prefix="fpirhc-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        path = Path(folder, path.name)
+        path.write_bytes(content)
+    return study({**values, "path": str(path)})

@@ -1,0 +1,140 @@
+"""Scenarios on a cluster of Dask: the same records, bit by bit, whoever dies on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fpirhc as fp
+from fpirhc.cli.main import main
+from fpirhc.errors import FpirhcError, InvalidValue, NotSupported, WorkerDied
+from fpirhc.studies.scenarios import cluster
+from fpirhc.studies.scenarios.bench import Conditions, fingerprint
+from fpirhc.studies.scenarios.cluster import Cluster, run_jobs
+from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
+from fpirhc.symbolic.native import machine_facts
+
+distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+NAMES = ["CTC", "CTC+FPI (eq 6)"]
+
+
+@pytest.fixture(scope="module")
+def two_workers() -> Iterator[Any]:
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local:
+        yield local
+
+
+def studied(folder: Path, count: int = 12, **settings: Any) -> dict[tuple[int, str], str]:
+    """The records of a study by scenario and controller, as they stand in its ledger; none may stand there twice."""
+    task = fp.load_problem("two_mass")
+    compare_scenarios(
+        task, count=count, percent=20.0, seed=3, folder=folder, controllers=NAMES, compiled=False, **settings
+    )
+    lines = (folder / LEDGER).read_text().splitlines()[1:]
+    records = [json.loads(line) for line in lines]
+    found = {(r["scenario"], r["controller"]): line for r, line in zip(records, lines, strict=True)}
+    assert len(found) == len(lines)
+    return found
+
+
+def opening_of(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a worker is told, and the facts that it must find."""
+    conditions = Conditions(3, COMPARING, 20.0, False)
+    task = fp.load_problem("two_mass")
+    return {"path": str(path), "tuned": {}, "conditions": asdict(conditions)}, fingerprint(task, conditions)
+
+
+def test_a_cluster_gives_the_records_of_one_process(tmp_path: Path, two_workers: Any) -> None:
+    alone = studied(tmp_path / "alone")
+    assert studied(tmp_path / "together", cluster=two_workers.scheduler_address) == alone
+
+
+def test_workers_that_are_killed_lose_and_double_nothing(tmp_path: Path, two_workers: Any) -> None:
+    """One of two, after every third record."""
+    killed: list[int] = []
+    alone = studied(tmp_path / "alone")
+
+    def kill(name: str, done: int, total: int) -> None:
+        del name, total
+        if done % 3 == 0 and len(killed) < 3:
+            killed.append(next(iter(two_workers.workers.values())).process.pid)
+            os.kill(killed[-1], signal.SIGKILL)
+
+    together = studied(tmp_path / "together", cluster=two_workers.scheduler_address, progress=kill)
+    assert killed
+    assert together == alone
+
+
+def test_a_scheduler_that_dies_ends_the_study_and_the_next_one_goes_on(tmp_path: Path) -> None:
+    """What was finished stands in the ledger; without a cluster the same study runs the rest."""
+    code = (
+        "import distributed, sys\n"
+        "if __name__ == '__main__':\n"
+        "    local = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address='127.0.0.1:0')\n"
+        "    print(local.scheduler_address, flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    script = tmp_path / "scheduler.py"
+    script.write_text(code)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([sys.executable, str(script)], text=True, **pipes) as process:  # type: ignore[call-overload]
+        address = process.stdout.readline().strip()
+        with pytest.raises(WorkerDied, match="finished results are kept, and the same command continues from them"):
+            studied(tmp_path / "study", cluster=address, progress=lambda *_: process.kill())
+    assert studied(tmp_path / "study") == studied(tmp_path / "alone")
+
+
+def test_a_worker_with_another_compiler_is_refused(
+    tmp_path: Path, two_workers: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "machine_facts", lambda: {"compiler": "cc 1.0"})
+    with pytest.raises(
+        FpirhcError, match=r"a worker would compute other numbers: compiler is .* there and 'cc 1.0' here"
+    ):
+        studied(tmp_path, cluster=two_workers.scheduler_address)
+
+
+def test_a_worker_without_the_file_has_its_content(tmp_path: Path) -> None:
+    path = fp.load_problem("two_mass").path
+    elsewhere, greeting = opening_of(tmp_path / "two_mass.py")
+    here, _ = opening_of(path)
+    content, facts = path.read_bytes(), {**greeting, **machine_facts()}
+    records = [run_jobs(json.dumps(o), content, facts, [(0, "CTC")])[0] for o in (elsewhere, here)]
+    assert records[0] == records[1]
+    assert records[0][0]["outcome"] == "finished"
+
+
+def test_a_file_that_a_worker_cannot_load_is_named(tmp_path: Path) -> None:
+    opening, greeting = opening_of(tmp_path / "none.py")
+    [answer], _ = run_jobs(json.dumps(opening), b"import nowhere_at_all\n", greeting, [(0, "CTC")])
+    assert answer["error"].startswith("a worker cannot load the problem: ")
+    assert "nowhere_at_all" in answer["error"]
+
+
+def test_an_address_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_WAIT", 0.5)
+    opening, greeting = opening_of(fp.load_problem("two_mass").path)
+    with pytest.raises(InvalidValue, match=r"--cluster tcp://127\.0\.0\.1:1: no scheduler answers there"):
+        Cluster("tcp://127.0.0.1:1", opening, greeting, 1)
+
+
+def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    opening, greeting = opening_of(fp.load_problem("two_mass").path)
+    with pytest.raises(NotSupported, match=r"--cluster needs distributed, .* pip install 'fpirhc\[cluster\]'"):
+        Cluster("local", opening, greeting, 1)
+
+
+def test_a_cluster_is_for_scenarios(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", "two_mass", "--cluster", "local"]) == 2
+    assert "--cluster needs --scenarios N" in capsys.readouterr().err
