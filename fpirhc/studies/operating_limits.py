@@ -218,7 +218,7 @@ def operating_limits(
     chosen = select(task, controllers)
     check_gains(task, chosen)
     quantities, unfit = _quantities(task.problem, over)
-    judge = _Judge(task, fails, seed)
+    judge = Judge(task, fails, seed)
     limits, untried = [], {(name, what): why for name in chosen for what, why in unfit.items()}
     for name, controller in chosen.items():
         loops = _Loops(judge, believing(task.problem, controller), compiled)
@@ -290,7 +290,7 @@ def _bracket(quantity: Quantity, failed: Callable[[float], bool]) -> tuple[float
     return holds, fails
 
 
-class _Judge:
+class Judge:
     """What a run of the task is worth."""
 
     def __init__(self, task: Task, fails: float, seed: int) -> None:
@@ -325,7 +325,7 @@ def _left(problem: Problem, run: Run) -> str:
 class _Loops:
     """The loops of one controller: one for all values of a quantity, and one for the problem as it stands."""
 
-    def __init__(self, judge: _Judge, controller: Controller, compiled: bool) -> None:
+    def __init__(self, judge: Judge, controller: Controller, compiled: bool) -> None:
         self._judge, self._controller, self._compiled = judge, controller, compiled
         self._own: dict[tuple[tuple[str, ...], bool], Simulator] = {}
         self._start: Point | None = None
