@@ -92,14 +92,6 @@ def test_identity_asks_for_what_is_desired() -> None:
 
 
 @dataclass(frozen=True)
-class _Careless(Affine):
-    """A map that claims twice the gain it has."""
-
-    def effective_gain(self) -> float:
-        return -self.gain
-
-
-@dataclass(frozen=True)
 class _Bare(Affine):
     """A map that divides by the norm of the error."""
 
@@ -110,11 +102,10 @@ class _Bare(Affine):
         return request + 0.5 * self.gain * ca.norm_2(error) * unit, {}
 
 
-@pytest.mark.parametrize(("wrong", "sentence"), [(_Careless(-0.5), "first-order"), (_Bare(-0.5), "gradient|value")])
-def test_conformance_finds_faults(wrong: Deformation, sentence: str) -> None:
-    """The laws are worth running: a wrong gain and an unguarded 0/0 are found, in words."""
-    with pytest.raises(AssertionError, match=sentence):
-        check_deformation(wrong, seed=1)
+def test_a_map_without_a_gradient_is_found() -> None:
+    """Its value is guarded against 0 / 0 and its derivative is not."""
+    with pytest.raises(AssertionError, match=r"gradient|value"):
+        check_deformation(_Bare(-0.5), seed=1)
 
 
 def test_scale_must_be_chosen() -> None:

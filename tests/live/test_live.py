@@ -98,11 +98,12 @@ def test_nothing_live_is_the_same_c_text():
 
 
 WRONG = [
-    (["deformation.gian"], InvalidName, "gain"),
-    (["start.q1"], InvalidName, "data of every loop"),
-    (["cost.states.q3"], InvalidName, "q1"),
-    (["optimiser.iterations"], NotSupported, "what the loop is made of"),
-    (["deformation"], InvalidValue, "go on with one of"),
+    ("RHC+FPI", "deformation.gian", InvalidName, "gain"),
+    ("RHC+FPI", "start.q1", InvalidName, "data of every loop"),
+    ("RHC+FPI", "cost.states.q3", InvalidName, "q1"),
+    ("RHC+FPI", "optimiser.iterations", NotSupported, "what the loop is made of"),
+    ("RHC+FPI", "deformation", InvalidValue, "go on with one of"),
+    ("CTC", "cost.states.q1", NotSupported, "does not use it"),
 ]
 
 
@@ -124,17 +125,11 @@ def test_tolerance_and_damping_of_the_plans_are_data(compiled):
             ready.run(seed=0, settings=wrong)
 
 
-@pytest.mark.parametrize(("paths", "error", "words"), WRONG, ids=[w[0][0] for w in WRONG])
-def test_what_cannot_be_live_is_refused_by_name(paths, error, words):
+@pytest.mark.parametrize(("name", "path", "error", "words"), WRONG, ids=[w[1] for w in WRONG])
+def test_what_cannot_be_live_is_refused_by_name(name, path, error, words):
     """A setting that is needed as a number would become NaN in CasADi, without an error."""
     with pytest.raises(error, match=words):
-        simulator(PROBLEM, PLANNED, live=paths)
-
-
-def test_a_setting_that_the_loop_does_not_use_is_refused():
-    """Computed torque has no cost."""
-    with pytest.raises(NotSupported, match="does not use it"):
-        simulator(PROBLEM, TORQUE, live=["cost.states.q1"])
+        simulator(PROBLEM, TASK.controllers[name], live=[path])
 
 
 def test_numbers_are_checked_at_every_change():

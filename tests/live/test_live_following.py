@@ -17,21 +17,6 @@ from fpirhc.simulation.simulate import simulator
 INNER = fp.ComputedTorque(fp.Exponential(rate=8.0), fp.Sigmoid(gain=-0.5, scale=50.0))
 MEASURED = dict.fromkeys(("a", "b", "a'", "b'"), 1e-3)
 KALMAN = fp.Estimating(INNER, fp.DisturbanceKalman({"a": 1.0, "b": 1.0}, MEASURED, noise={"a": 0.1}))
-ARM: dict[str, Any] = {"duration": 2.0, "measure_from": 0.0, "start": {"q1": 0.3, "q2": 0.3}}
-CASES: list[tuple[str, str, dict[str, Any], list[str]]] = [
-    ("mrac_pendulum", "Lyapunov MRAC", {"duration": 3.0}, ["rate", "adaptation"]),
-    ("mrac_pendulum", "backstepping MRAC", {"duration": 3.0}, ["model_rate", "rates.0", "rates.1"]),
-    ("planar_arm", "AID", ARM, ["tracking.rate"]),
-]
-
-
-@pytest.mark.parametrize(("file", "name", "changes", "paths"), CASES, ids=[case[1] for case in CASES])
-def test_adaptive_rivals_follow_their_rates(file, name, changes, paths):
-    """A changed rate gives the weights of the error and the steps of the model that a rebuilt controller has."""
-    task = load_problem(file)
-    problem = replace(task.problem, **{"measure_from": 0.0, **changes})
-    tried = check_live(problem, task.controllers[name], paths=paths, cycles=30)
-    assert all(one.factor for one in tried), tried
 
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["VM", "C"])

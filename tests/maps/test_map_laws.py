@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -19,7 +18,6 @@ from scipy.signal import cont2discrete
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
-from fpirhc.problem_files.problem_file import Task
 
 A = np.array([[-1.0, 1.0], [-2.0, -0.6]])  # y' = v - y, v' = -2 y - 0.6 v + 1.5 u
 B = np.array([[0.0], [1.5]])
@@ -209,43 +207,7 @@ def test_a_plan_on_a_wrong_model_is_cured_by_the_iteration() -> None:
 # Ways of running
 
 
-def test_gains_and_poles_are_live() -> None:
-    problem = replace(stock(), horizon=None, cost=None)
-    controller = fp.ComputedTorque(fp.ShiftPolynomial(0.5, step=0.1), fp.ModelReferenced(fp.Affine(gain=-1.0)))
-    other = fp.ComputedTorque(fp.ShiftPolynomial(0.2, step=0.1), fp.ModelReferenced(fp.Affine(gain=-1.4)))
-    live = ["tracking.poles", "deformation.map.gain"]
-    simulator = fp.simulator(problem, controller, live=live, compiled=False)
-    run = simulator.run(seed=0, settings={"tracking.poles": 0.2, "deformation.map.gain": -1.4})
-    assert np.abs(run["command"] - simulated(problem, other)["command"]).max() < 1e-12
-
-
-def test_scenarios_draw_parameters_of_a_map(tmp_path: Path) -> None:
-    """In every one of them the growth is another one, and the iteration helps."""
-    problem = replace(stock(), horizon=None, cost=None)
-    law = fp.ShiftPolynomial(0.7, step=0.1, integral=False)
-    controllers = {"CTC": fp.ComputedTorque(law), "CTC+FPI": fp.ComputedTorque(law, FORMS["model-referenced"])}
-    task = Task("stock", Path(__file__), "A stock", "", problem, controllers)
-    study = fp.compare_scenarios(task, count=6, percent=30.0, seed=0, folder=tmp_path, compiled=False)
-    assert [one.failures for one in study.summaries] == [0, 0]
-    assert study["CTC+FPI"].worst < study["CTC"].median
-
-
 GROWTH = {"growth": fp.Uncertain(0.1, 2.0, 0.3)}
-RIVALS = {  # controller, largest error of the last ten of 40 cycles
-    "PID": (fp.PID(proportional={"stock": -5.0}, integral={"stock": -5.0}), 2e-3),
-    "acceleration feedback": (fp.rivals.AccelerationFeedback(LAW, gain=0.5), 1.6e-4),
-    "force MRAC": (fp.rivals.ForceMRAC(LAW, fp.Affine(gain=-1.0), {}), 4e-4),
-    "backstepping": (fp.rivals.BacksteppingMRAC(3.0, [5.0], fp.ModelReferenced(fp.Affine(gain=-1.0))), 5e-5),
-    "sliding mode": (fp.rivals.SlidingMode(rate=1.0, gain=2.0, width=0.5), 2e-2),
-}
-
-
-@pytest.mark.parametrize("name", RIVALS)
-def test_rivals_follow_the_reference_of_a_map(name: str) -> None:
-    """The model believes 0.8 of a growth of 1.1, and computed torque alone without an integral is left with 2.5e-2."""
-    controller, limit = RIVALS[name]
-    run = simulated(replace(stock(), horizon=None, cost=None), controller)
-    assert np.abs(run["true_error"][-10:]).max() < limit
 
 
 def test_the_reference_model_of_a_map_has_its_pole_in_the_cycle() -> None:

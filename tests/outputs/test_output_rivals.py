@@ -9,28 +9,7 @@ import pytest
 from test_outputs import arm, circle, hill, sedated, simulated
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
 from fpirhc.errors import InvalidProblem, NotSupported
-
-ON_DEPTH: dict[str, tuple[Controller, float]] = {
-    "PID": (fp.PID({"depth": -2.0}, {"depth": -0.6}, {"depth": -2.0}), 1.0),
-    "sliding": (fp.rivals.SlidingMode(rate=1.0, gain=2.0, width=0.5), 0.3),
-    "rate": (fp.rivals.ResolvedAccelerationRate(rate=1.0), 0.1),
-    "feedback": (fp.rivals.AccelerationFeedback(fp.Exponential(rate=1.0), gain=2.0, time_constant=0.2), 0.1),
-    "backstepping": (fp.rivals.BacksteppingMRAC(1.0, (1.0, 1.0), fp.Affine(-1.5)), 0.1),
-    "force": (fp.rivals.ForceMRAC(fp.Exponential(rate=1.0), fp.Affine(-0.5)), 0.02),
-    "Lyapunov": (fp.rivals.LyapunovMRAC(rate=1.0, adaptation=0.1), 0.03),
-}
-
-
-@pytest.mark.parametrize("name", ON_DEPTH)
-def test_a_rival_follows_an_output_of_a_wrong_curve(name: str) -> None:
-    """The depth falls from 74 to 40; the errors are those of tuned rivals, rms from 3 min on."""
-    controller, largest = ON_DEPTH[name]
-    problem = sedated(hill(5.5), input_before={"u": 1.5})
-    run = simulated(problem, controller)
-    assert run.stop is None
-    assert fp.measure(problem, run).rms_error["depth"] < largest
 
 
 def test_an_increment_by_hand_on_the_hand_of_an_arm() -> None:

@@ -68,27 +68,6 @@ def test_sensors_and_estimators_are_those_of_the_outputs(sensing: str) -> None:
     assert np.abs(run["true_error"]).max() < 1.1 * np.abs(plain["true_error"]).max()
 
 
-def by_states() -> fp.Plant:
-    """The two masses, written by their states."""
-    response, parameters = TWO_MASS.problem.plant.response, TWO_MASS.problem.plant.parameters
-
-    class Entries:
-        def __init__(self, **entries: Any) -> None:
-            vars(self).update(entries)
-
-    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
-        a = response(Entries(q1=x.q1, q2=x.q2), Entries(q1=x.v1, q2=x.v2), u, p)
-        return {"q1": x.v1, "q2": x.v2, "v1": a["q1"], "v2": a["q2"]}
-
-    return fp.Plant.of_states(
-        states={"q1": "m", "q2": "m", "v1": "m/s", "v2": "m/s"},
-        inputs={"Q1": "N", "Q2": "N"},
-        parameters=parameters,
-        rates=rates,
-        outputs={"q1": fp.Output("m", lambda x, p: x.q1), "q2": fp.Output("m", lambda x, p: x.q2)},
-    )
-
-
 ARM = {"l1": 0.5, "l2": 0.4}  # m
 
 
@@ -221,13 +200,6 @@ def test_an_output_by_expression_is_the_plant_whose_coordinate_it_is() -> None:
     assert np.ptp(one["output.depth"]) > 30
     assert np.abs(one["output.depth"] - other["state.depth"]).max() < 2e-4
     assert set(hill(4.0).chains.values()) == {2}
-
-
-def test_adaptation_helps_a_wrong_curve_because_the_outputs_are_measured() -> None:
-    problem, law = sedated(hill(5.5)), fp.Exponential(rate=1.0)
-    plain, adaptive = fp.ComputedTorque(law), fp.ComputedTorque(law, fp.Affine(-1.5))
-    errors = [depth_error(problem, c) for c in (plain, adaptive)]
-    assert errors[1] < errors[0] / 8
 
 
 def planned(**settings: Any) -> fp.Problem:
@@ -371,16 +343,9 @@ def test_a_gain_that_vanishes_on_the_way_is_named_for_several_inputs_too() -> No
         circle(arm(), radius=-0.2)
 
 
-NOT_COVERED: dict[str, tuple[Callable[[], Controller], str]] = {
-    "feedforward": (lambda: fp.RecedingHorizon(OPTIMISER, on_failure=fp.Feedforward()), "Feedforward needs references")
-}
-
-
-@pytest.mark.parametrize("name", NOT_COVERED)
-def test_a_controller_that_does_not_cover_outputs_says_so(name: str) -> None:
-    make, words = NOT_COVERED[name]
-    with pytest.raises(NotSupported, match=words):
-        simulated(planned(), make())
+def test_a_policy_that_does_not_cover_outputs_says_so() -> None:
+    with pytest.raises(NotSupported, match="Feedforward needs references"):
+        simulated(planned(), fp.RecedingHorizon(OPTIMISER, on_failure=fp.Feedforward()))
 
 
 def test_a_stepper_is_given_the_outputs_and_does_what_the_loop_does() -> None:

@@ -38,6 +38,7 @@ TWO_MASS = fp.load_problem("two_mass")
 TRACK, MAP = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=20.0)
 PUSHED = {"disturbances": {"q1": fp.Sine(0.5, 3.0), "Q2": fp.Step(at=0.01, size=5.0)}}
 LATE = {"dead_time": fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}, measurement=2e-3)}
+AIMS = {"reference": fp.Setpoint({"q1": [(0.0, 2.2), (0.01, 2.4)], "q2": [(0.0, 5.4), (0.02, 5.3)]}, rate=10.0)}
 NOISES = {"q1": 1e-3, "q2": 1e-3, "q1'": 1e-2, "q2'": 1e-2, "q1''": 0.1, "q2''": 0.1}
 FILTER = fp.DisturbanceKalman({"q1": 5.0, "q2": 5.0}, NOISES)
 LOOPS: dict[str, tuple[Controller, fp.Problem]] = {
@@ -51,6 +52,8 @@ LOOPS: dict[str, tuple[Controller, fp.Problem]] = {
             ("late", TWO_MASS.controllers["RHC+FPI"], LATE),
             ("paired", fp.Predicted(fp.ComputedTorque(TRACK, fp.Paired(MAP, cycles=5)), inputs=3e-3, measurement=2e-3), LATE),
             ("at once", fp.Estimating(fp.ComputedTorque(TRACK), FILTER, at_once=True), {}),
+            ("set-points", TWO_MASS.controllers["CTC+FPI (eq 6)"], AIMS),
+            ("plans to set-points", TWO_MASS.controllers["RHC+FPI"], AIMS),
             ("reality", fp.ComputedTorque(TRACK, fp.ModelReferenced(MAP)), {"reality": fp.Reality(TWO_MASS.problem.plant)}),
         )
     },

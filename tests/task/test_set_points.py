@@ -380,20 +380,6 @@ def test_unannounced_steps_of_two_mass():
     assert jumps["RHC+FPI"] < 0.3 * jumps["RHC"]
 
 
-@pytest.mark.parametrize("controller", ["CTC+FPI (eq 6)", "RHC+FPI"])
-def test_set_points_of_outputs(controller):
-    """Outputs that are the coordinates are led as the coordinates are, bit by bit."""
-    plain = two_mass(0.15)
-    assert isinstance(plain.cost, fp.Quadratic)
-    same = {"q1": fp.Output("m", lambda q, v, p: q.q1), "q2": fp.Output("m", lambda q, v, p: q.q2)}
-    cost = replace(plain.cost, states={}, outputs=plain.cost.states)
-    outputs = replace(plain, plant=replace(plain.plant, outputs=same), cost=cost)
-    runs = [fp.simulate(p, TWO_MASS.controllers[controller], seed=0, compiled=False) for p in (plain, outputs)]
-    for signal in ("state", "command", "reference", "setpoint", "true_error", "cost"):
-        if signal in runs[0].layout:
-            np.testing.assert_array_equal(runs[0][signal], runs[1][signal])
-
-
 def test_a_stepper_names_set_points_of_outputs():
     """They are those of the outputs, which are other quantities than the states and of another number."""
     plant = fp.Plant.of_states(
