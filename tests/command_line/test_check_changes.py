@@ -1,18 +1,22 @@
-"""What a check says about changes: in percent, the largest first, a stale setting before its consequences, a floor."""
+"""What a check says about changes: in percent, largest first, a stale setting before its consequences, a floor, former names."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import replace
 
 import pytest
+from blessed import write_problems
 
+import fpirhc as fp
 from fpirhc.baselines.bands import BANDED, Expected, Metric
-from fpirhc.baselines.baseline import Baseline, Settings
+from fpirhc.baselines.baseline import Baseline, Settings, to_text
 from fpirhc.baselines.judging import BETTER, CHANGED, HOLDS, WORSE, Judgement, Row, ignoring, judge
 from fpirhc.baselines.measuring import FINISHED, Measurement
 from fpirhc.baselines.outline import change, outline
 from fpirhc.baselines.printing import show_check, to_markdown
+from fpirhc.baselines.reading import new_metrics, new_settings, read_baseline
 from fpirhc.cli.options import percent
 
 
@@ -139,3 +143,120 @@ def test_the_floor_is_a_percentage(text, value):
 def test_a_wrong_floor_is_refused(text):
     with pytest.raises(argparse.ArgumentTypeError, match=r"expected percent .* such as 20%"):
         percent(text)
+
+
+# Baselines of an older version: their names are read as those of today, their numbers are not touched
+
+
+OLD_NAMES = {"cost.deviation": "cost.correction", "replanning.": "nominal.", "optimiser.hessian": "optimiser.bend"}
+OLD_CLASSES = {"FromMeasurement": "Restart"}
+
+
+def old(name: str) -> str:
+    for now, before in OLD_NAMES.items():
+        name = name.replace(now, before)
+    return name
+
+
+def old_settings(flat):
+    return {old(k): OLD_CLASSES.get(v, v) if isinstance(v, str) else v for k, v in flat.items()}
+
+
+def test_an_old_baseline_holds_and_says_what_is_renamed(tmp_path):
+    """A file with the names of before: every number is compared, nothing is stale, and the names are told."""
+    write_problems(tmp_path)
+    task = fp.load_problem(str(tmp_path / "line.py"))
+    path = tmp_path / "baselines" / "line.json"
+    today = read_baseline(path)
+    assert not today.renamed
+    settings = Settings(
+        old_settings(today.settings.problem), {n: old_settings(one) for n, one in today.settings.controllers.items()}
+    )
+    controllers = {
+        name: replace(one, metrics={old(k): m for k, m in one.metrics.items()})
+        for name, one in today.controllers.items()
+    }
+    path.write_text(to_text(replace(today, settings=settings, controllers=controllers)))
+    assert "cost.correction" in path.read_text()
+    judgement = fp.check_baseline(task, compiled=False)
+    assert judgement.holds, (judgement.unusable, judgement.changed)
+    note = next(n for n in judgement.notes if "older version" in n)
+    for before, now in (
+        ("cost.correction", "cost.deviation"),
+        ("Restart", "FromMeasurement"),
+        ("nominal", "replanning"),
+    ):
+        assert f"'{before}' is now '{now}'" in note
+    # Once accepted again, the file has the names of today.
+    assert read_baseline(path).renamed
+    path.write_text(to_text(replace(read_baseline(path), renamed={})))
+    assert not read_baseline(path).renamed
+
+
+def test_names_of_a_users_own_stay():
+    """A coordinate may be called like an old setting; a value is a class only where 'is' says so."""
+    mine = {"start.nominal": 1.0, "cost.states.correction": 2.0, "reference.function": "Restart", "limits.bend": 3.0}
+    renamed, changed = new_settings(Settings(mine, {"RHC": mine}))
+    assert renamed == Settings(mine, {"RHC": mine})
+    assert not changed
+
+
+def test_what_is_not_compared_is_renamed_too():
+    """Under its new name, with the reason."""
+    some = Expected(("finished",), {"cost.total": Metric("banded", 1.0, 0.1, {})}, {"cost.correction": "why"})
+    renamed, changed = new_metrics(some)
+    assert renamed.not_compared == {"cost.deviation": "why"}
+    assert changed == {"cost.correction": "cost.deviation"}
+
+
+# Terminal and Markdown say the same about a check, because they lay out one outline
+
+
+HOLDING = Row("RHC", "rms_error.y", 1.0, 1.0, 0.1, "holds")
+QUIET = Row("RHC", "cycles", 300, 300, None, "holds")
+MUCH_WORSE = Row("RHC+FPI", "effort.u", 1.0, 2.0, 0.1, "worse")
+ENDED = Row("PID", "outcome", "finished", "ended early", None, "changed")
+GOOD = Judgement("good", (HOLDING, QUIET), reason="first", date="2026-01-01")
+BAD = Judgement(
+    "bad", (HOLDING, QUIET, MUCH_WORSE, ENDED), reason="first", date="2026-01-01", notes=("PID: not finite",)
+)
+MISSING = Judgement("missing", unusable=("there is no baseline 'missing.json'",))
+BROKEN = Judgement("broken", broken="no file at 'broken.py'")
+EVERY = outline([GOOD, BAD, MISSING, BROKEN], [("chain", "takes a minute")])
+
+
+@pytest.fixture
+def texts(capsys):
+    """Both outputs, without what their formats add."""
+    show_check(EVERY, every=False)
+    terminal = " ".join(capsys.readouterr().out.split())
+    markdown = to_markdown(EVERY).replace("&#95;", "_").replace("&#58;", ":")
+    return {"terminal": terminal, "markdown": markdown}
+
+
+def test_an_outline_groups_by_controller_and_knows_what_changed():
+    """Controllers stand in the order of their rows; what is unclear is so for a reason."""
+    bad = EVERY.sections[1]
+    assert [case.controller for case in bad.cases] == ["RHC", "RHC+FPI", "PID"]
+    assert [line.cells[1] for case in bad.cases for line in case.changed] == ["effort.u", "outcome"]
+    assert [line.in_summary for line in bad.lines] == [True, False, True, True]
+    assert [one.holds for one in EVERY.sections] == [True, False, False, False]
+    assert [one.unclear for one in EVERY.sections] == [False, False, True, True]
+    assert bad.headline == "bad: 2 of 4 metrics changed"
+    assert bad.lines[2].sentence == "RHC+FPI: effort.u was 1, is 2 (+100 %, band \u00b1 0.1): worse"
+    assert bad.lines[3].sentence == "PID: outcome was finished, is ended early: changed"
+
+
+@pytest.mark.parametrize("form", ["terminal", "markdown"])
+@pytest.mark.parametrize("word", ["effort.u", "RHC+FPI", "ended early", "missing.json", "no file at"])
+def test_every_form_has_what_changed_and_what_is_unclear(form, word, texts):
+    """Nothing that makes a check fail is left out of any output."""
+    assert word in texts[form]
+
+
+def test_metrics_that_hold_are_not_in_the_way(texts, capsys):
+    """A count that holds is in no summary; --all shows it on the terminal."""
+    assert "cycles" not in texts["terminal"]
+    assert "cycles" not in texts["markdown"]
+    show_check(EVERY, every=True)
+    assert "cycles" in capsys.readouterr().out

@@ -1,9 +1,10 @@
-"""The work vector of generated code holds what is used: the space of bodies that a driver replaces is not kept."""
+"""Generated code: its work vector holds what is used, and a library for every machine has the numbers of one for this machine."""
 
 from __future__ import annotations
 
 import ctypes
 import re
+import runpy
 import subprocess
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,9 +15,11 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.sensing_chain import compose_controller
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic import driver
+from fpirhc.symbolic import native as module
 from fpirhc.symbolic.driver import compiled_plans, with_less_work
-from fpirhc.symbolic.native import find_compiler, generate
+from fpirhc.symbolic.native import find_compiler, generate, native
 
 REAL = ctypes.POINTER(ctypes.c_double)
 GUARD = -1.2345e-77
@@ -167,3 +170,32 @@ def test_the_first_plan_of_a_run_is_not_compiled(monkeypatch):
         fp.simulate(problem, task.controllers["RHC"], seed=0, compiled=False)
     assert sought
     assert not [name for name in sought if "converging" in name]
+
+
+# Compiled loops for one machine and for every machine of its architecture: the same numbers
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+def test_a_library_for_every_machine_has_the_numbers_of_one_for_this_machine(tmp_path, monkeypatch):
+    """A chain of four masses has enough states for Jacobians with all directions side by side, which are apart from the loops."""
+    p = runpy.run_path(str(fp.load_problem("chain_of_masses").path))["chain"](4)
+    horizon = fp.Horizon(stages=3, step=0.2, discretisation=fp.RungeKutta4(1))
+    ocp = transcribe(p.plant, p.reference, horizon, p.cost, p.limits)
+    optimiser = fp.FixedPoint(iterations=3, tolerance=1e-6)
+    step = optimiser.step(ocp)
+    arguments = (1.01 * p.start_state, ocp.nodes[2], ocp.input_lower, ocp.input_upper, optimiser.memory(ocp).start())
+    found: list[list[np.ndarray]] = []
+    for flags in ((), ("-DALWAYS_WIDE",)):
+        if flags and module._machine_flags() != flags:
+            continue  # this machine has no wide registers
+        monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / f"cache{len(found)}"))
+        monkeypatch.setattr(module, "_loaded", {})
+        with monkeypatch.context() as one:
+            one.setattr(module, "_machine_flags", lambda flags=flags: flags)
+            found.append([value.full() for value in native(step, required=True).function(*arguments)])
+    for other in found[1:]:
+        for mine, yours in zip(found[0], other, strict=True):
+            np.testing.assert_array_equal(mine, yours)
+    assert np.abs(found[0][0]).max() > 0
+    for value, graph in zip(found[0], step(*arguments), strict=True):
+        np.testing.assert_allclose(value, graph.full(), rtol=1e-9, atol=1e-9)

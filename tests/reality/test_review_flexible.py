@@ -1,7 +1,8 @@
-"""A motor behind a flexible shaft, written by its states: speeds are states of their own, and the motor turns with its load."""
+"""A motor behind a flexible shaft, written by its states: speeds are states of their own, the motor turns with its load."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.errors import InvalidProblem
 from fpirhc.review.grid import review_grid
 from fpirhc.review.questions.reality import LOOP, RESONANCE
 from fpirhc.review.true_plant_loop import extra_modes, real_loops, real_points
@@ -110,3 +112,45 @@ def test_a_law_that_excites_the_shaft_is_refused_without_adaptation_too() -> Non
     answers = {a.question: a for a in fp.review(servo(), {"it": law(0.0)}, mismatch=0.0, seed=0).controllers["it"]}
     assert str(answers[LOOP].verdict) == "no"
     assert answers[LOOP].numbers["radius"] == pytest.approx(1.00526, abs=1e-4)
+
+
+# A reality may show a coordinate of the model as an output: a load's angle of a servo whose states have other names
+
+
+STATES = {"motor": "rad", "motor_speed": "rad/s", "load": "rad", "load_speed": "rad/s", "current": "A"}
+
+
+def renamed(unit: str = "rad", start: dict[str, float] | None = None) -> fp.Reality:
+    """The flexible servo whose load angle is called 'load' and shown as 'angle'."""
+
+    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        values = ca.mtimes(ca.DM(MATRIX), ca.vertcat(*(x[n] for n in STATES))) + ca.vertcat(0, 0, 0, 0, u.voltage / L)
+        return dict(zip(STATES, ca.vertsplit(values), strict=True))
+
+    outputs = {"angle": fp.Output(unit, lambda x, p: x.load)}
+    plant = fp.Plant.of_states(states=STATES, inputs={"voltage": "V"}, rates=rates, outputs=outputs, parameters={})
+    return fp.Reality(plant, start=start or {})
+
+
+def test_an_output_in_place_of_a_coordinate_changes_no_signal() -> None:
+    problem = replace(servo(), duration=0.5)
+    both = problem, replace(problem, reality=renamed())
+    one, other = (fp.simulate(p, law(-0.05), seed=0, compiled=False) for p in both)
+    shared = [name for name in one.layout.names if name != "reality_state"]
+    assert [name for name in shared if not np.array_equal(one[name], other[name])] == []
+
+
+def test_a_start_that_the_states_do_not_have_is_named() -> None:
+    moved = replace(servo(), start={"angle": 0.4})
+    with pytest.raises(
+        InvalidProblem, match=r"its output 'angle' starts at 0, that of the model at 0.4; give first values"
+    ):
+        fp.simulate(replace(moved, reality=renamed()), law(0.0), seed=0, compiled=False)
+    real = renamed(start={"motor": 0.4, "load": 0.4})
+    run = fp.simulate(replace(moved, reality=real, duration=0.1), law(0.0), seed=0, compiled=False)
+    assert run["state.angle"][0] == 0.4
+
+
+def test_an_output_in_another_unit_is_refused() -> None:
+    with pytest.raises(InvalidProblem, match=r"'angle' is in deg, the model's 'angle' in rad; write both in one unit"):
+        replace(servo(), reality=renamed("deg"))

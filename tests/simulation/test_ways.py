@@ -1,4 +1,4 @@
-"""Every kind of plant, reference and integrator runs in a loop, compiled where it can be."""
+"""Every kind of plant, reference and integrator runs in a loop, compiled where it can be and where it is worth it."""
 
 from __future__ import annotations
 
@@ -97,3 +97,19 @@ def test_memory_of_a_long_run():
     """Ten minutes at 1 kHz with every signal stay under 1 GB."""
     done = subprocess.run([sys.executable, "-c", LONG], capture_output=True, text=True, check=True)
     assert int(done.stdout) < 1_000_000
+
+
+# Short runs are not worth a compiler: `compiled=None` chooses
+
+
+def test_a_short_run_is_not_compiled_unless_it_is_asked_for():
+    """None chooses by cycles and stages; the run says why, and is that of the virtual machine."""
+    task = fp.load_problem("two_mass")
+    short = replace(task.problem, duration=20 * task.problem.period, measure_from=0.0)
+    law = task.controllers["CTC"]
+    chosen = fp.simulate(short, law, seed=0, compiled=None)
+    assert chosen.settings["why not compiled"] == "compiled=None was given, and the run is short"
+    assert np.array_equal(chosen.log, fp.simulate(short, law, seed=0, compiled=False).log)
+    long = replace(task.problem, duration=200_000 * task.problem.period)
+    ready = fp.simulator(long, law, compiled=None)
+    assert ready.compiled or "short" not in ready.why_not_compiled

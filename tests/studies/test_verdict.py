@@ -1,7 +1,8 @@
-"""The verdict says what happened, for adaptation that helps, does nothing, hurts, or diverges."""
+"""The verdict says what happened, for adaptation that helps, does nothing, hurts, or diverges; one outcome decides its words."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,8 @@ from plants import linear, sine_of_three
 import fpirhc as fp
 from fpirhc.errors import NotSupported
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.report.html import asset, css_class
+from fpirhc.report.terminal import STYLES
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.studies.comparison.compare import _pair, compare
 from fpirhc.studies.comparison.entry import Entry
@@ -22,6 +25,7 @@ from fpirhc.studies.comparison.harm import partners
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.comparison.timing import CycleTime, Price, measure_price, price_of
 from fpirhc.studies.comparison.verdict import findings
+from fpirhc.studies.scenarios.paired import ConfidenceInterval, Summary, verdict
 
 TRACK = fp.Exponential(rate=6.0)
 
@@ -263,3 +267,64 @@ def test_a_pair_has_the_same_formulas_where_several_controllers_have_the_same_se
     heavy, light = (fp.RecedingHorizon(planner.optimiser, cost=weighed(w)) for w in (1e4, 1e2))
     controllers = {"heavy": heavy, "light": light, "light+FPI": replace(light, deformation=fp.Affine(-1.0))}
     assert _pair(controllers, "light+FPI") == "light"
+
+
+# One outcome decides words and colours, in comparisons and in studies of scenarios
+
+
+def summary(name: str, interval: tuple[float, float] | None) -> Summary:
+    """A controller whose error differs from the baseline's by this interval."""
+    difference = None if interval is None else ConfidenceInterval(sum(interval) / 2, *interval)
+    errors = np.full(5, 0.1)
+    return Summary(
+        name,
+        errors,
+        errors,
+        errors,
+        0.1,
+        0.1,
+        0,
+        "0",
+        {"rms_error": {}},
+        {},
+        {"finished": 5},
+        {},
+        difference,
+        1.0,
+        2,
+        0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("interval", "outcome", "words"),
+    [
+        ((-0.2, -0.1), Outcome.BETTER, "has a smaller error than"),
+        ((0.1, 0.2), Outcome.WORSE, "has a larger error than"),
+        ((-0.1, 0.2), Outcome.NO_DIFFERENCE, "show no clear difference"),
+    ],
+)
+def test_a_summary_is_what_its_interval_leaves_no_doubt_of(interval, outcome, words):
+    """An interval with zero inside is no difference, whatever its middle."""
+    baseline, rival = summary("RHC", None), summary("RHC+FPI", interval)
+    assert baseline.outcome is None
+    assert rival.outcome is outcome
+    assert words in verdict([baseline, rival], {})[0]
+
+
+def test_green_is_for_better_alone():
+    """In the style sheet only the class of 'better' has the green ink, and the bare headline has the ordinary one."""
+    css = asset("report.css")
+    green = {
+        s
+        for rule, body in re.findall(r"([^{}]+)\{([^{}]*)\}", css)
+        if "color:var(--accent)" in body
+        for s in rule.split(",")
+    }
+    assert {s.strip() for s in green if "outcome" in s or "headline" in s} == {
+        ".headline.outcome-better",
+        "li.outcome-better",
+    }
+    assert [o for o in Outcome if "green" in STYLES[o]] == [Outcome.BETTER]
+    assert css_class(None) == "remark"
+    assert STYLES[None] == ""

@@ -1,10 +1,11 @@
-"""References: derivatives by differentiation, tables by splines, one interface."""
+"""References and disturbances: derivatives by differentiation, tables by splines, and what acts at which time."""
 
 from __future__ import annotations
 
 import casadi as ca
 import numpy as np
 import pytest
+from own_disturbance import Sawtooth
 from plants import chain
 
 import fpirhc as fp
@@ -55,3 +56,52 @@ def test_bad_tables(times, values, error):
     """Times must increase, lengths must agree, values must be finite."""
     with pytest.raises(error):
         fp.Table(times, {"y": values})
+
+
+# Disturbances: what they are at which time
+
+
+TIMES = np.linspace(0, 2, 21)
+
+
+def _values(disturbance, seed=0):
+    return disturbance.values(TIMES, np.random.default_rng(seed))
+
+
+def test_step_pulse_and_sine():
+    """Edges are where they were asked for."""
+    assert _values(fp.Step(at=1.0, size=3.0)).tolist() == [0.0] * 10 + [3.0] * 11
+    assert _values(fp.Pulse(at=0.5, duration=0.5, size=2.0)).sum() == pytest.approx(10.0)
+    np.testing.assert_allclose(_values(fp.Sine(2.0, 0.25)), 2 * np.sin(np.pi / 2 * TIMES), equal_nan=False)
+
+
+@pytest.mark.parametrize(
+    "disturbance",
+    [fp.Step(0.3, -3.0), fp.Pulse(0.2, 0.7, 2.0), fp.Sine(2.0, 0.7, 0.3), Sawtooth()],
+    ids=lambda d: type(d).__name__,
+)
+def test_jump_and_slew_are_the_largest_changes(disturbance):
+    """Between close samples no value changes by more than the slew says and one jump more; the largest of each does happen."""
+    times = np.linspace(0, 2, 20001)
+    changes = np.abs(np.diff(disturbance.values(times, np.random.default_rng(0))))
+    gone = disturbance.slew * (times[1] - times[0])
+    sudden = changes > 1.01 * gone
+    assert changes[~sudden].max(initial=0.0) == pytest.approx(gone, rel=1e-3)
+    assert changes[sudden].max(initial=0.0) == pytest.approx(disturbance.jump, abs=1.01 * gone)
+
+
+def test_noise_and_formulas_tell_nothing():
+    """Noise is no motion to follow, and of a formula nothing is known."""
+    for disturbance in (fp.Noise(1.0), fp.ColouredNoise(1.0, 0.1), fp.Formula(ca.sin)):
+        assert (disturbance.jump, disturbance.slew) == (0.0, 0.0)
+
+
+def test_noise_is_drawn_from_the_seed():
+    assert np.array_equal(_values(fp.Noise(1.0), 4), _values(fp.Noise(1.0), 4))
+    assert not np.array_equal(_values(fp.Noise(1.0), 4), _values(fp.Noise(1.0), 5))
+
+
+def test_formula_must_be_finite():
+    np.testing.assert_allclose(_values(fp.Formula(lambda t: ca.exp(-t))), np.exp(-TIMES), equal_nan=False)
+    with pytest.raises(InvalidValue, match="not finite at t = 0"):
+        _values(fp.Formula(lambda t: 1 / t))

@@ -1,8 +1,9 @@
-"""The exponential tracking law: gains, decay, bumpless start, digital limit."""
+"""Tracking laws: gains, decay, bumpless start and digital limit; of fractional order Mittag-Leffler decay, weights and memory."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from plants import chain
 
 import fpirhc as fp
+from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.errors import InvalidValue
 
 
@@ -63,3 +65,139 @@ def test_rate_must_be_positive():
     """A rate of zero would never track."""
     with pytest.raises(InvalidValue, match="above 0"):
         fp.Exponential(rate=0.0)
+
+
+# The tracking law of fractional order: Mittag-Leffler decay, its weights and memory, what a response error leaves
+
+
+def problem(order=1, *, period=1e-3, duration=2.002, **settings):
+    """A chain of integrators that is to stand still, from an error of 1 m."""
+    settings_in_use = {"start": {"y": -1.0}, "reference": fp.Trajectory(lambda t: {"y": 0 * t}), **settings}
+    return fp.Problem(plant=chain(order), period=period, duration=duration, **settings_in_use)
+
+
+def run(task, tracking, *, compiled=False):
+    return fp.simulate(task, fp.ComputedTorque(tracking), seed=0, compiled=compiled)
+
+
+def decaying(result, order, rate):
+    """S = (d/dt + rate)^n e_int of every cycle, from the logged state and integral."""
+    integral = np.concatenate([[0.0], result["integral.y"][:-1]])
+    chain_of_errors = [integral, *(-result["state"].T)]
+    return sum(math.comb(order, s) * rate ** (order - s) * chain_of_errors[s] for s in range(order + 1))
+
+
+def mittag_leffler(order, x):
+    """E_order(-x) by its power series, for x small enough that nothing cancels."""
+    return sum((-x) ** k / math.gamma(order * k + 1) for k in range(int(150 / order)))
+
+
+def test_series_is_the_exponential_and_the_cosine():
+    """E_1(-x) = exp(-x) and E_2(-x^2) = cos x: the yardstick of the tests below."""
+    assert mittag_leffler(1.0, 2.0) == pytest.approx(math.exp(-2), rel=1e-12)
+    assert mittag_leffler(2.0, 4.0) == pytest.approx(math.cos(2), rel=1e-12)
+
+
+@pytest.mark.parametrize(("order", "beta", "after"), [(3, 0.6, 0.300584), (1, 0.8, 0.223547), (2, 1.0, 0.135335)])
+def test_closed_loop_follows_mittag_leffler(order, beta, after):
+    """S(t) / S_0 = E_beta(-(rate t)^beta) on the ideal plant, whatever its relative order; `after` is E at rate t = 2."""
+    period = 4e-3
+    result = run(problem(order, period=period, duration=2.004), fp.Fractional(rate=1.0, order=beta, memory=2.004))
+    surface = decaying(result, order, 1.0)
+    assert surface[500] / surface[0] == pytest.approx(after, abs=period)
+    late = np.arange(50, 501, 25)
+    expected = [mittag_leffler(beta, (k * period) ** beta) for k in late]
+    np.testing.assert_allclose(surface[late] / surface[0], expected, atol=period)
+
+
+def test_order_above_one_overshoots():
+    """For beta = 1.5 S swings through zero, as E_1.5 does; S'(0) is zero."""
+    period = 4e-3
+    result = run(problem(period=period, duration=4.0), fp.Fractional(rate=1.0, order=1.5, memory=4.0))
+    surface = decaying(result, 1, 1.0)
+    late = np.arange(25, 1000, 25)
+    expected = [mittag_leffler(1.5, (k * period) ** 1.5) for k in late]
+    np.testing.assert_allclose(surface[late] / surface[0], expected, atol=period)
+    assert min(expected) < -0.1
+    assert surface[1] == pytest.approx(surface[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_order_one_is_the_exponential_law(order):
+    """With beta = 1 the errors differ from the exponential law's by the order of the period: half of it, half the difference."""
+
+    def difference(period):
+        task = problem(order, period=period, duration=1.5)
+        one = run(task, fp.Fractional(rate=4.0, order=1.0, memory=0.25))
+        other = run(task, fp.Exponential(rate=4.0, bumpless=False))
+        return np.abs(one["error.y"] - other["error.y"]).max()
+
+    assert difference(1e-3) < 4e-3
+    assert difference(5e-4) == pytest.approx(difference(1e-3) / 2, rel=0.05)
+
+
+@pytest.mark.parametrize("beta", [0.7, 1.0, 1.3])
+def test_what_a_response_error_leaves(beta):
+    """A constant response error h leaves S where the sum over the past equals its push: near period^(1-beta) h / rate^beta."""
+    rate, period, h = 6.0, 5e-3, 0.1
+    law = fp.Fractional(rate, beta)
+    task = problem(
+        period=period, duration=12.0, start={"y": 0.0}, disturbances={"u": fp.Step(at=0.0, size=h)}, measure_from=6.0
+    )
+    left = decaying(run(task, law), 1, rate)[-1]
+    stiffness = (rate * period) ** beta
+    rest = 1 + law.weights(law.cycles(period)).sum()
+    # In equilibrium every past S is the same, and each cycle adds (1 + stiffness) of the push, period h, to the implicit sum.
+    assert left == pytest.approx(-period * h * (1 + stiffness) / (stiffness + rest), rel=0.02)
+    assert left == pytest.approx(-(period ** (1 - beta)) * h / rate**beta, rel=0.15)
+
+
+def test_weights_are_binomials():
+    """w_j = (-1)^j C(beta, j), here for one half and for one."""
+    assert fp.Fractional(1.0, 0.5).weights(4) == pytest.approx([-1 / 2, -1 / 8, -1 / 16, -5 / 128])
+    assert fp.Fractional(1.0, 1.0).weights(4) == pytest.approx([-1, 0, 0, 0])
+
+
+def test_memory_is_static_and_bounded():
+    """20 / rate by default, one number per cycle and coordinate, and never more than 20 000 cycles."""
+    law = fp.Fractional(rate=4.0, order=0.8)
+    controller = compose_controller(problem(2), fp.ComputedTorque(law))
+    assert law.cycles(1e-3) == 5000
+    assert controller.memory["decay_past"].size == 5000
+    assert fp.Fractional(rate=1.0, order=0.8).cycles(1e-3) == 20_000
+    with pytest.raises(InvalidValue, match="give memory=10 or less"):
+        fp.Fractional(rate=1.0, order=0.8).cycles(5e-4)
+
+
+def test_shortest_memory_runs():
+    result = run(problem(duration=0.2, period=0.01), fp.Fractional(rate=100.0, order=0.9, memory=0.01))
+    assert np.isfinite(result["desired"]).all()
+
+
+def test_deformation_serves_the_law():
+    """On the seed problem with its wrong model beta = 0.7 leaves less error than the exponential law of the same rate."""
+    task = replace(fp.load_problem("two_mass").problem, duration=3.0, measure_from=2.0)
+    sigmoid = fp.Sigmoid(gain=-0.5, scale=20.0)
+    rms = [
+        np.sqrt(np.mean(fp.simulate(task, fp.ComputedTorque(law, sigmoid), seed=0)["error"][2000:] ** 2))
+        for law in (fp.Exponential(6.0), fp.Fractional(6.0, 0.7, memory=2.0))
+    ]
+    assert rms[1] < 0.4 * rms[0]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"rate": 0.0, "order": 0.5},
+        {"rate": math.inf, "order": 0.5},
+        {"rate": 1.0, "order": 0.0},
+        {"rate": 1.0, "order": 2.0},
+        {"rate": 1.0, "order": math.nan},
+        {"rate": 1.0, "order": 0.5, "memory": 0.5},
+        {"rate": 1.0, "order": 0.5, "memory": math.inf},
+    ],
+)
+def test_bad_settings_are_refused(settings):
+    """No decay from order 2 on, and no memory shorter than the decay it is to hold."""
+    with pytest.raises(InvalidValue, match="expected"):
+        fp.Fractional(**settings)
