@@ -14,7 +14,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.gate import Gate, was_skipped
+from fpirhc.controllers.gate import AGAIN, Gap, Gate, was_skipped
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, compose
 from fpirhc.symbolic.layout import Layout, Signal, scalar
@@ -249,6 +249,20 @@ def test_what_is_trusted_is_not_checked(opaque):
     assert gated(np.nan) == ([7.5, 0.0], Status.BAD_SAMPLE)
     assert gated(1.0, b=0.125) == ([7.5, 0.0], Status.NON_FINITE)
     assert gated.own == [1.0, 7.5]
+
+
+@both
+def test_a_cycle_that_is_given_again_is_no_missing_one(opaque):
+    """Its time is beyond every time: nothing is counted; a bad sample at any other time is missing."""
+    gated = Gated(opaque, gap=Gap(5, 0.0))
+    gated(0.5, time=0.0)
+    gated(np.nan, time=0.1)
+    gated(np.nan, time=AGAIN)
+    assert gated.memory["missing_cycles"].tolist() == [1.0]
+    gated(np.nan, time=0.2)
+    assert gated.memory["missing_cycles"].tolist() == [2.0]
+    assert gated(0.5, time=0.3) == ([8.0, -1.0], Status.NOT_CONVERGED)
+    assert gated.memory["missing_cycles"].tolist() == [0.0]
 
 
 def test_what_is_remembered():

@@ -1,6 +1,10 @@
 """Signatures of the core say what they take and return; values of a step are CasADi's own types."""
 
 import ast
+import importlib
+import inspect
+import pkgutil
+from dataclasses import is_dataclass
 from pathlib import Path
 
 import casadi as ca
@@ -106,3 +110,23 @@ def test_an_empty_column_mixes_with_every_kind() -> None:
     both = ca.vertcat(column(graphs), ca.MX.sym("x"))
     assert isinstance(both, ca.MX)
     assert both.shape == (1, 1)
+
+
+CHANGING = {  # dataclasses that collect something
+    "fpirhc.adapters.real_time.RealTime",
+    "fpirhc.export.straight._Lines",
+    "fpirhc.problem_files.problem_file._MistakesOfFile",
+}
+
+
+def test_values_are_frozen():
+    """What is a key of a cache, or is shared by loops, must not change under them."""
+    modules = [m.name for m in pkgutil.walk_packages(fpirhc.__path__, "fpirhc.") if not m.name.endswith("__main__")]
+    values = {
+        f"{module}.{value.__name__}": value
+        for module in modules
+        for value in vars(importlib.import_module(module)).values()
+        if inspect.isclass(value) and value.__module__ == module and is_dataclass(value)
+    }
+    assert len(values) > 300
+    assert {name for name, value in values.items() if not value.__dataclass_params__.frozen} == CHANGING

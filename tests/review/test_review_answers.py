@@ -23,11 +23,11 @@ from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
 from fpirhc.review.questions.commands import commands_inside, inverse_exists
 from fpirhc.review.questions.convergence import _NEAR, _without, box_converges, converges
-from fpirhc.review.questions.gain import _gain, _sign, gain_admissible, gain_of_target
+from fpirhc.review.questions.gain import _converging, _gain, _sign, gain_admissible, gain_of_target
 from fpirhc.review.questions.margins import LEAST_PHASE, MARGINS, margins_enough
 from fpirhc.review.questions.right_model import _no_gain
 from fpirhc.review.questions.slew import _start_deviation, effect, range_enough, slew_enough
-from fpirhc.review.recommended_gain import FAR, recommended_gain
+from fpirhc.review.recommended_gain import FAR, Recommended, recommended_gain
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 PERIOD, CYCLES = 0.1, 100
@@ -94,10 +94,10 @@ def test_convergence_is_a_hundredfold_change_over_the_run(grid, logarithms, verd
     assert bool(one.change) == (verdict != "yes")
 
 
+@pytest.mark.parametrize("rate", [-2.0, -0.2])
 @pytest.mark.parametrize(("share", "left"), [(0.99, 0.5), (-0.99, 0.5), (1.01, None), (-1.01, None)])
-def test_a_decaying_mode_of_the_zero_dynamics_takes_the_pole_beside_it(share, left):
+def test_a_decaying_mode_of_the_zero_dynamics_takes_the_pole_beside_it(share, left, rate):
     """A pole within the stated share of its distance from 1; a mode that grows takes none, nor does a pole that does not decay."""
-    rate = -2.0
     exact = math.exp(rate * PERIOD)
     pole = exact + share * _NEAR * (1 - exact)
     both, turned = (linear(np.diag(d), np.eye(2), np.eye(2), np.arange(2), PERIOD) for d in ([pole, 0.5], [0.5, pole]))
@@ -153,6 +153,17 @@ OWN = "See the questions about the gain, the form and the tracking law."
 def test_the_fault_of_an_outer_loop_is_not_the_gains(grid, ideal, change):
     """A loop that does not converge with the right model needs another rate, and no other gain."""
     assert convergence(grid, loops(2.0, ideal=ideal)).change == change
+
+
+def test_what_the_zero_dynamics_do_is_not_the_gains(grid, monkeypatch):
+    """Where the slowest mode is theirs and grows, along the reference or in the box; a slow loop has other cures."""
+    monkeypatch.setattr("fpirhc.review.questions.convergence.of_zero_dynamics", lambda *_: True)
+    monkeypatch.setattr("fpirhc.review.questions.convergence.loops_over_box", lambda *_: (loop(1.25),))
+    theirs = "The slowest mode is that of the zero dynamics, which no gain changes: see there."
+    case: Any = SimpleNamespace(grid=grid, controller=None, loops=loops(0.5))
+    assert box_converges(case).change == convergence(grid, loops(1.0)).change == theirs
+    assert convergence(grid, loops(0.9, 1.25, ideal=1.25)).change == theirs
+    assert convergence(grid, loops(math.exp(-0.5 * EDGE), ideal=0.999)).change == OWN
 
 
 @pytest.mark.parametrize(
@@ -337,6 +348,52 @@ def test_of_a_map_without_a_gain_of_its_own_the_effective_one_is_told(monkeypatc
     assert one.numbers == pytest.approx({"gain": 0.25, "limit": 0.2, "recommended": 0.1})
     assert one.evidence == "effective gain = 0.25; the smallest limit is 0.2, set by a pole"
     assert one.change == "Use effective gain = 0.1, half of it."
+
+
+SMALL = "; it is too small, the loop converges from -1.2 on"
+ADVICE = Recommended(value=-1.5, limit=-3.0, sets="a pole")
+
+
+@pytest.mark.parametrize(
+    ("advice", "said", "change"),
+    [
+        (replace(ADVICE, limit=-0.5), "", "told"),
+        (
+            replace(ADVICE, limit=-math.inf),
+            "; with -0.5 it does not converge either",
+            "See the convergence of the deformation.",
+        ),
+        (ADVICE, SMALL, "Use gain = -1.5."),
+        (replace(ADVICE, value=-1.2), SMALL, "Use gain = -1.2."),
+        (
+            replace(ADVICE, value=-1.1),
+            "; it is too small, the loop converges from -1.2 on",
+            "Use gain beyond -1.2, or another form.",
+        ),
+        (
+            replace(ADVICE, why_not="x"),
+            "; it is too small, the loop converges from -1.2 on",
+            "Use gain beyond -1.2, or another form.",
+        ),
+    ],
+)
+def test_a_gain_with_which_the_loop_diverges_is_a_no(monkeypatch, advice, said, change):
+    """A_c = -0.5 is the effective gain 0.25, the limit -3 six times that: a smallest one is sought up to there."""
+    asked: list[Any] = []
+    monkeypatch.setattr("fpirhc.review.questions.gain.least_gain", lambda *arguments: asked.append(arguments) or 0.6)
+    by_gain = SimpleNamespace(gains=(0.2, 0.25))
+    case: Any = SimpleNamespace(by_gain=by_gain, diverges=True, controller=SimpleNamespace(deformation=fp.Affine(-0.5)))
+    told = fp.Answer("gain", Verdict.YES, "gain = -0.5", "told", {"gain": -0.5})
+    one = _converging(case, told, advice)
+    assert (one.verdict, one.evidence, one.change) == ("no", told.evidence + said, change)
+    assert asked == ([(by_gain, 1.5)] if "small" in said else [])
+    assert one.numbers == pytest.approx({"gain": -0.5} | ({"least": -1.2} if "small" in said else {}))
+    refused = replace(told, verdict=Verdict.NO)
+    assert _converging(case, refused, advice) is refused
+    for same in ({"by_gain": None}, {"diverges": False}):
+        vars(case).update(by_gain=by_gain, diverges=True)
+        vars(case).update(same)
+        assert _converging(case, told, advice) is told
 
 
 def test_of_a_map_on_targets_the_loop_decides_and_without_eigenvalues_nobody(monkeypatch):
