@@ -331,6 +331,11 @@ JOURNEYS: dict[str, Any] = {
         (None, "line.py --over latncy", 2),
         (taken, "line.py --out taken/results", 3),
     ],
+    "robust": [
+        (None, "line.py --controllers CTC --risk 0.5 --confidence 0.5 --no-compile", 0),
+        (None, "line.py --risk 2", 2),
+        (taken, "line.py --out taken/results", 3),
+    ],
     "sweep": [
         (None, "line.py --over tracking.rate=2:6:3 --controllers CTC --no-compile --out swept", 0),
         (None, "line.py --over tracking.rate=2:6:4 --controllers CTC --no-compile --out swept", 3),

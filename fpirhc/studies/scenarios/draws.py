@@ -21,7 +21,7 @@ from fpirhc.review.dead_time_variants import is_late, live_paths, roomy, scaled
 from fpirhc.task.cases import Cases
 from fpirhc.task.problem import Problem
 
-COMPARING, TUNING = 0, 1  # uses: a controller is never compared on the scenarios on which it was tuned
+COMPARING, TUNING, SEARCHING = range(3)  # uses: a controller is never compared on the scenarios on which it was tuned
 
 
 @dataclass(frozen=True, eq=False)

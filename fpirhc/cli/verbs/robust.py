@@ -1,0 +1,87 @@
+"""`fpirhc robust PROBLEM`: the largest mismatch at which nearly all plants hold, and a search for one that fails."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+
+from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_out, add_problem, add_seed
+from fpirhc.cli.output import RESULTS, results_folder
+from fpirhc.cli.verb import ExitCode, Verb
+
+_SHARES = {
+    "risk": "largest share of the plants of a box that may fail (default: 0.05)",
+    "confidence": "with which that is said (default: 0.999)",
+    "fails": "rms error from which a run has failed, as a share of the reference's range (default: 0.5)",
+}
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    add_problem(parser)
+    add_controllers(parser)
+    for name, text in _SHARES.items():
+        parser.add_argument(f"--{name}", type=float, default=argparse.SUPPRESS, metavar="SHARE", help=text)
+    add_seed(parser, "the draws and the noise")
+    add_out(parser, "results/PROBLEM/robust")
+    add_no_compile(parser)
+    add_json(parser, "the table")
+
+
+def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.problem_files.problem_file import load_problem
+
+    task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
+    from fpirhc.report.html import render_page
+    from fpirhc.report.terminal import progress_bars, show
+    from fpirhc.studies.robust import robust_boxes
+    from fpirhc.studies.view import to_json
+    from fpirhc.whole_file import write_whole
+
+    folder = results_folder(options.out, task.name, "robust")
+    shares = {name: getattr(options, name) for name in _SHARES if hasattr(options, name)}
+    words = ["fpirhc", "robust", options.problem, "--seed", str(options.seed)]
+    words += ["--controllers", *options.controllers] if options.controllers else []
+    words += [word for name, value in shares.items() for word in (f"--{name}", f"{value:g}")]
+    words += ["--no-compile"] if options.no_compile else []
+    with progress_bars() as progress:
+        found = robust_boxes(
+            task,
+            controllers=options.controllers,
+            **shares,
+            seed=options.seed,
+            compiled=not options.no_compile,
+            command=shlex.join(words),
+            progress=progress,
+        )
+    page = render_page("scenarios.html", found.view, chart=None, own=())
+    write_whole(page, folder / "report.html", "report")
+    write_whole(f"{to_json(found.view.facts)}\n", folder / RESULTS, "report")
+    if options.json:
+        print(to_json(found.view.facts))
+    else:
+        show(found.view, folder / "report.html")
+    return ExitCode.FINISHED if found.boxes else ExitCode.BAD_INPUT
+
+
+VERB = Verb(
+    name="robust",
+    summary="find the largest mismatch at which nearly every plant holds, and search it for one that fails",
+    group="run",
+    add=_add,
+    run=_run,
+    codes={
+        ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or no controller could be tried",
+        ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
+    },
+    examples=(
+        ("fpirhc robust two_mass --controllers CTC 'CTC+FPI (eq 6)'", "225 plants per box, at most 5 % of which fail"),
+        ("fpirhc robust two_mass --controllers RHC+FPI --risk 0.01 --confidence 0.9999", "1374 plants per box"),
+    ),
+    notes="""
+A run fails if it ends early, leaves a limit of a state by more than 2 % of its width, or has an rms error above --fails of the
+reference's range. The box of P percent holds the plants that `compare --scenarios --mismatch P` draws: every exact parameter
+is multiplied by a factor between 1 - P/100 and 1 + P/100, or lies in P percent of its own spread.
+Where none of the drawn plants fails, the share that does is at most --risk, with --confidence for all boxes of whole percents
+at once. Drawn plants seldom are the worst ones: from the worst of them a search looks for a plant of the box that fails.
+""",
+)

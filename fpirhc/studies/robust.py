@@ -1,0 +1,405 @@
+"""How wrong the model may be: the largest box of plants in which a controller holds, by draws and a search for one that fails.
+
+Theory: docs/theory-robust.md, "How wrong the model may be".
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from fpirhc.controllers.contract import Controller, believing
+from fpirhc.describe import describe
+from fpirhc.errors import FpirhcError, InvalidValue
+from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import Seed
+from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.studies.comparison.compare import check_gains, select, versions
+from fpirhc.studies.operating_limits import FAILS, Judge, Point
+from fpirhc.studies.scenarios.draws import SEARCHING
+from fpirhc.studies.view import View
+from fpirhc.summary import Column, Table, in_percent, line, number
+
+RISK, CONFIDENCE = 0.05, 0.999  # where nothing else is said
+_BOXES = 99  # of 1 % to 99 %
+_FIRST = 8  # percent: the first box that is tried
+_GENERATION = 20  # plants of a search side by side, at most
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Counterexample:
+    """A plant of the box that fails.
+
+    Args:
+        parameters: its exact parameters, by name.
+        why: it fails.
+        from_percent: the smallest box, in whole percent, at whose edge in this direction a plant fails.
+    """
+
+    parameters: Mapping[str, float]
+    why: str
+    from_percent: int
+
+
+@dataclass(frozen=True)
+class RobustBox:
+    """The largest box of one controller.
+
+    Args:
+        controller: its name.
+        percent: the largest box that was tried in which no drawn plant failed; NaN where the plant of the problem fails.
+        fails_at: the smallest box above it in which one failed, percent; infinite where none did.
+        why: what failed there.
+        worst_drawn: largest relative error of the plants drawn from the box.
+        worst_found: largest relative error of those that the search tried beside them.
+        counterexample: a plant of the box that the search found to fail; None: it found none.
+    """
+
+    controller: str
+    percent: float
+    fails_at: float
+    why: str
+    worst_drawn: float
+    worst_found: float
+    counterexample: Counterexample | None
+
+
+@dataclass(frozen=True, eq=False)
+class RobustBoxes:
+    """The result of `robust_boxes`.
+
+    Args:
+        problem: name of the problem.
+        title: its title.
+        description: its description.
+        risk: largest share of failing plants in a box that holds.
+        confidence: with which that is said.
+        draws: plants that are drawn from a box.
+        fails: relative error from which a run has failed.
+        seed: of the draws.
+        boxes: by controller, in their order.
+        untried: reasons why controllers did not run, by name.
+        settings: settings of the problem and the controllers.
+        versions: versions of fpirhc and of what its numbers depend on.
+        command: the command line.
+        elapsed: wall time, s.
+    """
+
+    problem: str
+    title: str
+    description: str
+    risk: float
+    confidence: float
+    draws: int
+    fails: float
+    seed: int
+    boxes: tuple[RobustBox, ...]
+    untried: Mapping[str, str]
+    settings: Mapping[str, Any]
+    versions: Mapping[str, str]
+    command: str
+    elapsed: float
+
+    def __repr__(self) -> str:
+        return line(self, self.problem, *(f"{one.controller}: {_percent(one.percent)}" for one in self.boxes))
+
+    def _repr_html_(self) -> str:
+        return self.view.html()
+
+    @property
+    def view(self) -> View:
+        """What every output says of it."""
+        return _view(self)
+
+
+@checked_call
+def robust_boxes(
+    task: Task,
+    *,
+    controllers: Sequence[str] | None = None,
+    risk: float = RISK,
+    confidence: float = CONFIDENCE,
+    fails: float = FAILS,
+    seed: Seed = 0,
+    compiled: bool = True,
+    command: str = "",
+    progress: Progress | None = None,
+) -> RobustBoxes:
+    """Return for every controller the largest mismatch at which at most a share `risk` of all plants fails.
+
+    The box of P percent holds the plants that `fpirhc compare --scenarios --mismatch P` draws. N plants are drawn, one direction
+    each, and every box is asked with these; where none of the N fails,
+
+        share of failing plants <= risk    with probability >= confidence,    N >= ln(99 / (1 - confidence)) / ln(1 / (1 - risk)),
+
+    for all of the 99 boxes of whole percents at once, so that the largest one may be chosen. Inside it a search (differential
+    evolution from the worst plants, their corners and those across, about N runs) then looks for a plant that fails all the same.
+
+    Args:
+        task: the loaded problem file.
+        controllers: names of controllers; None: all.
+        risk: largest share of failing plants.
+        confidence: with which that is said.
+        fails: relative error (rms over the range of the reference) from which a run has failed; one that ends early or leaves a
+            limit of a state has failed too.
+        seed: of the draws and of the noise.
+        compiled: whether runs use compiled C.
+        command: the command line, for the report.
+        progress: function of (controller, boxes asked, boxes in all, at most).
+
+    Raises:
+        InvalidProblem: unknown controllers, gains of the wrong sign.
+        InvalidValue: a share that is none, `fails` that is not positive, or a plant without parameters to draw.
+    """
+    begin = time.perf_counter()
+    for name, value in (("risk", risk), ("confidence", confidence)):
+        if not 0 < value < 1:
+            raise InvalidValue(f"{name}={value!r}: expected a share above 0 and below 1")
+    if not fails > 0:
+        raise InvalidValue(f"fails={fails!r}: expected a positive share of the reference's range")
+    most = _most(task)
+    chosen = select(task, controllers)
+    check_gains(task, chosen)
+    draws = wanted_draws(risk, confidence)
+    boxes, untried = [], {}
+    for name, controller in chosen.items():
+        try:
+            plants = _Plants(task, believing(task.problem, controller), draws, fails, seed, compiled)
+            boxes.append(_robust_box(name, plants, most, progress))
+        except FpirhcError as error:
+            untried[name] = str(error)
+    return RobustBoxes(
+        problem=task.name,
+        title=task.title,
+        description=task.description,
+        risk=risk,
+        confidence=confidence,
+        draws=draws,
+        fails=fails,
+        seed=seed,
+        boxes=tuple(boxes),
+        untried=untried,
+        settings={"problem": describe(task.problem), **{n: describe(c) for n, c in chosen.items()}},
+        versions=versions(),
+        command=command,
+        elapsed=time.perf_counter() - begin,
+    )
+
+
+def wanted_draws(risk: float, confidence: float) -> int:
+    """Return how many plants have to hold in a box; see `robust_boxes`."""
+    return math.ceil(math.log(_BOXES / (1 - confidence)) / -math.log1p(-risk))
+
+
+def _most(task: Task) -> int:
+    """The largest box in which every plant is one, percent."""
+    moved: Parametric = task.problem.moved
+    least, beyond = 0, _BOXES + 1
+    while beyond - least > 1:
+        middle = (least + beyond) // 2
+        try:
+            exact_ranges(moved, middle)
+        except FpirhcError as error:
+            beyond, refusal = middle, str(error)
+        else:
+            least, refusal = middle, ""
+    if least and any(high > low for low, high in exact_ranges(moved, least).values()):
+        return least
+    why = refusal or "all are zero or given by signals"
+    raise InvalidValue(f"problem '{task.name}' has no parameters that can be drawn: {why}")
+
+
+def _robust_box(name: str, plants: _Plants, most: int, progress: Progress | None) -> RobustBox:
+    asked: dict[int, Point] = {}
+    steps = 2 + 2 * math.ceil(math.log2(most))
+
+    def worst(percent: int) -> Point:
+        """The first drawn plant that fails, or the one with the largest error."""
+        if percent not in asked:
+            asked[percent] = plants.worst_drawn(percent)
+            if progress:
+                progress(name, len(asked), steps)
+        return asked[percent]
+
+    holds, fails = _largest(lambda percent: not worst(percent).why, most)
+    if holds < 0:
+        return RobustBox(name, math.nan, 0.0, asked[0].why, asked[0].error, asked[0].error, None)
+    found, example = plants.search(holds)
+    if progress:
+        progress(name, steps, steps)
+    why = asked[fails].why if fails <= most else ""
+    above = float(fails) if fails <= most else math.inf
+    return RobustBox(name, float(holds), above, why, asked[holds].error, found, example)
+
+
+def _largest(holds: Callable[[int], bool], most: int) -> tuple[int, int]:
+    """The largest box that holds and the smallest one above that fails, as bisection finds them; -1 where none holds."""
+    low, high = -1, 0
+    while high <= most and holds(high):
+        low, high = high, most if 0 < high < most <= 2 * high else max(_FIRST, 2 * high)
+        if low == most:
+            return most, most + 1
+    high = min(high, most + 1)
+    while high - low > 1 and low >= 0:
+        middle = (low + high) // 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low, high
+
+
+class _Plants:
+    """The plants of all boxes, by percent and direction: the share of the distribution of every parameter, shape (np,)."""
+
+    def __init__(self, task: Task, controller: Controller, draws: int, fails: float, seed: int, compiled: bool) -> None:
+        self._problem, self._judge = task.problem, Judge(task, fails, seed)
+        self._controller, self._compiled, self._seed = controller, compiled, seed
+        self._parameters = task.problem.moved.parameters
+        streams = [np.random.SeedSequence(seed, spawn_key=(SEARCHING, k)).spawn(2) for k in range(draws)]
+        self._shares = np.array([np.random.default_rng(own).random(len(self._parameters)) for own, _ in streams])
+        self._noise = [int(noise.generate_state(1)[0]) for _, noise in streams]
+        self._errors = np.zeros(draws)
+        self._loop = self._built()
+
+    def worst_drawn(self, percent: int) -> Point:
+        """Return the first drawn plant of the box that fails, or the one with the largest error; of 0 % the problem's own."""
+        worst = Point(percent, 0.0, "")
+        for k, (shares, noise) in enumerate(zip(self._shares, self._noise, strict=True)):
+            one = self._point(percent, shares, noise)
+            self._errors[k] = one.error
+            worst = max(worst, one, key=lambda point: point.error)
+            if one.why:
+                return one
+            if percent == 0 and not self._problem.disturbances and self._problem.sensing.ideal:
+                break  # all of them are the same
+        return worst
+
+    def search(self, percent: int) -> tuple[float, Counterexample | None]:
+        """Return the largest error that a search in the box meets, and a plant that fails, if it meets one."""
+        from scipy.optimize import differential_evolution
+
+        size = min(_GENERATION, max(5, 4 * len(self._parameters)), max(5, len(self._shares) // 4))
+        order = np.argsort(self._errors)[::-1]
+        worst = self._shares[order[: max(size // 3, 2)]]
+        start = np.vstack([worst, np.round(worst), 1 - np.round(worst)])  # their corners, and the corners across
+        largest, noise = 0.0, self._noise[int(order[0])]
+
+        def negative_error(shares: np.ndarray) -> float:
+            nonlocal largest
+            one = self._point(percent, shares, noise)
+            largest = max(largest, one.error)
+            if one.why:
+                raise _Found(shares, one)
+            return -one.error
+
+        limits = [(0.0, 1.0)] * len(self._parameters)
+        generations = max(len(self._shares) // len(start) - 1, 1)
+        try:
+            differential_evolution(
+                negative_error, limits, init=start, maxiter=generations, tol=0, polish=False, seed=self._seed
+            )
+        except _Found as found:
+            return largest, self._counterexample(percent, found, noise)
+        return largest, None
+
+    def _counterexample(self, percent: int, found: _Found, noise: int) -> Counterexample:
+        holds, fails = 0, percent
+        while fails - holds > 1:
+            middle = (holds + fails) // 2
+            holds, fails = (holds, middle) if self._point(middle, found.shares, noise).why else (middle, fails)
+        values = self._exact(percent, found.shares)
+        return Counterexample(dict(zip(self._parameters, map(float, values), strict=True)), found.point.why, fails)
+
+    def _exact(self, percent: int, shares: np.ndarray) -> np.ndarray:
+        pairs = zip(self._parameters.values(), shares, strict=True)
+        return np.array([drawn(parameter, percent, float(share)) for parameter, share in pairs])
+
+    def _point(self, percent: int, shares: np.ndarray, noise: int) -> Point:
+        try:
+            problem = self._problem.with_exact(self._exact(percent, shares))
+        except FpirhcError as error:
+            return Point(percent, math.inf, str(error))
+        if self._loop.remembers:
+            self._loop = self._built()
+        return self._judge.point(percent, problem, self._loop.run(seed=noise, variant=problem))
+
+    def _built(self) -> Simulator:
+        return simulator(self._problem, self._controller, compiled=self._compiled)
+
+
+class _Found(Exception):  # it ends a search and reports no error
+    """A plant that fails ends the search."""
+
+    def __init__(self, shares: np.ndarray, point: Point) -> None:
+        self.shares, self.point = shares.copy(), point
+
+
+# --- What is said of it -------------------------------------------------------------------------------------------------
+
+
+def _view(found: RobustBoxes) -> View:
+    conditions = (
+        f"A run fails if it ends early, leaves a limit of a state, or has an rms error above {in_percent(found.fails)} of the "
+        f"reference's range. The box of P percent holds the plants that scenarios with a mismatch of P percent draw. "
+        f"{found.draws} plants per box; where none fails, at most {in_percent(found.risk)} of all plants of the box do, with "
+        f"{in_percent(found.confidence)} confidence for all boxes at once."
+    )
+    heads = ["controller", "box [%]", "fails at [%]", "worst drawn", "worst found", "counterexample from [%]"]
+    table = Table(f"{found.problem}: how wrong the model may be", [Column(head) for head in heads], conditions)
+    for one in found.boxes:
+        example = "none found" if one.counterexample is None else str(one.counterexample.from_percent)
+        errors = (_error(one.worst_drawn), _error(one.worst_found))
+        table.add([one.controller, _percent(one.percent), _percent(one.fails_at), *errors, example])
+    examples = [f"{one.controller}: {_plant(one.counterexample)}" for one in found.boxes if one.counterexample]
+    return View(
+        title=found.title,
+        about=found.description,
+        sentences=[(text, None) for text in _sentences(found)],
+        conditions=conditions,
+        tables=(table,),
+        lists={"Plants of the boxes that fail": examples} if examples else {},
+        skipped=found.untried,
+        settings=found.settings,
+        versions=found.versions,
+        command=found.command,
+        elapsed=found.elapsed,
+        facts={
+            **{name: getattr(found, name) for name in ("problem", "risk", "confidence", "draws", "fails", "seed")},
+            "boxes": [asdict(one) for one in found.boxes],
+            "untried": dict(found.untried),
+            "versions": found.versions,
+        },
+    )
+
+
+def _sentences(found: RobustBoxes) -> Iterator[str]:
+    for one in sorted(found.boxes, key=lambda box: -1.0 if math.isnan(box.percent) else box.percent, reverse=True):
+        if math.isnan(one.percent):
+            yield f"{one.controller}: fails as the problem stands ({one.why})."
+            continue
+        above = "the largest that was tried" if math.isinf(one.fails_at) else f"at {one.fails_at:g} % one fails"
+        if one.counterexample is None:
+            searched = f"a search found none that fails (largest error {_error(one.worst_found)})"
+        else:
+            searched = f"a search found one that fails, and such plants begin at {one.counterexample.from_percent} %"
+        yield f"{one.controller}: no plant drawn from the box of {one.percent:g} % fails, {above}; {searched}."
+
+
+def _plant(example: Counterexample) -> str:
+    values = ", ".join(f"{name} = {number(value)}" for name, value in example.parameters.items())
+    return f"{values} ({example.why}); in this direction plants fail from {example.from_percent} % on"
+
+
+def _percent(value: float) -> str:
+    return "as it stands" if math.isnan(value) else "none" if math.isinf(value) else f"{value:g}"
+
+
+def _error(value: float) -> str:
+    return in_percent(value) if math.isfinite(value) else "ended early"
