@@ -91,6 +91,7 @@ def test_adaptation_pays_behind_dry_friction_and_a_tool_that_nobody_weighed():
         assert error["adapted"][joint] < 0.1 * error["alone"][joint]
 
 
+@pytest.mark.outside
 def test_a_probe_finds_the_coupling_and_a_setting_at_least_as_good_as_one_by_hand():
     """The tool makes the forearm's inertia many times larger, so its gain is far below 1; nothing is late and nothing lags."""
     task, law = problem(REAL, 3.0), fp.ComputedTorque(fp.Exponential(rate=8.0))

@@ -102,7 +102,7 @@ def null_change(name: str) -> float:
     """Largest change of the state by the form where the model is exact, relative to its largest value."""
     module: Any = fp.load_problem(name)
     problem = with_exact_model(module.problem)
-    problem = short(problem, min(200, problem.cycles))
+    problem = short(problem, min(100, problem.cycles))
     controller = module.controllers[module.headline[1]]
     sign = -1.0 if resolved(problem, controller).deformation.effective_gain() < 0 else 1.0
     map = fp.Sigmoid(gain=-0.5 * sign, shift=0.3 * sign, scale=50.0)

@@ -43,8 +43,9 @@ def exported(name: str, folder: Path, target: str) -> tuple[Device, Path]:
 
 
 @needs_compiler
-@pytest.mark.parametrize("target", ["fmu", "fmu2"])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    ("name", "target"), [*((name, "fmu") for name in CASES), ("torque", "fmu2"), ("outputs", "fmu2")]
+)
 def test_a_unit_is_valid_and_its_commands_are_those_of_the_stepper_bit_by_bit(name, target, tmp_path):
     """FMPy finds nothing wrong, and 300 samples of a run give the commands and statuses that the stepper gives."""
     device, path = exported(name, tmp_path, target)

@@ -36,7 +36,12 @@ def blocks(page: Path) -> list[str]:
     return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=lambda p: p.stem)
+CODE = [
+    pytest.param(p, marks=[pytest.mark.outside] * (p.stem.startswith("outside")), id=p.stem) for p in PAGES if blocks(p)
+]
+
+
+@pytest.mark.parametrize("page", CODE)
 def test_code_runs(page, tmp_path, monkeypatch):
     """The blocks of a page, one after the other, as a reader would paste them."""
     for package in NEEDED.get(page.stem, ()):

@@ -46,6 +46,7 @@ def test_a_file_is_short_and_says_what_it_needs(path):
     assert needed(path)
 
 
+@pytest.mark.outside
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
 def test_the_package_gives_the_baseline(path):
     """Every metric of every controller holds, in the virtual machine."""
@@ -57,6 +58,7 @@ def test_the_package_gives_the_baseline(path):
     assert [str(row) for row in judgement.changed] == []
 
 
+@pytest.mark.outside
 def test_wind_and_payload_of_the_quadrotor_are_drawn(tmp_path):
     """In every scenario adaptation pays; the hardest has twice the wind and twice the load."""
     if missing(FOLDER / "quadrotor.py"):

@@ -38,8 +38,13 @@ def certificate(name: str) -> LimitsCertificate:
     return fp.certify_limits(*task(name), mismatch=case.mismatch, pieces=case.pieces)
 
 
+@cache
+def mapped(function: ca.Function, count: int) -> ca.Function:
+    return function.map(count)
+
+
 def of(function: ca.Function, *columns: np.ndarray) -> np.ndarray:
-    return np.asarray(function.map(columns[0].shape[1])(*columns).full())
+    return np.asarray(mapped(function, columns[0].shape[1])(*columns).full())
 
 
 def runs(name: str, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -380,7 +380,12 @@ ADVICE = Recommended(value=-1.5, limit=-3.0, sets="a pole")
 def test_a_gain_with_which_the_loop_diverges_is_a_no(monkeypatch, advice, said, change):
     """A_c = -0.5 is the effective gain 0.25, the limit -3 six times that: a smallest one is sought up to there."""
     asked: list[Any] = []
-    monkeypatch.setattr("fpirhc.review.questions.gain.least_gain", lambda *arguments: asked.append(arguments) or 0.6)
+
+    def least(*arguments: Any) -> float:
+        asked.append(arguments)
+        return 0.6
+
+    monkeypatch.setattr("fpirhc.review.questions.gain.least_gain", least)
     by_gain = SimpleNamespace(gains=(0.2, 0.25))
     case: Any = SimpleNamespace(by_gain=by_gain, diverges=True, controller=SimpleNamespace(deformation=fp.Affine(-0.5)))
     told = fp.Answer("gain", Verdict.YES, "gain = -0.5", "told", {"gain": -0.5})
