@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -81,7 +82,7 @@ def test_bounds_of_parameters_end_the_boxes():
 
 
 def test_equal_seeds_have_equal_answers():
-    some = {"risk": 0.3, "confidence": 0.9, "compiled": False}
+    some: dict[str, Any] = {"risk": 0.3, "confidence": 0.9, "compiled": False}
     assert robust_boxes(pump(), **some, seed=1).boxes == robust_boxes(pump(), **some, seed=1).boxes
 
 
