@@ -84,11 +84,11 @@ LOOPS: dict[str, tuple[Problem, Controller]] = {
 def accumulated(problem: Problem, controller: Controller) -> Callable[[], float]:
     """Return a call that runs 500 cycles and says how many seconds they took."""
     loop = close_loop(problem, controller)
-    backend = native(loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK))
+    backend = native(loop.function, calls=CHUNK)
     if not backend.compiled:
         sys.exit("this benchmark needs a C compiler")
     evaluator = Evaluator(backend.function)
-    for argument, table in zip(evaluator.arguments[1:], run_tables(problem, 0, CHUNK), strict=True):
+    for argument, table in zip(evaluator.arguments[1:-1], run_tables(problem, 0, CHUNK), strict=True):
         argument.reshape(CHUNK, -1)[:] = table
     start = loop.memory.start()
 

@@ -21,6 +21,7 @@ import fpirhc as fp
 from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
+from fpirhc.symbolic.program import chained
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table
@@ -46,17 +47,17 @@ def simulated(compiled: bool) -> Callable[[], object]:
     """The accumulated loop as `simulate` runs it, without its set-up: chunks, log, finiteness check."""
     loop = close_loop(TASK.problem, CONTROLLER)
     chunk = 500
-    function = loop.function.mapaccum("fpirhc_loop_run", chunk)
-    evaluator = Evaluator(native(function).function if compiled else function)
+    function = native(loop.function, calls=chunk).function if compiled else chained(loop.function, chunk, 5)
+    evaluator = Evaluator(function)
     log = np.empty((CYCLES, loop.trace.size))
 
     def work() -> None:
-        evaluator.arguments[0][:] = loop.memory.start()
+        evaluator.arguments[0][:], evaluator.arguments[-1][:] = loop.memory.start(), chunk
         for at in range(0, CYCLES, chunk):
             evaluator.redirect(1, log[at : at + chunk])
             evaluator.evaluate()
             assert np.isfinite(np.sum(log[at : at + chunk]))
-            evaluator.arguments[0][:] = evaluator.results[0].reshape(chunk, -1)[-1]
+            evaluator.arguments[0][:] = evaluator.results[0]
 
     return work
 

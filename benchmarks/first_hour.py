@@ -31,7 +31,7 @@ from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.native import native
 task = fp.load_problem("chain_of_masses")
 loop = close_loop(runpy.run_path(str(task.path))["chain"](5), task.controllers["RHC+FPI"])
-assert native(loop.function.mapaccum("chain_run", 500)).compiled
+assert native(loop.function, calls=500).compiled
 """
 ROWS: dict[str, Sequence[str]] = {
     "`import fpirhc`, then `fp.Problem`": ("-c", "import fpirhc as fp; fp.Problem"),

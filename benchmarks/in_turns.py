@@ -26,7 +26,7 @@ def loop_time(ready: Simulator) -> Work:
         begin = time.process_time()
         for _ in range(ready.problem.cycles // CHUNK):
             evaluator.evaluate()
-            evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, -1)[-1]
+            evaluator.arguments[0][:] = evaluator.results[0]
         return time.process_time() - begin
 
     return work

@@ -48,10 +48,10 @@ def cycles(ready: Simulator) -> Callable[[], float]:
         evaluator.redirect(1, log)
         begin = time.process_time()
         for k in range(problem.cycles // CHUNK):
-            for argument in evaluator.arguments[1:]:
+            for argument in evaluator.arguments[1:-1]:
                 argument.reshape(CHUNK, -1)[:] = rows[k * CHUNK : (k + 1) * CHUNK]
             evaluator.evaluate()
-            evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, -1)[-1]
+            evaluator.arguments[0][:] = evaluator.results[0]
         return time.process_time() - begin
 
     return work

@@ -18,12 +18,13 @@ from fpirhc.controllers.gate import BRIDGED
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.c_text import portable
-from fpirhc.export.straight import condensed, without_detours
+from fpirhc.export.straight import condensed
 from fpirhc.simulation.clock import most_missed
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
-from fpirhc.symbolic.native import generate, native
+from fpirhc.symbolic.native import native
+from fpirhc.symbolic.program import generate
 from fpirhc.task.problem import Problem
 
 _RAW = "fpirhc_native"  # name of the generated function, before it has its own
@@ -177,7 +178,7 @@ def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, i
     text, sizes["w"] = _without_wrapper(texts[0], sizes["w"])
     if function.is_a("SXFunction") and text != texts[0]:  # scalar code has variables of its own
         text, sizes = condensed(text), {"arg": function.n_in(), "res": function.n_out(), "iw": 1, "w": 1}
-    texts = (without_detours(text), *texts[1:])
+    texts = (text, *texts[1:])
     for text in texts:
         entry = re.match(r"#define ENTRY (\w+)\n", text)
         visible = entry[1] if entry else _RAW

@@ -1,4 +1,4 @@
-"""Generated C, written shorter: results at their place at once, and scalar code for processors that compute numbers by calls.
+"""Generated scalar code, written shorter for processors that compute numbers by calls.
 
 CasADi writes a choice as (c ? x : 0) + (!c ? y : 0), and a comparison as a number. Here a choice is one expression, a comparison is
 a byte, and every value is computed just before it is needed. Values stay as they are, except that a chosen -0 is no longer +0.
@@ -23,46 +23,6 @@ _NOT = re.compile(r"\(!(v\d+)\)\Z")
 _HALF = re.compile(r"\((v\d+)\?(v\d+):0\)\Z")
 _CHOICE = re.compile(r"\(v\d+\?(v\d+):(0|v\d+)\)\Z")
 _SUM = re.compile(r"\((v\d+)\+(v\d+)\)\Z")
-
-
-_FUNCTION = re.compile(r"^static int casadi_f\d+\([^{]*\{.*?^\}\n", re.MULTILINE | re.DOTALL)
-_CALL = re.compile(r"((?:  (?:arg|res)1\[\d+\]=[^;]*;\n)+)  if \(casadi_f\d+\(arg1, res1, iw, w, 0\)\) return 1;\n")
-_RESULT = re.compile(r"^  (?:res1\[\d+\]=(w\d+)|casadi_copy\(w[^,]*, \d+, (w\d+)\));\n", re.MULTILINE)
-_TAKEN = r"^  (?:if \(res\[\d+\]\) )?casadi_copy\({name}, \d+, (res\[\d+\])(\+\d+)?\);\n"
-
-
-def without_detours(text: str) -> str:
-    """Return the C text with results of calls written where they are wanted, where they would only be copied to there.
-
-    CasADi gives every argument and every result of a call a place of its own; a text in which one call has both at one place stays.
-    """
-    for call in _CALL.finditer(text):
-        places = [set(re.findall(rf"{kind}1\[\d+\]=\(?&?(w\w+)", call[1])) for kind in ("arg", "res")]
-        if places[0] & places[1]:
-            return text
-    return _FUNCTION.sub(lambda found: _at_their_place(found[0]), text)
-
-
-def _at_their_place(body: str) -> str:
-    for one in list(_RESULT.finditer(body)):
-        name = one[1] or one[2]
-        taken = re.search(_TAKEN.format(name=name), body, re.MULTILINE)
-        if taken and len(re.findall(rf"\b{name}\b", body)) == 3:  # declared, written, copied
-            place = f"{taken[1]}{taken[2] or ''}"
-            at_once = one[0].replace(f"{name};", f"{taken[1]} ? {place} : {name};")
-            if one[2]:
-                body = _undeclared(name, body)
-                at_once = f"  if ({taken[1]}) {one[0].strip().replace(f', {name})', f', {place})')}\n"
-            body = body.replace(taken[0], "").replace(one[0], at_once)
-    return body
-
-
-def _undeclared(name: str, body: str) -> str:
-    """The function without the declaration of a place, alone, first or later in its line."""
-    declared = rf"\*{name}=w\+\d+"
-    for pattern in (rf"^  casadi_real {declared};\n", rf", {declared}(?=[,;])", rf"(?<=casadi_real ){declared}, "):
-        body = re.sub(pattern, "", body, count=1, flags=re.MULTILINE)
-    return body
 
 
 def condensed(text: str) -> str:

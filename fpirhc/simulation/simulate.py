@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
@@ -32,6 +31,7 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import Native, native
+from fpirhc.symbolic.program import chained
 from fpirhc.task.problem import Problem
 
 _CHAIN = 5  # cycles of the inner chain of the virtual machine
@@ -167,13 +167,9 @@ def simulator(
     backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
     if compiled or (compiled is None and long):
         backend = native(loop.function, flags, required=bool(live), calls=moving(problem).cycles_of_call)
-    function = backend.function if backend.compiled else _chained(loop, moving(problem).cycles_interpreted)
+    interpreted = moving(problem).cycles_interpreted
+    function = backend.function if backend.compiled else chained(loop.function, interpreted, _CHAIN)
     return Simulator(problem, ready, loop, Evaluator(function), backend.compiled, backend.reason, settings)
-
-
-def _chained(loop: Composite, cycles: int) -> ca.Function:
-    """The loop over so many cycles."""
-    return loop.function.mapaccum(f"{loop.function.name()}_run", cycles, {"base": _CHAIN})
 
 
 @checked_call
@@ -298,7 +294,7 @@ def run_cycles(
         problem: of the run.
         start: first memory of the loop.
         loop: one cycle, which the log is of.
-        evaluator: of the loop over as many cycles as a call runs.
+        evaluator: of the loop over as many cycles as a call runs, see `chained`.
         tables: disturbances and the sensors' random series, one row per cycle, in whole chunks.
         talk: what passes between the loop and a plant outside after every call.
         progress: called with (cycles done, cycles in all).
@@ -310,9 +306,9 @@ def run_cycles(
     cycles, trace, dropped, padded = problem.cycles, loop.trace, Dropped(loop), _padded(problem, patches)
     count = evaluator.results[1].size // trace.size  # a call
     log, ranges = np.empty((padded, trace.size)), talk.ranges(trace)
-    memory, *read = evaluator.arguments
+    memory, *read, run = evaluator.arguments
     windows = [(argument.reshape(count, -1), table) for argument, table in zip(read, tables, strict=False)]
-    ends, sent = evaluator.results[0].reshape(count, start.size), evaluator.results[2:]
+    after, sent = evaluator.results[0], evaluator.results[2:]
     memory[:] = start
     talk.begin(read[len(tables) :])
     for at, end in _pieces(cycles, count, [cycle for cycle, _, _ in patches]):
@@ -321,6 +317,7 @@ def run_cycles(
                 memory[places] = values
         for argument, table in windows:
             argument[:] = table[at : at + count]
+        run[:] = end - at
         evaluator.redirect(1, log[at : at + count])
         why = evaluator.failure()
         if why:
@@ -334,7 +331,7 @@ def run_cycles(
         if outside is not None:
             row, what = outside
             return log[: at + row].copy(), stopped(problem, at + row, what)
-        memory[:] = ends[end - at - 1]
+        memory[:] = after
         ended = talk.after(end - 1, sent)
         if ended and end < cycles:
             return log[:end].copy(), stopped(problem, end, ended[0]) + ended[1]

@@ -17,13 +17,10 @@ from functools import cache
 
 import casadi as ca
 
-from fpirhc.errors import NotSupported
-from fpirhc.symbolic.expression import FINITE, TINY, Expression, graph
+from fpirhc.symbolic.expression import FINITE, TINY, Expression, graph, kind
 from fpirhc.symbolic.latest import Latest
 
 SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
-_FUNCTION = re.compile(r"^/\*[^\n]*\*/\nstatic int (casadi_f\d+)\([^\n]*\{\n.*?^\}\n", re.MULTILINE | re.DOTALL)
-_CALL = re.compile(r"\bcasadi_f\d+\b")
 # Large leaves are compiled without much optimising; the loops around them never are. The loops use wider registers than the
 # leaves: with registers allocated across calls GCC forgets to clear their upper halves, and every leaf then runs at half speed.
 _FAST = """#if defined(__GNUC__) && !defined(__clang__)
@@ -39,14 +36,6 @@ _LARGE_OR_SMALL = re.compile(r"(?<![\w.])\d\.\d{16}e[+-](?:[3-9]\d|\d{3})\b")
 _drivers: dict[str, str] = {}
 _rooms: dict[str, int] = {}
 _LATEST: Latest[ca.Function] = Latest(16)
-_BODY = re.compile(
-    r"(?:^/\* (\w+):\([^\n]*\*/\n)?^static int (casadi_f\d+)\([^\n]*\) \{\n(.*?)^\}$", re.MULTILINE | re.DOTALL
-)
-_OWN = re.compile(r"(?<=[ *])(w\d+)=w\+(\d+)(?=[,;])")
-_CALLED = re.compile(r"\b(casadi_f\d+|\w+_driver)\([^;\n]*, w, (?:0|mem)\)")
-_USE = re.compile(r"\bw\b")
-_EXPORTED = re.compile(r"^CASADI_SYMBOL_EXPORT int (\w+)_work\(.*?\*sz_w = (\d+)", re.MULTILINE | re.DOTALL)
-_SIZE = re.compile(r"(\*sz_w = )(\d+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +58,8 @@ class Driver:
     def source(self) -> str:
         """Return the whole C file, in which the entry is called ENTRY."""
         generator = ca.CodeGenerator("fpirhc_leaves", {"with_header": False, "with_mem": False})
-        renamed = [_renamed(leaf, f"fpirhc_leaf_{name}") for name, leaf in self.leaves.items()]
-        for leaf in renamed:
+        named = [renamed(leaf, f"fpirhc_leaf_{name}") for name, leaf in self.leaves.items()]
+        for leaf in named:
             generator.add(leaf)
         lines = [f"#define {name} {value}" for name, value in self.constants.items()]
         lines += [f"#define {name} fpirhc_leaf_{name}" for name in self.leaves]
@@ -129,156 +118,26 @@ def _multiple(number: re.Match[str]) -> str:
     return number[0]
 
 
-def substitute(source: str) -> tuple[str, list[str]]:
-    """Return generated C with the bodies of Functions that have a driver replaced, and the drivers' own C files."""
-    files = []
-    for name in dict.fromkeys(re.findall(r"^/\* (fpirhc_\w+):\(", source, re.MULTILINE)):
-        if name not in _drivers:
-            continue
-        body = re.compile(
-            rf"(^/\* {name}:\([^\n]*\*/\nstatic int \w+\([^\n]*\) \{{\n).*?^\}}$", re.MULTILINE | re.DOTALL
-        )
-        entry = f"{name}_driver"
-        source, count = body.subn(rf"\1  return {entry}(arg, res, iw, w, mem);\n}}", source)
-        if count:
-            declaration = f"int {entry}{SIGNATURE};\n"
-            source = source.replace(f"/* {name}:(", f"{declaration}/* {name}:(", 1)
-            files.append(f"#define ENTRY {entry}\n{_drivers[name]}")
-    return (_without_unused(source) if files else source), files
+def is_driver(name: str) -> bool:
+    """Whether a Function of this name has a driver as its body."""
+    return name in _drivers
 
 
-def _without_unused(source: str) -> str:
-    """Drop the static functions that nothing calls any more: a compiler would read and then discard them."""
-    definitions = {m[1]: m[0] for m in _FUNCTION.finditer(source)}
-    rest = re.sub(r"^#define .*$", "", _FUNCTION.sub("", source), flags=re.MULTILINE)
-    called, waiting = set[str](), [rest]
-    while waiting:
-        for name in set(_CALL.findall(waiting.pop())) & definitions.keys() - called:
-            called.add(name)
-            waiting.append(definitions[name].partition("{")[2])
-    for name in definitions.keys() - called:
-        source = source.replace(definitions[name], "")
-    return source
+def entry_of(name: str) -> tuple[str, int]:
+    """Return the name of the C function of a driver, and the numbers that it needs in w."""
+    return f"{name}_driver", _rooms[f"{name}_driver"]
 
 
-def _renamed(leaf: ca.Function, name: str) -> ca.Function:
-    inputs = [ca.SX.sym(f"i{k}", leaf.sparsity_in(k)) for k in range(leaf.n_in())]
-    results = leaf.call(inputs)
-    return ca.Function(name, inputs, results)
+def file_of(name: str) -> str:
+    """Return the C file of a driver."""
+    return f"#define ENTRY {name}_driver\n{_drivers[name]}"
 
 
-@dataclass(frozen=True)
-class _Body:
-    """One generated function: its text, its name, its callees, and where its own values begin and end, None if unknown."""
-
-    name: str
-    text: str
-    callees: tuple[str, ...]
-    begin: int | None
-    end: int | None
-    plain: bool  # only calls use the begin of w
-
-
-def with_less_work(source: str, sizes: Mapping[str, int], functions: Mapping[str, ca.Function]) -> str:
-    """Return a program with the same results and a shorter work vector.
-
-    CasADi gives every Function of a program one work vector w: its callees get w from its begin, and its own values stand behind
-    what the largest callee needs. A driver needs another number of them than the graph that it replaces. So its callers' own
-    values move, mostly down, and the program needs less. CasADi also keeps room for values that its C only points to: a Function
-    ends behind the last value that its text has. A Function is changed only where its text shows that nothing but calls uses the
-    begin of w.
-
-    Args:
-        source: generated C, in which calls of drivers stand in place of bodies.
-        sizes: of the work vectors of all Functions, by name, as CasADi made them; of Functions with the same name the largest.
-        functions: by name, without those that share a name.
-
-    Raises:
-        NotSupported: a driver has more numbers than the graph that it replaces, and its callers cannot make room for them.
-    """
-    exported = _EXPORTED.search(source)
-    if exported is None:
-        return source
-    sizes = {**sizes, exported[1]: int(exported[2])}
-    bodies = {m[2]: _body(m[1] or "", m[3], functions.get(m[1] or "")) for m in _BODY.finditer(source)}
-    needs = dict[str, int | None]()
-    for key in bodies:
-        _need(key, bodies, sizes, needs)
-    top = [key for key, body in bodies.items() if body.name == exported[1]]
-    if len(top) != 1 or any(need is None for need in needs.values()):
-        raise NotSupported("the work of its loops cannot be laid out")
-    source = _BODY.sub(lambda m: m[0].replace(m[3], _moved(bodies[m[2]], needs)), source)
-    return _SIZE.sub(lambda m: f"{m[1]}{needs[top[0]]}", source)
-
-
-def _body(name: str, text: str, function: ca.Function | None) -> _Body:
-    own = [int(m[2]) for m in _OWN.finditer(text)]
-    callees = tuple(m[1] for m in _CALLED.finditer(text))
-    plain = not _USE.search(_CALLED.sub("", _OWN.sub("", text)))
-    return _Body(name, text, callees, min(own) if own else None, _end(text, function), plain)
-
-
-def _end(text: str, function: ca.Function | None) -> int | None:
-    """Where the last own value of a function ends, None where it is not known.
-
-    The value w12 is place 12 of the Function's work. The lengths of all places must explain where every value begins.
-    """
-    if function is None or not function.is_a("MXFunction"):
-        return None
-    begins = {int(m[1][1:]): int(m[2]) for m in _OWN.finditer(text)}
-    places = sorted(begins, key=begins.__getitem__)
-    lengths = _lengths(function)
-    if not places or any(lengths.get(place) is None for place in places):
-        return None
-    ends = [begins[place] + int(lengths[place] or 0) for place in places]
-    return ends[-1] if all(end == begins[k] for end, k in zip(ends, places[1:], strict=False)) else None
-
-
-def _lengths(function: ca.Function) -> dict[int, int | None]:
-    """Length of every place of a Function's work; None where its uses disagree."""
-    lengths = dict[int, int | None]()
-    for k in range(function.n_instructions()):
-        if function.instruction_id(k) == ca.OP_OUTPUT:  # its number is that of a result
-            continue
-        places, made = list(function.instruction_output(k)), function.instruction_MX(k)
-        for j, place in enumerate(places):
-            if made.is_call():  # a call itself has no length
-                length = int(made.which_function().nnz_out(j))
-            else:
-                length = int(made.nnz() if len(places) == 1 else made.get_output(j).nnz())
-            lengths[place] = length if lengths.get(place, length) == length else None
-    return lengths
-
-
-def _need(key: str, bodies: Mapping[str, _Body], sizes: Mapping[str, int], needs: dict[str, int | None]) -> int | None:
-    """What a function needs after the move; None where that is not known."""
-    if key not in bodies:
-        return _rooms.get(key, 0) if key.endswith("_driver") else None
-    if key not in needs:
-        body = bodies[key]
-        inner = [_need(callee, bodies, sizes, needs) for callee in body.callees]
-        below = None if None in inner else max((n for n in inner if n is not None), default=0)
-        if below is None:
-            needs[key] = None
-        elif not body.plain:  # it stays as it is, and CasADi's begin of its own values must be behind its callees
-            begin, size = body.begin, sizes.get(body.name)
-            fits = size is not None and below <= (size if begin is None else begin)
-            needs[key] = size if fits else None
-        elif body.begin is None:
-            needs[key] = below
-        else:
-            size = body.end if body.end is not None else sizes.get(body.name)
-            needs[key] = None if size is None else size - (body.begin - below)
-    return needs[key]
-
-
-def _moved(body: _Body, needs: Mapping[str, int | None]) -> str:
-    """The text with the function's own values directly behind what its callees need."""
-    if body.begin is None or not body.plain:
-        return body.text
-    below = max((needs.get(callee) or 0 for callee in body.callees), default=0)
-    shift = body.begin - below
-    return _OWN.sub(lambda m: f"{m[1]}=w+{int(m[2]) - shift}", body.text)
+def renamed(function: ca.Function, name: str) -> ca.Function:
+    """Return a Function under another name; scalar code stays scalar code."""
+    matrix = kind(not function.is_a("SXFunction"))
+    inputs = [matrix.sym(f"i{k}", function.sparsity_in(k)) for k in range(function.n_in())]
+    return ca.Function(name, inputs, function.call(inputs))
 
 
 _TEXT = f"""

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import os
 import platform
-import re
 import shutil
 import stat
 import subprocess
@@ -26,8 +24,8 @@ from pathlib import Path
 import casadi as ca
 
 from fpirhc.errors import CompileError, NotSupported
-from fpirhc.symbolic import driver
-from fpirhc.symbolic.driver import of_type, substitute, with_less_work
+from fpirhc.symbolic import driver, flat_code, program
+from fpirhc.symbolic.program import NAME, generate
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
 # -z defs: a missing symbol must fail here and not end the process at the first call.
@@ -36,7 +34,6 @@ _LINK = ("-shared", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
 _ALIGNED = ("-falign-functions=64", "-falign-loops=64")
 _FLAGS = (*_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC")
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
-_NAME = "fpirhc_native"  # stands for the exported name, which is made of the key
 _loaded: dict[str, ca.Function] = {}
 
 
@@ -89,8 +86,7 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
         function: to compile.
         flags: for the compiler, after its usual ones.
         required: whether a failure of the compiler is an error; without a compiler `function` is returned as it is all the same.
-        calls: number of calls that the compiled Function makes, `mapaccum`; 0: it is `function` itself. The chain is built only
-            where its library is not in the cache.
+        calls: number of calls in a row that the compiled Function makes, see `program.chained`; 0: it is `function` itself.
 
     Raises:
         CompileError: `required`, and the compiler failed.
@@ -104,44 +100,13 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
         note = _note(function, compiler, flags, calls)
         known = _noted(note) if note else None
         if known is None:
-            whole = function.mapaccum(f"{function.name()}_run", calls) if calls else function
-            key, known = _library(generate(whole), compiler, flags)
+            key, known = _library(generate(function, calls), compiler, flags)
             _remember(note, key)
         return Native(known, True, "")
     except (NotSupported, CompileError) as error:
         if required and isinstance(error, CompileError):
             raise
         return Native(function, False, str(error))
-
-
-def generate(function: ca.Function) -> tuple[str, ...]:
-    """Return the C files of `function`: its own under a fixed name, and the files of the drivers that it calls.
-
-    Raises:
-        NotSupported: a part of it cannot be written as C.
-    """
-    if any(f.is_a("External") for f in function.find_functions()):
-        raise NotSupported("it calls a Function that is already compiled; compile the whole instead")
-    inputs = [ca.MX.sym(function.name_in(k), function.sparsity_in(k)) for k in range(function.n_in())]
-    names = (function.name_in(), function.name_out())
-    # One call wrapped under a fixed name: the name of a mapaccum is CasADi's own, and must not decide the cache key.
-    wrapped = ca.Function(_NAME, inputs, function.call(inputs, False, True), *names)
-    generator = ca.CodeGenerator(_NAME, {"with_header": False})
-    try:
-        # CasADi warns on stderr of parts that it cannot write. The source holds the same text, and the caller announces it once.
-        with contextlib.redirect_stderr(io.StringIO()):
-            generator.add(wrapped)
-            source = str(generator.dump())
-    except RuntimeError as error:
-        raise NotSupported(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
-    _check_self_contained(source)
-    source, drivers = substitute(of_type(source))
-    if drivers:
-        ordered = sorted(wrapped.find_functions(), key=lambda f: f.sz_w())
-        called = [f.name() for f in ordered]
-        alone = {f.name(): f for f in (*ordered, wrapped) if called.count(f.name()) <= 1}
-        source = with_less_work(source, {f.name(): int(f.sz_w()) for f in ordered}, alone)
-    return source, *drivers
 
 
 def cache_folder() -> Path:
@@ -176,16 +141,6 @@ def _why_no_compiler() -> str:
     if setting:
         return f"the C compiler '{setting}', asked for by FPIRHC_CC, was not found"
     return "no C compiler was found (looked for CC, cc, gcc, clang)"
-
-
-def _check_self_contained(source: str) -> None:
-    unsupported = re.search(r"^\s*#error (?:Code generation not supported for )?(\w+)", source, re.MULTILINE)
-    if unsupported:
-        raise NotSupported(f"it calls '{unsupported[1]}', which CasADi cannot write as C")
-    # It is not tried even where the header is installed: its library would have to be found and linked too.
-    header = re.search(r"^#include <(.+/.+)>", source, re.MULTILINE)
-    if header:
-        raise NotSupported(f"it calls a solver that cannot be written as C: its own library is needed ({header[1]})")
 
 
 @cache
@@ -267,7 +222,7 @@ def _note(function: ca.Function, compiler: str, more: Sequence[str], calls: int)
 @cache
 def _writer() -> str:
     """Hash of the code that writes C."""
-    files = (Path(__file__), Path(driver.__file__))
+    files = (Path(__file__), *(Path(module.__file__ or "") for module in (driver, flat_code, program)))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -310,7 +265,7 @@ def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) ->
     if key not in _loaded:
         path = cache_folder() / f"{key}{_suffix()}"
         name = f"fpirhc_{key}"
-        named = _Unit(own.source.replace(_NAME, name), own.command)
+        named = _Unit(own.source.replace(NAME, name), own.command)
         _loaded[key] = _load(path, name, [named, *drivers], link)
     return key, _loaded[key]
 

@@ -23,7 +23,7 @@ from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.tuning.tune import tune
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.live import live_number
-from fpirhc.symbolic.native import generate
+from fpirhc.symbolic.program import generate
 
 TASK = load_problem("two_mass")
 PROBLEM = replace(TASK.problem, duration=0.3, measure_from=0.0)

@@ -22,8 +22,8 @@ from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import judge
 from fpirhc.optimisers.plain import call_symbols, first_anchor
 from fpirhc.optimisers.search import Search
-from fpirhc.symbolic.driver import substitute
-from fpirhc.symbolic.native import find_compiler, generate, native
+from fpirhc.symbolic.native import find_compiler, native
+from fpirhc.symbolic.program import generate
 
 PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
 HORIZON = fp.Horizon(stages=12, step=0.05)
@@ -226,7 +226,7 @@ def test_driver_and_composed_graph_agree(iterations, high):
     graph = optimiser.step(ocp)
     sources = generate(graph)
     assert len(sources) == 2, "the driver stands in a file of its own"
-    assert "_driver(arg, res, iw, w, mem)" in sources[0]
+    assert "_driver(arg1, res1, iw, w, 0)" in sources[0]
     compiled = native(graph)
     assert compiled.compiled
     bounds = np.array([-high]), np.array([high])
@@ -251,11 +251,6 @@ def test_converging_driver_and_graph_stop_together():
     np.testing.assert_allclose(results[0][0], results[1][0], atol=1e-6)
     fixed = replace(optimiser, iterations=int(results[0][1].ravel()[3]))
     np.testing.assert_allclose(fixed.step(ocp)(*arguments)[0].full(), results[0][0], atol=1e-9)
-
-
-def test_functions_without_a_driver_are_left_alone():
-    (source,) = generate(ca.Function("fpirhc_plain", [x := ca.SX.sym("x")], [ca.sin(x)]))
-    assert substitute(source) == (source, [])
 
 
 def test_gradient_newton_transition():

@@ -20,7 +20,8 @@ from fpirhc.horizon.rollout import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import judge
-from fpirhc.symbolic.native import generate, native
+from fpirhc.symbolic.native import native
+from fpirhc.symbolic.program import generate
 
 TASK: Any = fp.load_problem("two_mass")
 GRADIENT = fp.ReducedGradient(iterations=60, tolerance=1e-4)

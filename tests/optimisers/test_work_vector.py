@@ -9,17 +9,16 @@ import subprocess
 from dataclasses import replace
 from types import SimpleNamespace
 
-import casadi as ca
 import numpy as np
 import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.symbolic import driver
 from fpirhc.symbolic import native as module
-from fpirhc.symbolic.driver import compiled_plans, with_less_work
-from fpirhc.symbolic.native import find_compiler, generate, native
+from fpirhc.symbolic.driver import compiled_plans
+from fpirhc.symbolic.native import find_compiler, native
+from fpirhc.symbolic.program import generate
 
 REAL = ctypes.POINTER(ctypes.c_double)
 GUARD = -1.2345e-77
@@ -66,51 +65,6 @@ def test_a_controller_with_twenty_stages_needs_and_touches_no_more(name, most, t
         for mine, theirs in zip(results, f(*values), strict=True):
             np.testing.assert_allclose(mine, theirs.full().ravel(), rtol=1e-9, atol=1e-9)
         values[0][:] = results[0]
-
-
-def test_a_program_that_uses_the_begin_of_its_work_vector_stays_as_it_is():
-    """Only values behind calls move; a text in which something else uses the begin of w is not changed there."""
-    text = (
-        "/* inner:(i0)->(o0) */\n"
-        "static int casadi_f1(const double** arg, double** res, long* iw, double* w, int mem) {\n"
-        "  return inner_driver(arg, res, iw, w, mem);\n}\n"
-        "/* outer:(i0)->(o0) */\n"
-        "static int casadi_f0(const double** arg, double** res, long* iw, double* w, int mem) {\n"
-        "  double *w0=w+100, *w1=w+103;\n  MORE\n"
-        "  if (casadi_f1(arg, res, iw, w, 0)) return 1;\n}\n"
-        "CASADI_SYMBOL_EXPORT int outer_work(long *sz_w) {\n  if (sz_w) *sz_w = 107;\n}\n"
-    )
-    shorter = with_less_work(text, {"inner": 100, "outer": 107}, {})
-    assert "*w0=w+0, *w1=w+3;" in shorter
-    assert "*sz_w = 7;" in shorter
-    used = text.replace("MORE", "casadi_mtimes(w0, w1, w);")
-    assert with_less_work(used, {"inner": 100, "outer": 107}, {}) == used
-
-
-@pytest.mark.parametrize("name", ["two_mass", "delayed_mass"])
-def test_the_lengths_of_all_values_explain_where_they_begin(name, monkeypatch):
-    """CasADi keeps room for values that its C only points to; a Function ends where its last value does."""
-    ends = dict[str, int | None]()
-    known = driver._end
-
-    def noted(text: str, function: ca.Function | None) -> int | None:
-        end = known(text, function)
-        if function is not None and driver._OWN.search(text):
-            ends[function.name()] = end
-        return end
-
-    monkeypatch.setattr(driver, "_end", noted)
-    task = fp.load_problem(name)
-    function = fp.Stepper(task.problem, task.controllers["RHC"], compiled=False).function
-    generate(function)
-    sizes = {f.name(): f.sz_w() for f in function.find_functions()}
-    assert len(ends) > 5
-    for called, end in ends.items():
-        assert end is not None, called
-        assert end <= sizes.get(called, np.inf)
-    one = function.find_function("fpirhc_plan")
-    begins = "".join(f"*w{k}=w+{7 * k}," for k in range(3))  # no lengths of CasADi's are these
-    assert known(begins, one) is None
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")

@@ -24,6 +24,7 @@ from fpirhc.symbolic.driver import SIGNATURE, Driver, finite, with_driver
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import expression, graph
 from fpirhc.symbolic.native import find_compiler, native
+from fpirhc.symbolic.program import chained, generate
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 
@@ -56,14 +57,18 @@ def test_same_numbers_as_the_virtual_machine(cache):
 
 
 @needs_compiler
-def test_accumulated_functions_are_compiled_under_a_fixed_name(cache):
-    """Mapaccum names its results itself; the library's name does not depend on it."""
-    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+@pytest.mark.parametrize("count", [37, 5, 1])
+def test_a_chain_of_calls_is_that_of_the_virtual_machine(cache, count):
+    """Memory after so many calls, and the results of these; what is read follows call by call."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
     step = ca.Function("fpirhc_step", [x, u], [0.5 * x + u, x - u])
     many = step.mapaccum("fpirhc_many", 37)
     values = np.arange(37.0)
-    for result, expected in zip(native(many).function(1.0, values), many(1.0, values), strict=True):
-        np.testing.assert_array_equal(result.full(), expected.full())
+    expected = [one.full() for one in many([1.0, 2.0], values)]
+    for chain in (native(step, calls=37).function, chained(step, 37, 5)):
+        after, shown = (one.full() for one in chain([1.0, 2.0], values, count))
+        np.testing.assert_array_equal(after[:, 0], expected[0][:, count - 1])
+        np.testing.assert_array_equal(shown[:, :count], expected[1][:, :count])
 
 
 @needs_compiler
@@ -115,11 +120,10 @@ def test_a_library_is_found_without_writing_c(cache, monkeypatch):
     """By a note of the same Function, compiler, flags and writer of C; whatever differs writes C, and its own library is found."""
     native(model(2.0))
     written: list[ca.Function] = []
-    generate = module.generate
 
-    def noticed(function):
+    def noticed(function, calls):
         written.append(function)
-        return generate(function)
+        return generate(function, calls)
 
     monkeypatch.setattr(module, "generate", noticed)
 
@@ -149,13 +153,13 @@ def test_calls_in_a_chain_have_a_library_of_their_own(cache, monkeypatch):
     """It hands on what is remembered; another number of calls has another library, which is found without the chain."""
     x = np.linspace(-1.0, 1.0, 3)
     for calls in (4, 5, 5):
-        expected = model(0.5).mapaccum("chain", calls)(x)
-        np.testing.assert_array_equal(native(model(0.5), calls=calls).function(x).full(), expected.full())
+        expected = model(0.5).mapaccum("chain", calls)(x)[:, -1]
+        np.testing.assert_array_equal(native(model(0.5), calls=calls).function(x, calls).full(), expected.full())
     np.testing.assert_array_equal(native(model(0.5)).function(x).full(), model(0.5)(x).full())
     assert len(_libraries(cache)) == 3
     monkeypatch.setattr(module, "_loaded", {})
-    monkeypatch.setattr(module, "generate", lambda _: pytest.fail("its C was written again"))
-    np.testing.assert_array_equal(native(model(0.5), calls=5).function(x).full(), expected.full())
+    monkeypatch.setattr(module, "generate", lambda *_: pytest.fail("its C was written again"))
+    np.testing.assert_array_equal(native(model(0.5), calls=5).function(x, 5).full(), expected.full())
 
 
 @needs_compiler
@@ -179,7 +183,7 @@ def test_a_wrong_note_finds_nothing(cache, monkeypatch, damage):
 @pytest.mark.parametrize("damage", [b"", b"not a library", None])
 def test_damaged_library_is_built_again(cache, damage):
     """Truncated, overwritten, or with a lost checksum: the answer is right and the cache is whole again."""
-    sources = module.generate(model(4.0))
+    sources = generate(model(4.0))
     compiler = find_compiler()
     assert compiler is not None
     module._library(sources, compiler)
@@ -465,7 +469,7 @@ def test_generated_code_has_no_number_that_a_float_cannot_hold(name):
     if name == "limits":
         problem = replace(problem, limits=replace(problem.limits, states={"q1": (1.85, 2.35)}))
     single = np.finfo(np.float32)
-    for text in module.generate(fp.Stepper(problem, controller, compiled=False).function):
+    for text in generate(fp.Stepper(problem, controller, compiled=False).function):
         numbers = re.findall(r"(?<![\w.])\d+\.?\d*(?:e[+-]?\d+)?", re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL))
         assert "FINITE" in text
         assert not [n for n in numbers if float(n) and not single.tiny <= float(n) <= single.max]
@@ -479,7 +483,7 @@ def test_a_column_is_finite_in_either_type(real, tmp_path):
     column = ca.MX.sym("x", size)
     function = ca.Function("fpirhc_fine", [column], [graph(finite(expression(column), opaque=True))])
     texts = [tmp_path / f"{k}.c" for k in range(2)]
-    for path, text in zip(texts, module.generate(function), strict=True):
+    for path, text in zip(texts, generate(function), strict=True):
         path.write_text(text)
     built = str(tmp_path / "fine.so")
     command = [
@@ -510,3 +514,13 @@ def test_a_column_is_finite_in_either_type(real, tmp_path):
             values = good.copy()
             values[k] = bad
             assert fine(values) == 0, (k, bad)
+
+
+@needs_compiler
+def test_scalar_functions_of_one_name_are_two(cache):
+    """A composed Function may call several that CasADi would export under the same name."""
+    x = ca.MX.sym("x", 3)
+    both = ca.Function("fpirhc_both", [x], [model(2.0)(x), model(3.0)(x + model(2.0)(x))])
+    at = np.array([0.3, -0.7, 2.0])
+    for one, other in zip(native(both, required=True).function(at), both(at), strict=True):
+        np.testing.assert_array_equal(one.full(), other.full())

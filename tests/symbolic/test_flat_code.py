@@ -1,0 +1,101 @@
+"""Composed Functions as flat C: every way of taking apart and putting together gives the numbers of the virtual machine."""
+
+from __future__ import annotations
+
+import re
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from fpirhc.symbolic.dataflow import call_sites
+from fpirhc.symbolic.native import find_compiler, native
+from fpirhc.symbolic.program import generate
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+MX = ca.MX
+SCALAR = ca.SX.sym("s", 3)
+LEAF = ca.Function("fpirhc_leaf", [SCALAR], [ca.sin(SCALAR) + SCALAR[::-1], ca.sumsqr(SCALAR)])
+
+
+def inner(name: str, times: float) -> ca.Function:
+    x, y = MX.sym("x", 3), MX.sym("y", 4)
+    first, total = LEAF(times * x)
+    return ca.Function(name, [x, y], [ca.vertcat(y[1:3], first), ca.vertcat(total, y)])
+
+
+def moved(x, y, c):
+    """Splits, joins, selections, repetitions and reshapes."""
+    a, b = ca.vertsplit(x, [0, 1, 3])
+    y = MX(y)
+    y[1:3] = b
+    table = ca.horzcat(ca.reshape(y, 2, 2), ca.repmat(b, 1, 3))
+    return [ca.vertcat(b, a, y[[3, 0, 2]], c), ca.vec(table)[::3], ca.vec(table[:, 1:3]), ca.vertcat(x, y)[1:6]]
+
+
+def computed(x, y, c):
+    """Operations, with one number for all entries, written into each other or read twice."""
+    z = ca.vertcat(x, c) * y - 2
+    kept = ca.if_else(c > 0, ca.vertcat(x, c), y)
+    worst = ca.mmax(ca.fabs(z)) - ca.mmin(z)
+    return [kept + z, worst, ca.logic_not(z > 0) / ca.fmax(y * y, 0.1), -z + ca.norm_inf(x), 1 / (3 + ca.fabs(x))]
+
+
+def called(x, y, c):
+    """Calls in one and in several places, and results that nobody reads."""
+    once, many = inner("fpirhc_once", 1.0), inner("fpirhc_many", 2.0)
+    p, q = once(x, y)
+    r, _ = many(p[2:5], q[1:5])
+    u, v = many(r[:3], ca.vertcat(c, r[1:4]))
+    return [ca.vertcat(u, q), v, LEAF(u[1:4])[1]]
+
+
+def chosen(x, y, c):
+    """Choices of computed, of given and of constant values."""
+    yes, no = inner("fpirhc_yes", 3.0), inner("fpirhc_no", 4.0)
+    p, q = ca.Function.if_else("fpirhc_choice", yes, no)(c > 0, x, y)
+    m = ca.if_else(c > 1, ca.vertcat(y, y), ca.DM(np.arange(8.0)), True)
+    return [p, ca.vertcat(q[2:4], m[3:6]), m[4:7] * x, c + ca.if_else(c < 0, c * x[0], 5, True)]
+
+
+def mapped(x, y, c):
+    """Loops over columns, some of them the same for all."""
+    table = ca.horzcat(x, 2 * x, x - c)
+    s, t = LEAF.map(3)(table)
+    same, _ = inner("fpirhc_wide", 1.0).map(2)(ca.repmat(x, 1, 2), ca.horzcat(y, y[::-1]))
+    return [s, t, ca.vec(same)]
+
+
+@needs_compiler
+@pytest.mark.parametrize("graph", [moved, computed, called, chosen, mapped])
+@pytest.mark.parametrize("number", [2.0, 0.5, -1.0])
+def test_flat_code_has_the_bits_of_the_virtual_machine(graph, number):
+    symbols = MX.sym("x", 3), MX.sym("y", 4), MX.sym("c")
+    function = ca.Function(f"fpirhc_{graph.__name__}", [*symbols], graph(*symbols))
+    compiled = native(function, required=True)
+    assert compiled.compiled
+    assert "casadi_copy(w" not in generate(function)[0]
+    values = np.array([0.3, -1.7, 2.0]), np.array([1.0, -0.0, 3.0, 0.5]), number
+    for one, other in zip(compiled.function(*values), function(*values), strict=True):
+        np.testing.assert_array_equal(one.full(), other.full())
+
+
+@needs_compiler
+def test_an_operation_that_is_not_known_is_left_to_casadi():
+    """Only the block that has it."""
+    x, a = MX.sym("x", 2), MX.sym("a", 2, 2)
+    product = ca.Function("fpirhc_product", [a, x], [ca.mtimes(a, x)])
+    whole = ca.Function("fpirhc_whole", [a, x], [ca.vertcat(x, product(a, x + 1) * 2)])
+    text = generate(whole)[0]
+    assert re.search(r"/\* fpirhc_product:.*casadi_mtimes", text, re.DOTALL)
+    assert "/* fpirhc_whole */" in text
+    values = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([0.5, -0.3])
+    np.testing.assert_array_equal(native(whole, required=True).function(*values).full(), whole(*values).full())
+
+
+def test_what_is_called_in_one_place_is_no_function_of_its_own():
+    symbols = MX.sym("x", 3), MX.sym("y", 4), MX.sym("c")
+    function = ca.Function("fpirhc_called", [*symbols], called(*symbols))
+    assert sorted(call_sites(function).values()) == [1, 2, 3]
+    names = re.findall(r"^/\* (fpirhc_\w+) \*/$", generate(function)[0], re.MULTILINE)
+    assert names == ["fpirhc_many", "fpirhc_called"]
