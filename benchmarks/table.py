@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from fpirhc.studies.comparison.compare import versions
+from fpirhc.studies.view import versions
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "performance.md"
 

@@ -10,14 +10,15 @@ from pathlib import Path
 from fpirhc.baselines.bands import Expected, expected
 from fpirhc.baselines.baseline import Baseline, Settings, fingerprint, settings_of, to_text
 from fpirhc.baselines.judging import Judgement, judge
-from fpirhc.baselines.measuring import REFUSED, Job, Progress, measure_all, names_by_source, nominal, variants
+from fpirhc.baselines.measuring import REFUSED, Job, measure_all, names_by_source, nominal, variants
 from fpirhc.baselines.places import baseline_path, check_inside
 from fpirhc.baselines.reading import read_baseline, read_text
 from fpirhc.errors import BaselineError, FpirhcError, InvalidValue, OutputError
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task, load_problem
-from fpirhc.studies.comparison.compare import select, versions
+from fpirhc.studies.comparison.compare import select
+from fpirhc.studies.view import Progress, versions
 from fpirhc.whole_file import write_whole
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,12 +20,12 @@ from fpirhc.simulation.metrics import known_metrics, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import run_tables, simulate
 from fpirhc.studies.open_loop import solve_first
+from fpirhc.studies.view import Progress
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.task.problem import Problem
 
 FINISHED, DIVERGED, REFUSED = "finished", "diverged", "refused"
 Number = float | str
-Progress = Callable[[str, int, int], None]
 
 _CONVERGED = 1e-8  # of the input's range: tolerance of open-loop plans
 

@@ -29,8 +29,8 @@ from fpirhc.summary import Column, Table, printable
 if TYPE_CHECKING:
     from fpirhc.simulation.metrics import Metrics
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Progress as Report
     from fpirhc.studies.open_loop import Solved
+    from fpirhc.studies.view import Progress as Report
     from fpirhc.studies.view import View
 
 STYLES = {

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from fpirhc.controllers.contract import Controller, believing
-from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -26,9 +25,9 @@ from fpirhc.sensing.sensing import Sensor
 from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.studies.comparison.compare import check_gains, select, versions
+from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.scenarios.bench import ranges, relative_error
-from fpirhc.studies.view import View
+from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number
 from fpirhc.symbolic.queue import MOST
 from fpirhc.task.disturbance import Noise
@@ -44,8 +43,6 @@ _ROOMS = (
     512,
 )  # cycles of latency for which loops are built; C of the long queue takes longer to compile than to do without
 _LOOPS = 20  # cycles that the longest period leaves to a run
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,43 +113,26 @@ class OperatingLimit:
         return number(self.fails) if math.isfinite(self.fails) else f"> {number(self.holds)}"
 
 
-@dataclass(frozen=True, eq=False)
-class OperatingLimits:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OperatingLimits(Study):
     """The result of `operating_limits`.
 
     Args:
-        problem: name of the problem.
-        title: its title.
-        description: its description.
         fails: relative error from which a run has failed.
         seed: of noise and lost samples.
         quantities: what grew.
         limits: one per controller and quantity that could be tried.
         untried: reasons why not, by controller and quantity.
-        settings: settings of the problem and the controllers.
-        versions: versions of fpirhc and of what its numbers depend on.
-        command: the command line.
-        elapsed: wall time, s.
     """
 
-    problem: str
-    title: str
-    description: str
     fails: float
     seed: int
     quantities: tuple[Quantity, ...]
     limits: tuple[OperatingLimit, ...]
     untried: Mapping[tuple[str, str], str]
-    settings: Mapping[str, Any]
-    versions: Mapping[str, str]
-    command: str
-    elapsed: float
 
     def __repr__(self) -> str:
         return line(self, self.problem, *(f"{one.controller}: {one.quantity.name} {one.text}" for one in self.limits))
-
-    def _repr_html_(self) -> str:
-        return self.view.html()
 
     def of(self, controller: str, quantity: str) -> OperatingLimit:
         """Return one limit.
@@ -232,18 +212,12 @@ def operating_limits(
         if progress:
             progress(name, len(quantities), len(quantities))
     return OperatingLimits(
-        problem=task.name,
-        title=task.title,
-        description=task.description,
         fails=fails,
         seed=seed,
         quantities=quantities,
         limits=tuple(limits),
         untried=untried,
-        settings={"problem": describe(task.problem), **{n: describe(c) for n, c in chosen.items()}},
-        versions=versions(),
-        command=command,
-        elapsed=time.perf_counter() - begin,
+        **circumstances(task, chosen, command, begin),
     )
 
 
@@ -517,18 +491,11 @@ def _view(found: OperatingLimits) -> View:
         untried.setdefault(f"{what}: {why}", []).append(name)
     everyone = {name for name, _ in found.untried} | set(controllers)
     lacking = [text if set(names) == everyone else f"{', '.join(names)}, {text}" for text, names in untried.items()]
-    return View(
-        title=found.title,
-        about=found.description,
+    return found.viewed(
         sentences=[(text, None) for text in _sentences(found)],
         conditions=conditions,
         tables=(table,),
-        lists={name: texts for name, texts in (("What failed", reasons), ("Not tried", lacking)) if texts},
-        skipped={},
-        settings=found.settings,
-        versions=found.versions,
-        command=found.command,
-        elapsed=found.elapsed,
+        lists={"What failed": reasons, "Not tried": lacking},
         facts=_facts(found),
     )
 

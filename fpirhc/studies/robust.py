@@ -9,30 +9,26 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
 from fpirhc.controllers.contract import Controller, believing
-from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.studies.comparison.compare import check_gains, select, versions
+from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.operating_limits import FAILS, Judge, Point
 from fpirhc.studies.scenarios.draws import SEARCHING
-from fpirhc.studies.view import View
+from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number
 
 RISK, CONFIDENCE = 0.05, 0.999  # where nothing else is said
 _BOXES = 99  # of 1 % to 99 %
 _FIRST = 8  # percent: the first box that is tried
 _GENERATION = 20  # plants of a search side by side, at most
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -73,14 +69,11 @@ class RobustBox:
     counterexample: Counterexample | None
 
 
-@dataclass(frozen=True, eq=False)
-class RobustBoxes:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RobustBoxes(Study):
     """The result of `robust_boxes`.
 
     Args:
-        problem: name of the problem.
-        title: its title.
-        description: its description.
         risk: largest share of failing plants in a box that holds.
         confidence: with which that is said.
         draws: plants that are drawn from a box.
@@ -88,15 +81,8 @@ class RobustBoxes:
         seed: of the draws.
         boxes: by controller, in their order.
         untried: reasons why controllers did not run, by name.
-        settings: settings of the problem and the controllers.
-        versions: versions of fpirhc and of what its numbers depend on.
-        command: the command line.
-        elapsed: wall time, s.
     """
 
-    problem: str
-    title: str
-    description: str
     risk: float
     confidence: float
     draws: int
@@ -104,16 +90,9 @@ class RobustBoxes:
     seed: int
     boxes: tuple[RobustBox, ...]
     untried: Mapping[str, str]
-    settings: Mapping[str, Any]
-    versions: Mapping[str, str]
-    command: str
-    elapsed: float
 
     def __repr__(self) -> str:
         return line(self, self.problem, *(f"{one.controller}: {_percent(one.percent)}" for one in self.boxes))
-
-    def _repr_html_(self) -> str:
-        return self.view.html()
 
     @property
     def view(self) -> View:
@@ -178,9 +157,6 @@ def robust_boxes(
         except FpirhcError as error:
             untried[name] = str(error)
     return RobustBoxes(
-        problem=task.name,
-        title=task.title,
-        description=task.description,
         risk=risk,
         confidence=confidence,
         draws=draws,
@@ -188,10 +164,7 @@ def robust_boxes(
         seed=seed,
         boxes=tuple(boxes),
         untried=untried,
-        settings={"problem": describe(task.problem), **{n: describe(c) for n, c in chosen.items()}},
-        versions=versions(),
-        command=command,
-        elapsed=time.perf_counter() - begin,
+        **circumstances(task, chosen, command, begin),
     )
 
 
@@ -358,18 +331,12 @@ def _view(found: RobustBoxes) -> View:
         errors = (_error(one.worst_drawn), _error(one.worst_found))
         table.add([one.controller, _percent(one.percent), _percent(one.fails_at), *errors, example])
     examples = [f"{one.controller}: {_plant(one.counterexample)}" for one in found.boxes if one.counterexample]
-    return View(
-        title=found.title,
-        about=found.description,
+    return found.viewed(
         sentences=[(text, None) for text in _sentences(found)],
         conditions=conditions,
         tables=(table,),
-        lists={"Plants of the boxes that fail": examples} if examples else {},
+        lists={"Plants of the boxes that fail": examples},
         skipped=found.untried,
-        settings=found.settings,
-        versions=found.versions,
-        command=found.command,
-        elapsed=found.elapsed,
         facts={
             **{name: getattr(found, name) for name in ("problem", "risk", "confidence", "draws", "fails", "seed")},
             "boxes": [asdict(one) for one in found.boxes],

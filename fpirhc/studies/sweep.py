@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,12 +23,12 @@ from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
-from fpirhc.studies.comparison.compare import check_gains, select, versions
+from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
-from fpirhc.studies.view import View
+from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number
 from fpirhc.symbolic.paths import names_in
 from fpirhc.task.cases import Cases
@@ -42,8 +42,6 @@ _MOST = 2  # settings of a map
 _LOG = "log"
 _FORM = "PATH=LOW:HIGH:COUNT, or PATH=LOW:HIGH:COUNT:log"
 _OF_PARAMETERS = "exact", "approximate", "known"
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -138,44 +136,27 @@ class SweepMap:
         return float((self.outcomes != "finished").mean())
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sweep(Study):
     """The result of `sweep`.
 
     Args:
-        problem: name of the problem.
-        title: its title.
-        description: its description.
         axes: one setting or two.
         maps: one per controller.
         aim: the figure that is judged.
         seed: of the noise, the same in all cells.
-        settings: settings of the problem and the controllers.
-        versions: versions of fpirhc and of what its numbers depend on.
-        command: the command line.
-        elapsed: wall time, s.
     """
 
-    problem: str
-    title: str
-    description: str
     axes: tuple[Axis, ...]
     maps: tuple[SweepMap, ...]
     aim: Objective
     seed: int
-    settings: Mapping[str, Any]
-    versions: Mapping[str, str]
-    command: str
-    elapsed: float
 
     def __repr__(self) -> str:
         names = " x ".join(f"{len(axis.values)} {axis.path}" for axis in self.axes)
         return line(
             self, self.problem, names, *(f"{one.controller}: {in_percent(one.failed)} failed" for one in self.maps)
         )
-
-    def _repr_html_(self) -> str:
-        return self.view.html()
 
     def of(self, controller: str) -> SweepMap:
         """Return the map of a controller.
@@ -270,19 +251,7 @@ def sweep(
     header = {**fingerprint(task, conditions), "axes": describe(axes), "metric": aim.name}
     with Ledger(folder / LEDGER, header, CellFields) as ledger:
         maps = tuple(_Runner(task, name, grid, conditions, aim, ledger).map(progress) for name in chosen)
-    return Sweep(
-        problem=task.name,
-        title=task.title,
-        description=task.description,
-        axes=axes,
-        maps=maps,
-        aim=aim,
-        seed=seed,
-        settings={"problem": describe(task.problem), **{n: describe(c) for n, c in chosen.items()}},
-        versions=versions(),
-        command=command,
-        elapsed=time.perf_counter() - begin,
-    )
+    return Sweep(axes=axes, maps=maps, aim=aim, seed=seed, **circumstances(task, chosen, command, begin))
 
 
 # --- The grid ------------------------------------------------------------------------------------------------------------
@@ -523,18 +492,11 @@ def _view(found: Sweep) -> View:
         if one.without
     ]
     lists = {"Why runs failed": reasons, "How it was run": [*built, *same]}
-    return View(
-        title=found.title,
-        about=found.description,
+    return found.viewed(
         sentences=[(text, None) for text in _sentences(found)],
         conditions=conditions,
         tables=(table,),
-        lists={name: texts for name, texts in lists.items() if texts},
-        skipped={},
-        settings=found.settings,
-        versions=found.versions,
-        command=found.command,
-        elapsed=found.elapsed,
+        lists=lists,
         facts=_facts(found),
     )
 

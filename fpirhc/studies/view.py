@@ -1,15 +1,25 @@
-"""The view of a study: everything that page, terminal, notebook and JSON say of it, each laying it out in its way."""
+"""What every study has: its circumstances, and a view that page, terminal, notebook and JSON lay out, each in its way."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
 
+from fpirhc.describe import describe
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import Table, in_percent
+
+if TYPE_CHECKING:
+    from fpirhc.controllers.base import Controller
+    from fpirhc.problem_files.problem_file import Task
+
+Progress = Callable[[str, int, int], None]  # of (controller, what is done, what there is in all)
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,13 +32,13 @@ class View:
         sentences: the verdict, with the outcome that each sentence states; None for a remark.
         conditions: what the numbers of the first table are measured on.
         tables: its tables, the controllers first; those without rows are not shown.
-        lists: sentences by the heading under which a page has them.
-        skipped: reasons why controllers did not run, by name.
         settings: settings of the problem and of every controller, by name.
         versions: versions of fpirhc and of what its numbers depend on.
         command: the command that reproduces it; '' where there is none.
         elapsed: wall time, s.
         facts: what the JSON object holds.
+        lists: sentences by the heading under which a page has them.
+        skipped: reasons why controllers did not run, by name.
     """
 
     title: str
@@ -36,18 +46,97 @@ class View:
     sentences: Sequence[tuple[str, Outcome | None]]
     conditions: str
     tables: Sequence[Table]
-    lists: Mapping[str, Sequence[str]]
-    skipped: Mapping[str, str]
     settings: Mapping[str, Any]
     versions: Mapping[str, str]
     command: str
     elapsed: float
     facts: Mapping[str, Any] = field(repr=False)
+    lists: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    skipped: Mapping[str, str] = field(default_factory=dict)
 
     def html(self) -> str:
         """Return the verdict and the first table for a notebook."""
         notes = [*(text for text, _ in self.sentences), *(text for texts in self.lists.values() for text in texts)]
         return replace(self.tables[0].narrow, title=self.title).html(notes)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Study(ABC):
+    """The result of a study.
+
+    Args:
+        problem: name of the problem.
+        title: its title.
+        description: its description.
+        settings: settings of the problem and the controllers.
+        versions: versions of fpirhc and of what its numbers depend on.
+        command: the command line.
+        elapsed: wall time, s.
+    """
+
+    problem: str
+    title: str
+    description: str
+    settings: Mapping[str, Any]
+    versions: Mapping[str, str]
+    command: str
+    elapsed: float
+
+    @property
+    @abstractmethod
+    def view(self) -> View:
+        """What every output says of it."""
+
+    def viewed(
+        self,
+        sentences: Sequence[tuple[str, Outcome | None]],
+        conditions: str,
+        tables: Sequence[Table],
+        facts: Mapping[str, Any],
+        *,
+        lists: Mapping[str, Sequence[str]] | None = None,
+        skipped: Mapping[str, str] | None = None,
+    ) -> View:
+        """Return the view of these sentences, tables, lists and facts under the study's circumstances, see `View`."""
+        return View(
+            self.title,
+            self.description,
+            sentences,
+            conditions,
+            tables,
+            self.settings,
+            self.versions,
+            self.command,
+            self.elapsed,
+            facts,
+            {heading: texts for heading, texts in (lists or {}).items() if texts},
+            skipped or {},
+        )
+
+    def _repr_html_(self) -> str:
+        """Verdict and first table, for notebooks."""
+        return self.view.html()
+
+
+def circumstances(task: Task, controllers: Mapping[str, Controller], command: str, begin: float) -> dict[str, Any]:
+    """Return the fields of a `Study` that has run these controllers of a task since `begin`, on the performance counter."""
+    return {
+        "problem": task.name,
+        "title": task.title,
+        "description": task.description,
+        "settings": {"problem": describe(task.problem), **{n: describe(c) for n, c in controllers.items()}},
+        "versions": versions(),
+        "command": command,
+        "elapsed": time.perf_counter() - begin,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of fpirhc and of what its numbers depend on."""
+    import platform
+
+    packages = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy")}
+    return {**packages, "python": platform.python_version(), "machine": platform.machine()}
 
 
 def to_json(facts: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ from fpirhc.cli.verb import ExitCode, Verb
 if TYPE_CHECKING:
     from fpirhc.controllers.base import Controller
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Progress
+    from fpirhc.studies.view import Progress
     from fpirhc.task.problem import Problem
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from typing import cast
 
 from fpirhc.broken import attempted
@@ -43,9 +42,8 @@ from fpirhc.studies.comparison.pairwise import Built, beside_each_other, null_te
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.studies.tuning.objective import objective
+from fpirhc.studies.view import Progress, circumstances
 from fpirhc.task.problem import Problem
-
-Progress = Callable[[str, int, int], None]
 
 
 def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
@@ -123,19 +121,15 @@ def compare(
     judged = judge(entries)
     pairs = list(dict.fromkeys(finding.pair for finding in judged if finding.pair))
     nulls = null_tests(task.problem, pairs, [*entries, *alone], built, sizes, seed=seed, broken=broken)
+    facts = circumstances(task, {}, command, begin)
+    facts["settings"] |= {e.name: {k: v for k, v in e.run.settings.items() if k != "problem"} for e in entries}
     return Comparison(
-        problem=task.name,
-        title=task.title,
-        description=task.description,
+        **facts,
         seed=seed,
         measure_from=task.problem.measure_from,
         entries=tuple(_advised(task, entries, judged[0], nulls)),
         skipped=skipped,
         findings=judged,
-        command=command,
-        versions=versions(),
-        settings=describe(task.problem),
-        elapsed=time.perf_counter() - begin,
         pictures=task.pictures,
         nulls=nulls,
         time_unit=task.problem.time_unit,
@@ -169,14 +163,6 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     mistakes.raise_if_any()
-
-
-def versions() -> dict[str, str]:
-    """Versions of fpirhc and of what its numbers depend on."""
-    import platform
-
-    packages = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy")}
-    return {**packages, "python": platform.python_version(), "machine": platform.machine()}
 
 
 def _entries(

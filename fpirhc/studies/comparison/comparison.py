@@ -16,29 +16,22 @@ from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import gap
 from fpirhc.studies.comparison.outcome import Finding, Outcome
-from fpirhc.studies.view import View, status_shares
+from fpirhc.studies.view import Study, View, status_shares
 from fpirhc.summary import Column, Table, line, numbers_written_out, written_out
 
 _SOLVES = "solve."  # metrics of plans, which have a table of their own
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison(FoundByName):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison(Study, FoundByName):
     """The result of `compare`.
 
     Args:
-        problem: name of the problem.
-        title: its title.
-        description: its description.
         seed: of the disturbances and the noise.
         measure_from: time from which errors count.
         entries: the controllers that ran, in order.
         skipped: reasons why controllers were skipped, by name.
         findings: the verdict, sentence by sentence with outcomes; the headline pair is first.
-        command: the command line.
-        versions: versions of fpirhc and of what its numbers depend on.
-        settings: settings of the problem.
-        elapsed: wall time of the comparison, s.
         pictures: pictures of the problem for the report.
         nulls: what adaptation does where there is nothing to adapt, for every pair.
         time_unit: unit of time of the problem.
@@ -46,18 +39,11 @@ class Comparison(FoundByName):
         information: what the controllers are given, what each uses, and when each acts, in sentences.
     """
 
-    problem: str
-    title: str
-    description: str
     seed: int
     measure_from: float
     entries: tuple[Entry, ...]
     skipped: Mapping[str, str]
     findings: tuple[Finding, ...]
-    command: str
-    versions: Mapping[str, str]
-    settings: Mapping[str, Any]
-    elapsed: float
     pictures: tuple[Picture, ...] = ()
     nulls: tuple[NullTest, ...] = ()
     time_unit: str = "s"
@@ -90,13 +76,8 @@ class Comparison(FoundByName):
         counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
         return line(self, self.problem, f"seed {self.seed}", counts, self.verdict[0])
 
-    def _repr_html_(self) -> str:
-        """Verdict and errors as a table, for notebooks."""
-        return self.view.html()
-
     @property
     def view(self) -> View:
-        """What every output says of it."""
         return _view(self)
 
     def __getitem__(self, name: str) -> Entry:
@@ -113,11 +94,8 @@ def _view(comparison: Comparison) -> View:
     entries = comparison.entries
     ended = [f"{e.name} ended early: {e.run.stop}" for e in entries if e.run.stop]
     notes = [f"{e.name}: {note}" for e in entries for note in e.notes]
-    own = {e.name: {k: v for k, v in e.run.settings.items() if k != "problem"} for e in entries}
     since, marked = _since(comparison), _marked(comparison)
-    return View(
-        title=comparison.title,
-        about=comparison.description,
+    return comparison.viewed(
         sentences=comparison.sentences,
         conditions=f"Errors, effort and cost from t = {since} on; seed {comparison.seed}. Marked are the best of: {marked}.",
         tables=(_controllers(comparison), _plans(comparison)),
@@ -130,10 +108,6 @@ def _view(comparison: Comparison) -> View:
             )
         },
         skipped=comparison.skipped,
-        settings={"problem": comparison.settings, **own},
-        versions=comparison.versions,
-        command=comparison.command,
-        elapsed=comparison.elapsed,
         facts=_facts(comparison),
     )
 

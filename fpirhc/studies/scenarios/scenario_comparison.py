@@ -14,7 +14,7 @@ from fpirhc.simulation.metrics.measuring import Column as Number
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.scenarios.paired import Record, Summary, noun
 from fpirhc.studies.tuning.objective import Objective
-from fpirhc.studies.view import View, status_shares
+from fpirhc.studies.view import Study, View, status_shares
 from fpirhc.summary import Column, Table, line, written_out
 
 _ERRORS = "Errors are rms errors divided by the range of the reference, root mean square over the judged coordinates. "
@@ -27,14 +27,11 @@ _MEANING = (
 _UNTUNED = "No file of tuned settings was given: all settings are those of the problem file."
 
 
-@dataclass(frozen=True, eq=False)
-class ScenarioComparison(FoundByName):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScenarioComparison(Study, FoundByName):
     """The result of `compare_scenarios`.
 
     Args:
-        problem: name of the problem.
-        title: its title.
-        description: its description.
         count: number of scenarios.
         named: whether they are cases of the problem file.
         figure: by which controllers are compared.
@@ -48,17 +45,10 @@ class ScenarioComparison(FoundByName):
         skipped: reasons why controllers were not run, by name.
         verdict: the verdict in sentences.
         tuning: sentences about the origin of tuned settings, by controller.
-        settings: settings of the problem and the controllers.
-        versions: versions of fpirhc and of what its numbers depend on.
-        command: the command line.
-        elapsed: wall time of the study, s.
         time_unit: unit of time of the problem.
         pictures: those of the problem file; they are drawn where they keep something of every run.
     """
 
-    problem: str
-    title: str
-    description: str
     count: int
     percent: float
     seed: int
@@ -69,10 +59,6 @@ class ScenarioComparison(FoundByName):
     skipped: Mapping[str, str]
     verdict: tuple[str, ...]
     tuning: Mapping[str, str]
-    settings: Mapping[str, Any]
-    versions: Mapping[str, str]
-    command: str
-    elapsed: float
     time_unit: str = "s"
     named: bool = False
     figure: Objective = field(default_factory=Objective)
@@ -83,13 +69,8 @@ class ScenarioComparison(FoundByName):
         counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"
         return line(self, self.problem, *counts, self.verdict[0])
 
-    def _repr_html_(self) -> str:
-        """Verdict and errors as a table, for notebooks."""
-        return self.view.html()
-
     @property
     def view(self) -> View:
-        """What every output says of it."""
         return _view(self)
 
     def __getitem__(self, name: str) -> Summary:
@@ -109,18 +90,12 @@ def _view(comparison: ScenarioComparison) -> View:
     outcomes = [
         one.outcome for one in comparison.summaries[1:]
     ]  # the first sentences are about the rivals, in their order
-    return View(
-        title=comparison.title,
-        about=comparison.description,
+    return comparison.viewed(
         sentences=tuple(zip_longest(comparison.verdict, outcomes)),
         conditions=f"{conditions} {'' if comparison.figure.metric else _ERRORS}{_MEANING} {'' if comparison.tuning else _UNTUNED}",
         tables=(_controllers(comparison, conditions), _groups(comparison)),
         lists={"Tuning": [f"{name}: {note}" for name, note in comparison.tuning.items()]},
         skipped=comparison.skipped,
-        settings=comparison.settings,
-        versions=comparison.versions,
-        command=comparison.command,
-        elapsed=comparison.elapsed,
         facts=_facts(comparison),
     )
 

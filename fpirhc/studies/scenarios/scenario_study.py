@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -19,7 +18,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
 from fpirhc.simulation.metrics.measuring import Column
-from fpirhc.studies.comparison.compare import check_gains, select, versions
+from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint, scenario_numbers
 from fpirhc.studies.scenarios.cluster import Cluster
 from fpirhc.studies.scenarios.draws import COMPARING
@@ -29,9 +28,9 @@ from fpirhc.studies.scenarios.processes import Workers
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import with_tuned
+from fpirhc.studies.view import Progress, circumstances
 
 LEDGER = "scenarios.jsonl"
-Progress = Callable[[str, int, int], None]
 
 
 @checked_call
@@ -105,9 +104,6 @@ def compare_scenarios(
         records, skipped = _completed(ledger, bench, workers, numbers, names, progress)
     summaries = _summaries(records, seed, task.metrics, figure)
     return ScenarioComparison(
-        problem=task.name,
-        title=task.title,
-        description=task.description,
         count=len(numbers),
         named=conditions.named,
         figure=figure,
@@ -122,10 +118,7 @@ def compare_scenarios(
         skipped=skipped,
         verdict=verdict(summaries, skipped, noun(conditions.named), figure),
         tuning={n: note for n, note in (tuning or {}).items() if n in names},
-        settings={"problem": describe(task.problem), **{n: describe(task.controllers[n]) for n in names}},
-        versions=versions(),
-        command=command,
-        elapsed=time.perf_counter() - begin,
+        **circumstances(task, select(task, names), command, begin),
         pictures=task.pictures,
     )
 

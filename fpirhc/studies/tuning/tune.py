@@ -6,7 +6,7 @@ Theory: docs/theory-questions.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -27,11 +27,11 @@ from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import as_python
+from fpirhc.studies.view import Progress
 from fpirhc.symbolic.paths import content_at, paths_to
 
 LEDGER = "trials.jsonl"
 _PRESENT = -1  # number of the trial of the settings as they are, which no budget counts
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
