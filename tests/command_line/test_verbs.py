@@ -22,6 +22,7 @@ from fpirhc.cli.discovery import shipped
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import OF_EVERY_VERB, ExitCode
 from fpirhc.probing.probe import Probe, probe
+from fpirhc.probing.rule import Rule
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
@@ -489,9 +490,10 @@ def test_journey_of_probe(folder, capsys, monkeypatch):
     assert len(found) == 2
 
 
-def test_review_asks_the_plant_as_estimated(folder, capsys):
+def test_review_asks_the_plant_as_estimated(folder, capsys, monkeypatch):
     """A plant outside has no equations: after a probe its inverse, poles and margins are answered as those of the estimate."""
     del folder
+    monkeypatch.setattr(Rule, "shortlist", lambda _: {})  # a review of the plant needs no choice of a deformation
     Path("outside.py").write_text(OUTSIDE)
     answers = []
     for words in ([], ["--probe"]):
