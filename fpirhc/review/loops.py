@@ -143,6 +143,10 @@ class Points:
             self._ideals[place] = self.asked.at(quiet)
         return self._ideals[place]
 
+    def noisy(self, place: int, kept: np.ndarray) -> LinearLoop:
+        """Return the linear loop at a point behind the noise of the sensors, see `AskedLoop.noisy`."""
+        return self.asked.noisy(self.quiet(place), kept)
+
     def quiet(self, place: int, draw: int = 0) -> np.ndarray:
         """Return the memory at a point, with the parameters of a draw."""
         if (place, draw) not in self._quiets:

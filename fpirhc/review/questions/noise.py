@@ -1,4 +1,4 @@
-"""What does the noise of measured responses do? The chatter of the commands, and the gain and filter that it asks for.
+"""What does the noise of sensors do? The chatter of the commands, and the gain and filter that it asks for.
 
 The pair is that of `suggest`: the largest gain with which noise alone moves no input by more than its budget per cycle. The
 budget is 1 % of the range between the limits of an input. Where no input has limits it is the chatter of the deformation in use,
@@ -11,34 +11,59 @@ import math
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.loops import points_of, thinned
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.suggest import chatter_of, within_budget
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 CHATTER = "Is the chatter from measured responses small?"
 SMALL = 0.01  # of the range between an input's limits
+_POINTS = 3  # of the reference, whose loops are asked
+_DRAWN = 20_000
+_WHITE = 0.03  # correlation of a drawn series with itself one cycle later, below which it is white
 
 
-def chatter_small(grid: ReviewGrid, controller: Controller) -> Answer | None:
-    """Return the rms steps of the commands that noise causes; None without white noise on a response, or where it is late."""
-    problem, deformation = grid.problem, controller.deformation
-    if problem.sensing.ideal or problem.response_delay > 0 or not deformation.iteration.constant:
+def chatter_small(case: Case) -> Answer | None:
+    """Return the rms steps of the commands that noise causes in the whole loop, by its discrete Lyapunov equation.
+
+    None without noise, for maps and models that change on line, and where a linear loop does not converge.
+    """
+    problem, deformation = case.problem, case.controller.deformation
+    loops = _noisy_loops(case) if deformation.iteration.constant or not deformation.adapts else None
+    if loops is None:
         return None
-    try:
-        steps = chatter_of(grid, controller, deformation.effective_gain(), deformation.iteration.error_pole)
-    except FpirhcError:
-        return None
+    rms = np.max([one.steps(covariance) for one, covariance in loops], axis=0)
+    steps = dict(zip(problem.plant.inputs, map(float, rms), strict=True))
     lower, upper = problem.limits.input_bounds(problem.plant)
-    share = float(np.max(np.array(list(steps.values())) / (upper - lower)))
+    share = float(np.max(rms / (upper - lower)))
     text = "rms step per cycle from noise: " + ", ".join(f"{i} {v:.3g}" for i, v in steps.items())
     numbers = {f"step_{i}": v for i, v in steps.items()} | {"share_of_limits": share}
     if share < SMALL:
         return Answer(CHATTER, Verdict.YES, text, "", numbers)
     change = "fp.suggest(problem, controller, chatter=...) gives the gain and the filter for a smaller one."
+    if not deformation.adapts:
+        change = "Lower the rate, weigh the change of the inputs, or estimate more slowly."
+    elif problem.response_delay > 0:
+        change = "Lower the gain, filter its error (Filtered), or estimate more slowly."
     return Answer(CHATTER, Verdict.UNKNOWN, text, change, numbers)
+
+
+def _noisy_loops(case: Case) -> list[tuple[LinearLoop, np.ndarray]] | None:
+    """Linear loops behind the sensors' noise, each with the covariance of what drives it; None where one does not converge."""
+    noises = [one.noise for one in case.problem.sensing.sensors.values() if one.noise is not None]
+    if not noises or not case.loops.loops or case.loops.radii.max() >= 1 or case.loops.learns:
+        return None
+    times, random = case.problem.period * np.arange(_DRAWN), np.random.default_rng(0)
+    series = np.array([one.values(times, random) for one in noises])
+    points, variances = points_of(case.grid, case.controller), series.var(axis=1)
+    kept = np.mean(series[:, 1:] * series[:, :-1], axis=1) / np.maximum(variances, 1e-300)
+    kept = np.where(np.abs(kept) < _WHITE, 0.0, kept)
+    loops = [points.noisy(k, kept) for k in thinned(case.loops.places, _POINTS)]
+    if any(np.abs(one.poles).max(initial=0.0) >= 1 for one in loops):
+        return None
+    return [(one, np.diag(variances * (1 - kept**2))) for one in loops]
 
 
 NOISE_PAIR = "Are gain and filter those that the sensors' noise asks for?"
@@ -85,6 +110,6 @@ def _budget(case: Case) -> dict[str, float]:
 
 
 QUESTIONS = (
-    ControllerQuestion(lambda case: chatter_small(case.grid, case.controller), CHATTER, order=12),
+    ControllerQuestion(chatter_small, CHATTER, order=12, adaptive=False),
     ControllerQuestion(suits_noise, NOISE_PAIR, order=70),
 )

@@ -1,6 +1,6 @@
 """A closed loop that is asked: it runs from a point of its task, and is linearised at points along this run.
 
-The step is the one that simulates, with disturbances and noise left out and sensors without their quantum. Both parameter sets are
+The step is the one that simulates, with disturbances and noise at zero and sensors without their quantum. Both parameter sets are
 part of its memory, so other plants and other models need no other build.
 """
 
@@ -21,7 +21,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NoAnswer, NotSupported
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 from fpirhc.simulation.linearise.linear_map import GAIN
-from fpirhc.simulation.linearise.slopes import Directions, Step, along, reached
+from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
@@ -67,7 +67,7 @@ class AskedLoop:
         self.problem, self.controller = _calm(problem), resolved(problem, controller)
         with any_gain(), compiled_plans():  # one that a run refuses has poles too
             self.loop: Composite = close_loop(self.problem, self.controller)
-        self._step = Step(self.loop)
+        self._step = Step(self.loop, self.loop.reads.names[0])  # the disturbances of all inputs
         names = self.loop.trace.names
         self._command = self.loop.trace.slice("command")
         self._arriving = self.loop.trace.slice("arriving" if "arriving" in names else "command")
@@ -76,7 +76,6 @@ class AskedLoop:
         self._request = [k for k, c in enumerate(self.loop.memory.columns) if "_deformed_last." in c]
         self._phases = [k for k, c in enumerate(self.loop.memory.columns) if c.endswith("_phase")]
         self._gains = [k for k, c in enumerate(self.loop.memory.columns) if c.split(".")[-1] == GAIN]
-        self._inputs = len(self.problem.plant.inputs)
         self._known: dict[bytes, list[Directions]] = {}  # of the points of `at`
 
     @property
@@ -219,6 +218,30 @@ class AskedLoop:
         """Return the linear loop of the period that begins at a memory."""
         return self._among([self._period(memory)])[0]
 
+    def noisy(self, memory: np.ndarray, kept: np.ndarray) -> LinearLoop:
+        """Return the linear loop behind the noise of the sensors, n+ = c n + w, with the commands that are sent for v.
+
+        Args:
+            memory: at which it is linearised.
+            kept: c, shape (noises,); zero for white noise.
+
+        Raises:
+            NotSupported: no sensor has noise.
+        """
+        if self._noise is None:
+            raise NotSupported("no sensor has noise")
+        period = self._period(memory)
+        ways = [[self._noise.way(at, self._scales(period[0]))] for at in period]
+        directions = self._directions(ways, self._noise.width, None)
+        plain = self._linear(directions, 0, self._scales(period[0])[self._places], self._command)
+        return plain.with_noise([at.kicked[0][1][self._command] for at in directions], kept)
+
+    @cached_property
+    def _noise(self) -> Step | None:
+        """The step with the random series of the sensors for w."""
+        drawn = self.problem.sensing.drawn
+        return Step(self.loop, drawn[0].name) if drawn else None
+
     def between(self, memory: np.ndarray, gains: tuple[float, float], *, held: bool = False) -> tuple[LinearLoop, ...]:
         """Return the linear loops of two gains of a `LinearMap` in the same coordinates.
 
@@ -237,23 +260,28 @@ class AskedLoop:
         """The linear loops along several periods, in the same coordinates."""
         scales, names = self._scales(periods[0][0]), [b"".join(map(bytes, period)) for period in periods]
         ways = [[self._step.way(at, scales) for at in together] for together in zip(*periods, strict=True)]
-        places = np.arange(self._state.start, self._state.stop)
-        if self.quick:
-            directions = [along(some, np.eye(len(scales))[:, self._free], self._inputs) for some in ways]
-        else:
-            with np.errstate(invalid="ignore", over="ignore"):  # a loop that runs away is infinite on both sides
-                directions = reached(ways, self._free, places, self._inputs, self._known.get(names[-1]))
+        directions = self._directions(ways, self._step.width, self._known.get(names[-1]))
         if len(periods) == 1:
             self._known[names[0]] = directions
-        return tuple(self._linear(directions, k, scales[places]) for k in range(len(periods)))
+        return tuple(self._linear(directions, k, scales[self._places], self._arriving) for k in range(len(periods)))
 
-    def _linear(self, directions: list[Directions], number: int, scales: np.ndarray) -> LinearLoop:
-        """The linear loop of one of the ways of every cycle."""
+    @property
+    def _places(self) -> np.ndarray:
+        """Places of the plant's state."""
+        return np.arange(self._state.start, self._state.stop)
+
+    def _directions(self, ways: list[list[Way]], width: int, begun: list[Directions] | None) -> list[Directions]:
+        if self.quick:
+            return [along(some, np.eye(self._free.size)[:, self._free], width) for some in ways]
+        with np.errstate(invalid="ignore", over="ignore"):  # a loop that runs away is infinite on both sides
+            return reached(ways, self._free, self._places, width, begun)
+
+    def _linear(self, directions: list[Directions], number: int, scales: np.ndarray, sent: slice) -> LinearLoop:
+        """The linear loop of one of the ways of every cycle, and the commands in one place of the trace."""
         cycles = []
         for at, later in zip(directions, [*directions[1:], directions[0]], strict=True):
-            state, arriving = at.basis[self._state] * scales[:, None], at.traces[number][self._arriving]
-            onto = later.basis.T
-            cycles.append(LinearCycle(onto @ at.moved[number], onto @ at.kicked[number], arriving, state))
+            state, onto, kicked = at.basis[self._state] * scales[:, None], later.basis.T, at.kicked[number][0]
+            cycles.append(LinearCycle(onto @ at.moved[number], onto @ kicked, at.traces[number][sent], state))
         first = directions[0]
         placed = (first.basis[self._state] / scales[:, None]).T
         return LinearLoop(tuple(cycles), first.traces[number][self._errors], placed, self.problem.period)
@@ -342,8 +370,8 @@ def _started(problem: Problem, state: Mapping[str, float] | None, before: Mappin
 
 
 def _calm(problem: Problem) -> Problem:
-    """The problem without disturbances and noise, and with an entry for signals at its inputs."""
-    sensors = {n: replace(s, noise=None, quantum=None, dropout=0.0) for n, s in problem.sensing.sensors.items()}
+    """The problem without disturbances and lost samples, and with an entry for signals at its inputs."""
+    sensors = {n: replace(s, quantum=None, dropout=0.0) for n, s in problem.sensing.sensors.items()}
     keys = problem.disturbable[: len(problem.plant.inputs)]
     still = {key: Jump(at=0.0, size=0.0) for key in keys}
     return replace(problem, disturbances=still, sensing=replace(problem.sensing, sensors=sensors))

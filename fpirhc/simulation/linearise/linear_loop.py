@@ -79,6 +79,22 @@ class LinearLoop:
         )
         return (neutral & no_error) | (lasting & nothing)
 
+    def with_noise(self, told: Sequence[np.ndarray], kept: np.ndarray) -> LinearLoop:
+        """Return the loop whose w is a noise n+ = c n + w, of which z remembers the present value.
+
+        Args:
+            told: of every cycle, what n adds to v at once, shape (nu, nw).
+            kept: c, shape (nw,); zero for white noise.
+        """
+        width, cycles = len(kept), []
+        for one, at_once in zip(self.cycles, told, strict=True):
+            dynamics = np.block([[one.dynamics, one.entry], [np.zeros((width, one.dynamics.shape[1])), np.diag(kept)]])
+            entry = np.vstack([np.zeros_like(one.entry), np.eye(width)])
+            state = np.pad(one.state, ((0, 0), (0, width)))
+            cycles.append(LinearCycle(dynamics, entry, np.hstack([one.arriving, at_once]), state))
+        errors, placed = np.pad(self.errors, ((0, 0), (0, width))), np.pad(self.placed, ((0, width), (0, 0)))
+        return LinearLoop(tuple(cycles), errors, placed, self.period)
+
     def delayed(self, inputs: Sequence[int], cycles: int) -> LinearLoop:
         """Return the loop some of whose commands arrive later by so many cycles, or earlier where the number is negative.
 
@@ -134,7 +150,7 @@ class LinearLoop:
         return np.stack([whole[k, k + 1 : k + 1 + cycles] for k in range(count)])
 
     def spread(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the covariance (n, n) of z at the first cycle where w is white noise with a covariance (nu, nu) in every cycle.
+        """Return the covariance (n, n) of z at the first cycle where w is white noise with a covariance (nw, nw) in every cycle.
 
         It solves P = F P F' + Q over a period, where Q is what the noise of its cycles adds up to.
         """
@@ -144,6 +160,19 @@ class LinearLoop:
         for one in self.cycles:
             added = one.dynamics @ added @ one.dynamics.T + one.entry @ covariance @ one.entry.T
         return np.asarray(solve_discrete_lyapunov(self.dynamics, added))
+
+    def steps(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the rms (nu,) of v_k+1 - v_k = (C F - C) z_k + C G w_k over a period, where w is white noise with a covariance.
+
+        The loop is stable; the covariance has the shape (nw, nw).
+        """
+        spread, squares = self.spread(covariance), np.zeros(len(self.cycles[0].arriving))
+        for one, later in zip(self.cycles, (*self.cycles[1:], self.cycles[0]), strict=True):
+            moved = later.arriving @ one.dynamics - one.arriving
+            parts = (moved, spread), (later.arriving @ one.entry, covariance)
+            squares += sum(np.einsum("ij,jk,ik->i", m, s, m) for m, s in parts)
+            spread = one.dynamics @ spread @ one.dynamics.T + one.entry @ covariance @ one.entry.T
+        return np.asarray(np.sqrt(squares / len(self.cycles)))
 
     @property
     def _shown(self) -> np.ndarray:

@@ -26,17 +26,18 @@ Way: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray
 
 
 class Step:
-    """One step of a loop whose first read are the disturbances of all inputs; it works in one thread only."""
+    """One step of a loop and one of the signals w that it reads, the others at zero; it works in one thread only."""
 
-    def __init__(self, loop: Composite) -> None:
-        """Bind the Function of the loop."""
-        self.loop = loop
+    def __init__(self, loop: Composite, entering: str) -> None:
+        """Bind the Function of the loop, and the name of w."""
+        self.loop, self._entry = loop, 1 + loop.reads.names.index(entering)
+        self.width = loop.reads[entering].size
         self.scalar = bool(loop.function.is_a("SXFunction"))
         self._evaluator = Evaluator(loop.function)
         self._slopes: Evaluator | None = None
 
     def __call__(self, memory: np.ndarray, w: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return the next memory and the trace; w is added to the plant's inputs."""
+        """Return the next memory and the trace."""
         memory_next, trace = (np.empty_like(result) for result in self._evaluator.results)
         self.into(memory, w, memory_next, trace)
         return memory_next, trace
@@ -44,7 +45,7 @@ class Step:
     def into(self, memory: np.ndarray, w: np.ndarray | float, memory_next: np.ndarray, trace: np.ndarray) -> None:
         """Write the next memory and the trace into two arrays."""
         self._evaluator.arguments[0][:] = memory
-        self._evaluator.arguments[1][:] = w
+        self._evaluator.arguments[self._entry][:] = w
         self._evaluator.evaluate()
         memory_next[:], trace[:] = self._evaluator.results
 
@@ -53,11 +54,11 @@ class Step:
         if not self.scalar:
             return self._evaluated(memory, scales)
         if self._slopes is None:
-            self._slopes = Evaluator(_derivative(self.loop.function))
-        size, nu = memory.size, self._evaluator.arguments[1].size
-        slopes = self._slopes(memory, np.zeros(nu))
+            self._slopes = Evaluator(_derivative(self.loop.function, self._entry))
+        size = memory.size
+        slopes = self._slopes(memory, np.zeros(self.width))
         _finite(*slopes)
-        by_memory, by_input = (m.reshape(columns, -1).T for m, columns in zip(slopes, (size, nu), strict=True))
+        by_memory, by_input = (m.reshape(columns, -1).T for m, columns in zip(slopes, (size, self.width), strict=True))
 
         def move(deviations: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             both = by_memory @ (scales[:, None] * deviations) + by_input @ w
@@ -96,13 +97,13 @@ class Directions:
         basis: orthonormal directions (n, m) at its beginning, in scales.
         moved: by way, the next deviations (n, m).
         traces: by way, the deviations of the trace (columns, m).
-        kicked: by way, the next deviations (n, nu) after inputs alone.
+        kicked: by way, the next deviations (n, m) and the deviations of the trace (columns, m) after each w alone.
     """
 
     basis: np.ndarray
     moved: list[np.ndarray]
     traces: list[np.ndarray]
-    kicked: list[np.ndarray]
+    kicked: list[tuple[np.ndarray, np.ndarray]]
 
 
 def along(ways: Sequence[Way], basis: np.ndarray, inputs: int) -> Directions:
@@ -112,8 +113,8 @@ def along(ways: Sequence[Way], basis: np.ndarray, inputs: int) -> Directions:
     return Directions(basis, [moved for moved, _ in images], [trace for _, trace in images], kicked)
 
 
-def _kicked(way: Way, size: int, inputs: int) -> np.ndarray:
-    return way(np.zeros((size, inputs)), np.eye(inputs))[0]
+def _kicked(way: Way, size: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
+    return way(np.zeros((size, inputs)), np.eye(inputs))
 
 
 def reached(
@@ -129,7 +130,7 @@ def reached(
         ways: of the cycles of the period, one or several each.
         free: which entries may deviate, (n,).
         first: places of the plant's state.
-        inputs: number of inputs.
+        inputs: entries of w.
         begun: those of each cycle's last way alone, from which the others go on; None: none are known.
 
     Raises:
@@ -146,7 +147,7 @@ def reached(
         waiting[(place + 1) % count].extend(moved.T)
 
     for k, part in enumerate(parts):
-        for kicked in part.kicked if begun is None else part.kicked[:-1]:
+        for kicked, _ in part.kicked if begun is None else part.kicked[:-1]:
             passed(k, kicked / (np.linalg.norm(kicked * free[:, None], axis=0) + 1e-300))
         for moved in part.caught_up():
             passed(k, moved)
@@ -223,11 +224,12 @@ def _new(some: Sequence[np.ndarray], basis: np.ndarray) -> Sequence[np.ndarray]:
     return deviations[np.linalg.norm(rests, axis=1) > _NEW]
 
 
-def _derivative(function: ca.Function) -> ca.Function:
-    """Function (memory, w) -> slopes of (next memory, trace) by each."""
-    z, w = (ca.SX.sym(name, *function.size_in(k)) for k, name in enumerate(("z", "w")))
-    rest = [ca.DM.zeros(*function.size_in(k)) for k in range(2, function.n_in())]
-    results = ca.vertcat(*function(z, w, *rest))
+def _derivative(function: ca.Function, entry: int) -> ca.Function:
+    """Function (memory, w) -> slopes of (next memory, trace) by each, w being the argument with that number."""
+    z, w = ca.SX.sym("z", *function.size_in(0)), ca.SX.sym("w", *function.size_in(entry))
+    arguments = [z, *(ca.SX.zeros(*function.size_in(k)) for k in range(1, function.n_in()))]
+    arguments[entry] = w
+    results = ca.vertcat(*function(*arguments))
     return ca.Function("fpirhc_loop_slopes", [z, w], [ca.densify(ca.jacobian(results, v)) for v in (z, w)])
 
 
