@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from fpirhc.contraction.gains import predicted_factor
 from fpirhc.contraction.spectrum import Array, response_jacobians
@@ -17,8 +18,10 @@ _WINDOW = 15  # times (number of coordinates + 1): the cycles that are used; the
 _INDEPENDENT = 1e-3  # share of the size of the requests that each direction must reach, apart from the drift
 
 
-def identified_factor(deformed: Array, realised: Array, effective_gain: float) -> float:
-    """Return max|1 - a eig(J)| with J fitted to a run; NaN when the run does not excite every direction.
+def identified_factor(
+    deformed: Array, realised: Array, effective_gain: float, weights: npt.ArrayLike | None = None
+) -> float:
+    """Return max|1 - a eig(J W)| with J fitted to a run; NaN when the run does not excite every direction.
 
         realised[k+1] - realised[k] = J (deformed[k] - deformed[k-1]) + drift
 
@@ -29,6 +32,7 @@ def identified_factor(deformed: Array, realised: Array, effective_gain: float) -
         deformed: requests, shape (cycles, n).
         realised: responses, shape (cycles, n); row k is the response to the request issued in cycle k - 1.
         effective_gain: a of the deformation, dimensionless.
+        weights: W of the deformation, by rows; None: the one matrix.
 
     Raises:
         InvalidShape: the arrays differ in shape.
@@ -52,7 +56,9 @@ def identified_factor(deformed: Array, realised: Array, effective_gain: float) -
     if not smallest > _INDEPENDENT * np.linalg.norm(request_steps):
         return float("nan")
     fitted = np.linalg.lstsq(excitation, answer, rcond=None)[0].T
-    return predicted_factor(np.linalg.eigvals(fitted), effective_gain)
+    return predicted_factor(
+        np.linalg.eigvals(fitted if weights is None else fitted @ np.array(weights)), effective_gain
+    )
 
 
 def _without_trend(rows: Array) -> Array:

@@ -284,6 +284,7 @@ def with_held_deformation(
     """
     block = replace(block, waits=_waiting(plant, deformation, block))
     repeats = math.isfinite(answered) and deformation.adapts and _REQUEST in block.reads and not block.memory.names
+    repeats = repeats and deformation.iteration.weights is None  # its steps are those of one number
     lossy = _repeated(plant, deformation, block, answered) if repeats else block
     if settles:
         return replace(block, bridged=lambda: _settling(plant, deformation, lossy))

@@ -54,7 +54,7 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
     gain = deformation.effective_gain()
     if gain == 0 or not _REFUSES.get():
         return
-    spectrum = _at_start(problem)
+    spectrum = _at_start(problem, deformation)
     if spectrum is not None and sum(linear_limit(spectrum.eigenvalues)) * gain <= 0:
         raise NotContractive(assess_gain(deformation, spectrum).text)
 
@@ -71,7 +71,7 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     gain, form = deformation.effective_gain(), _form(deformation)
     if gain == 0 or not deformation.iteration.limited or not deformation.iteration.constant or not _REFUSES.get():
         return
-    spectrum = _at_start(problem)
+    spectrum = _at_start(problem, deformation)
     if spectrum is None:
         return
     late = _delayed_weights(problem, form)
@@ -190,26 +190,26 @@ def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: fl
     )
 
 
-def _at_start(problem: Problem) -> Spectrum | None:
-    """Eigenvalues of the response Jacobian at the start; None where the inverse response is singular there.
+def _at_start(problem: Problem, deformation: Deformation) -> Spectrum | None:
+    """Eigenvalues of the response Jacobian at the start, weighted; None where the inverse response is singular there.
 
     With a reality they are those of the response at the end of a cycle; None where the command has not reached it by then.
     """
-    return _SPECTRA.of((problem,), (), lambda: _spectrum(problem.of_equations))
-
-
-def _spectrum(problem: Problem) -> Spectrum | None:
-    plant, exact = problem.plant, problem.real_plant.exact[None, :]
-    real, state = problem.real_start[None, :], problem.start_state[None, :]
-    response = plant.equations.controlled_response(problem.start_state, problem.inputs_before, plant.approximate)
-    [jacobian] = jacobians_along(problem, real, state, response.full().T, plant.approximate, exact)
+    jacobian = _JACOBIANS.of((problem,), (), lambda: _jacobian(problem.of_equations))
     if not np.isfinite(jacobian).all():
         return None
-    spectrum = Spectrum(np.linalg.eigvals(jacobian))
+    spectrum = Spectrum(np.linalg.eigvals(deformation.iteration.weighted(jacobian)))
     return spectrum if np.abs(spectrum.eigenvalues).max() > _NOTHING else None
 
 
-_SPECTRA: Latest[Spectrum | None] = Latest(8)  # a search checks many gains at the same start
+def _jacobian(problem: Problem) -> np.ndarray:
+    plant, exact = problem.plant, problem.real_plant.exact[None, :]
+    real, state = problem.real_start[None, :], problem.start_state[None, :]
+    response = plant.equations.controlled_response(problem.start_state, problem.inputs_before, plant.approximate)
+    return jacobians_along(problem, real, state, response.full().T, plant.approximate, exact)[0]
+
+
+_JACOBIANS: Latest[np.ndarray] = Latest(8)  # a search checks many gains at the same start
 _CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same controllers again and again
 
 
@@ -302,13 +302,20 @@ def _of_outputs(problem: Problem, controller: Controller) -> Iterator[str]:
         )
 
 
+def _what(deformation: Deformation) -> str:
+    """What the map has one of per controlled coordinate."""
+    iteration = deformation.iteration
+    return "weights" if iteration.weights is not None and iteration.channels == len(iteration.weights) else "dead times"
+
+
 def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
     """Reasons against the form, the first one first."""
     plant, channels, mirror = problem.plant, deformation.iteration.channels, deformation.mirror
-    if channels not in (None, len(plant.controlled_names)):
+    names = plant.controlled_names
+    if channels not in (None, len(names)):
         yield (
-            f"{type(deformation).__name__}: {channels} dead times are given, but the plant has {len(plant.controlled_names)} "
-            f"controlled coordinates ({', '.join(plant.controlled_names)}); give one for each, or one number for all"
+            f"{type(deformation).__name__}: {channels} {_what(deformation)} are given, but the plant has {len(names)} "
+            f"controlled coordinates ({', '.join(names)}); give one for each, or one number for all"
         )
     if (outer := form_inside(deformation)) is not None:
         name = type(outer).__name__

@@ -3,35 +3,80 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
-from fpirhc.deformation.base import Deformation
-from fpirhc.fields.kinds import NotZero
+import casadi as ca
+import numpy as np
+
+from fpirhc.deformation.base import Deformation, Iteration
+from fpirhc.describe import as_written
+from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import NotZero, finite_number
 from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.live import nominal
 
 
 @dataclass(frozen=True)
 class Affine(Deformation):
-    """r+ = r + (A_c / 2) (f - d), exactly linear.
+    """r+ = r + (A_c / 2) W (f - d), exactly linear.
 
     It is eq. (6) of Khan, Tar and Rudas with the kernel zeta(x) = x / 2 + D, whose fixed point x* = 2 D cancels D.
 
     Args:
         gain: A_c, negative where the model has the sign of the plant's input effect right.
+        weights: W of coupled responses, by which the gain becomes a matrix: a tuple with one number per controlled coordinate, or
+            one of rows. None: the one matrix, every response corrects its own request.
+
+    Raises:
+        InvalidValue: weights that are no diagonal and no square matrix of finite numbers, or a singular one.
 
     References:
         H. Khan, J. K. Tar, I. J. Rudas, Robot. Autom. Eng. J. 3(5), 2018, DOI 10.19080/RAEJ.2018.03.555623.
     """
 
     gain: NotZero
+    weights: tuple[float, ...] | tuple[tuple[float, ...], ...] | None = field(
+        default=None, metadata={"setting": "where given"}
+    )
+
+    def __post_init__(self) -> None:
+        if self.weights is None:
+            return
+        rows = nominal(self._rows)
+        square = all(len(row) == len(rows) and all(map(finite_number, row)) for row in rows)
+        if not square or not rows or np.linalg.matrix_rank(np.array(rows)) < len(rows):
+            raise InvalidValue(
+                f"Affine(weights={self.weights!r}): expected a tuple with a finite number other than zero per controlled "
+                "coordinate, (1.0, 3.0), or the rows of a matrix that has an inverse, ((1.0, 0.2), (0.0, 3.0))"
+            )
+
+    def __repr__(self) -> str:
+        return as_written(self)
+
+    @property
+    def iteration(self) -> Iteration:
+        if self.weights is None:
+            return Iteration()
+        return Iteration(channels=len(self.weights), weights=nominal(self._rows))
+
+    @property
+    def _rows(self) -> tuple[tuple[float, ...], ...]:
+        """W by rows."""
+        given: Any = self.weights or ()
+        if given and isinstance(given[0], tuple):
+            return tuple(given)
+        return tuple(tuple(w if j == k else 0.0 for j in range(len(given))) for k, w in enumerate(given))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return r + (A_c / 2) (f - d)."""
+        """Return r + (A_c / 2) W (f - d)."""
         del memory
-        return request + 0.5 * self.gain * (response - desired), {}
+        error = response - desired
+        if self.weights is not None:
+            error = ca.vertcat(*(sum(w * error[k] for k, w in enumerate(row)) for row in self._rows))
+        return request + 0.5 * self.gain * error, {}
 
     def effective_gain(self) -> float:
         """The effective gain a = -A_c / 2."""

@@ -3,7 +3,7 @@
 A controller computes a desired response d and requests r, the deformed response, from its model; the realised response of the plant
 is f(r). A deformation is the fixed-point iteration r+ = G(r, f, d) with G(r, d, d) = r: where the response is the
 desired one the request stays, so at the fixed point the plant does what was desired although the model is wrong. To
-first order every map here is r+ = r - a (f - d) with one number a, its effective gain.
+first order every map here is r+ = r - a (f - d) with one number a, its effective gain, or r+ = r - a W (f - d).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked, former_members, replaced, unnamed_inner
@@ -136,6 +137,7 @@ class Iteration:
         reach: the setting that bounds the requests for which the gains hold; None where the gains hold for all requests.
         channels: number of controlled coordinates that the map is made for; None: any number.
         limited: whether a gain beyond the limit of the iteration is refused.
+        weights: W by rows where the gain is a matrix, r+ = r - a W (f - d); None: the one matrix.
     """
 
     constant: bool = True
@@ -146,6 +148,11 @@ class Iteration:
     reach: Reach | None = None
     channels: int | None = None
     limited: bool = True
+    weights: tuple[tuple[float, ...], ...] | None = None
+
+    def weighted(self, jacobian: np.ndarray) -> np.ndarray:
+        """Return J W for a response Jacobian J, shape (..., n, n): response errors are multiplied by I - a J W per cycle."""
+        return jacobian if self.weights is None else jacobian @ np.array(self.weights)
 
 
 class Deformation(Checked, ABC):

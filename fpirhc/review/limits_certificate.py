@@ -167,7 +167,7 @@ def _iterates(problem: Problem, ready: Controller) -> bool:
     if mirror is None or np.any(mirror.cycles) or mirror.measurement or mirror.lags:
         return False
     linear = deformation.largest_step() == np.inf and deformation.secant_gain() == deformation.effective_gain()
-    return linear and deformation.memory(names).size == len(names)
+    return linear and deformation.iteration.weights is None and deformation.memory(names).size == len(names)
 
 
 def _hard(problem: Problem) -> list[str]:

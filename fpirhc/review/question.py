@@ -64,14 +64,19 @@ class Case:
         """Parameters of the model, shape (np,)."""
         return self.controller.plant_model(self.problem).parameters(self.problem.plant)
 
+    def spectrum(self, draws: np.ndarray) -> Spectrum:
+        """Return the eigenvalues of the weighted response Jacobian along the reference, for draws of the grid.
+
+        Raises:
+            InvalidValue: none is finite.
+        """
+        return spectrum_near(self.grid, self.believed, draws, self.controller.deformation.iteration, near=False)
+
     @cached_property
     def spectra(self) -> tuple[Spectrum, Spectrum] | None:
         """Eigenvalues of the response Jacobian along the reference and over the box; None where none is finite."""
         try:
-            own, boxed = (
-                spectrum_near(self.grid, self.believed, draws, near=False)
-                for draws in (self.grid.draws[:1], self.grid.draws)
-            )
+            own, boxed = (self.spectrum(draws) for draws in (self.grid.draws[:1], self.grid.draws))
         except InvalidValue:
             return None
         return own, boxed

@@ -27,7 +27,7 @@ from fpirhc.review.question import Case
 from fpirhc.review.questions.margins import keeps_margins
 from fpirhc.review.questions.right_model import leaves_right_model_alone
 from fpirhc.review.questions.speed import fast_enough, plan_keeps_up
-from fpirhc.review.spectra import largest_product, spectrum_near
+from fpirhc.review.spectra import largest_product
 from fpirhc.task.problem import Problem
 
 MARGIN = 2.0
@@ -229,11 +229,8 @@ def recommended_for(problem: Problem, controller: Controller) -> Recommended | N
     try:
         grid = review_grid(problem, 0.0, 0)
         ready = resolved(grid.problem, controller)
-        boxed = spectrum_near(
-            grid, ready.plant_model(grid.problem).parameters(grid.problem.plant), grid.draws, near=False
-        )
         case = Case(grid, ready, NominalRuns(grid.problem))
-        return gain_advice(case, boxed, leaves_right_model_alone(case))
+        return gain_advice(case, case.spectrum(grid.draws), leaves_right_model_alone(case))
     except FpirhcError:
         return None
 

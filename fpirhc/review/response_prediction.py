@@ -192,6 +192,7 @@ def majorant(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np
     plant = nominal.problem.plant
     rows = np.tile(plant.exact if exact is None else exact, (nominal.cycles, 1))
     jacobians = response_jacobians(plant, nominal.states[:-1], nominal.desired, rows, nominal.believed)
+    jacobians = nominal.controller.deformation.iteration.weighted(jacobians)
     factors, size = np.eye(jacobians.shape[1]) - gain * jacobians, np.abs(errors.error)
     if gain == 0 or not np.isfinite(factors).all():
         return size

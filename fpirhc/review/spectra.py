@@ -14,7 +14,7 @@ import numpy as np
 from fpirhc.contraction.delayed import leaking_limit
 from fpirhc.contraction.spectrum import Spectrum, response_jacobian
 from fpirhc.controllers.check import product_limit
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, Iteration
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each
 from fpirhc.symbolic.expression import kind
@@ -24,13 +24,16 @@ _SHARES = (-0.25, 0.5, 1.0, 1.25)  # of the way from the nominal response to the
 _SAMPLES = 2000
 
 
-def eigenvalues_near(grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, *, near: bool) -> np.ndarray:
-    """Return eigenvalues of J, shape (samples, n); samples that are not finite are left out.
+def eigenvalues_near(
+    grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, iteration: Iteration, *, near: bool
+) -> np.ndarray:
+    """Return eigenvalues of J W, shape (samples, n); samples that are not finite are left out.
 
     Args:
         grid: points of the reference.
         believed: parameters of the model, shape (np,).
         draws: the first draws of the grid, shape (draws, np); as many are used as the number of samples allows.
+        iteration: of the deformation, whose W it is.
         near: whether to sample near the reference too, and not only on it at r*.
     """
     states, requests = _near(grid, believed) if near else (grid.states, grid.requests(believed))
@@ -42,17 +45,20 @@ def eigenvalues_near(grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, 
     known = (np.repeat(rows, m, axis=0), np.tile(believed, (m * len(rows), 1)))
     jacobians = each(stacked_jacobian(grid.problem.plant), points, np.tile(requests, (len(rows), 1)), *known)
     finite = jacobians[np.isfinite(jacobians).all(axis=1)]
-    # The transposed Jacobian has the same eigenvalues.
-    return np.linalg.eigvals(finite.reshape(-1, n, n)).reshape(-1, n)
+    transposed = finite.reshape(-1, n, n)  # has the same eigenvalues
+    matrices = transposed if iteration.weights is None else iteration.weighted(transposed.transpose(0, 2, 1))
+    return np.linalg.eigvals(matrices).reshape(-1, n)
 
 
-def spectrum_near(grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, *, near: bool) -> Spectrum:
+def spectrum_near(
+    grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, iteration: Iteration, *, near: bool
+) -> Spectrum:
     """Return `eigenvalues_near` as a spectrum.
 
     Raises:
         InvalidValue: none is finite.
     """
-    return Spectrum(eigenvalues_near(grid, believed, draws, near=near))
+    return Spectrum(eigenvalues_near(grid, believed, draws, iteration, near=near))
 
 
 def _near(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

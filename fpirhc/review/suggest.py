@@ -210,13 +210,14 @@ _DRAWN = 20_000
 class Noisy:
     """Points of the reference; build it with `noisy_points`.
 
-    Parameters: jacobians J (points, n, n), inverses: the model's inputs per unit of response (points, nu, n),
-    covariance (n, n) of the noise.
+    Parameters: jacobians J W (points, n, n), inverses B: the model's inputs per unit of response (points, nu, n),
+    covariance (n, n) of the noise, moved: B W, the inputs per unit of a step of the map (points, nu, n).
     """
 
     jacobians: np.ndarray
     inverses: np.ndarray
     covariance: np.ndarray
+    moved: np.ndarray
 
     def steps(self, gain: float, pole: float) -> np.ndarray:
         """Return the rms step of every input (nu,), the largest of all points.
@@ -225,7 +226,7 @@ class Noisy:
             NotContractive: gain and pole with which noise grows.
         """
         spreads = [noise_spread(j, self.covariance, gain, pole).step for j in self.jacobians]
-        covariances = [b @ s @ b.T for b, s in zip(self.inverses, spreads, strict=True)]
+        covariances = [b @ s @ b.T for b, s in zip(self.moved, spreads, strict=True)]
         return np.asarray(np.sqrt(np.max([np.diag(m) for m in covariances], axis=0)))
 
 
@@ -241,7 +242,8 @@ def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, f
     jacobians, inverses = _along_the_reference(
         grid, controller.plant_model(grid.problem).parameters(grid.problem.plant)
     )
-    return Noisy(jacobians, inverses, np.diag(_deviations(grid.problem, noise) ** 2))
+    covariance, iteration = np.diag(_deviations(grid.problem, noise) ** 2), controller.deformation.iteration
+    return Noisy(iteration.weighted(jacobians), inverses, covariance, iteration.weighted(inverses))
 
 
 def chatter_of(grid: ReviewGrid, controller: Controller, gain: float, pole: float) -> dict[str, float]:

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.deformation.base import Iteration
 from fpirhc.errors import NotSupported
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.plant import Plant
@@ -102,8 +103,8 @@ def real_loops(grid: ReviewGrid, controller: Controller) -> list[LinearLoop]:
     return [points.at(k) for k in thinned(usable(grid), _POINTS)]
 
 
-def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Extra:
-    """Return the poles of the reality that it has beyond the settled one, and its response Jacobian below them, at a point."""
+def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray, iteration: Iteration) -> Extra:
+    """Return the poles of the reality beyond the settled one, and the weighted response Jacobian below them, at a point."""
     assert grid.real is not None
     reality, model = grid.real.truth, grid.problem.plant
     plant = reality.plant
@@ -120,7 +121,7 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
     gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
     assumed = np.asarray(model.equations.input_gain(grid.states[point.place], point.command, believed).full())
-    return Extra(modes, np.linalg.eigvals(gain @ np.linalg.inv(assumed)))
+    return Extra(modes, np.linalg.eigvals(iteration.weighted(gain @ np.linalg.inv(assumed))))
 
 
 def _settling(problem: Problem, free: list[int]) -> Guided:

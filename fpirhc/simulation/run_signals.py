@@ -59,9 +59,12 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
     """
     states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
     gain, model = controller.deformation.effective_gain(), controller.plant_model(problem)
+    iteration = controller.deformation.iteration
     if problem.foreign is not None:
         shown = (
-            np.nan if problem.response_delay else identified_factor(deformed, log[:, layout.slice("realised")], gain)
+            np.nan
+            if problem.response_delay
+            else identified_factor(deformed, log[:, layout.slice("realised")], gain, iteration.weights)
         )
         return np.full(len(log), shown)
     own = model.plant
@@ -74,7 +77,8 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
     modelled = problem if own is problem.plant else replace(problem, plant=own)
 
     def jacobians(rows: np.ndarray) -> np.ndarray:
-        return jacobians_along(modelled, real[rows], states[rows], deformed[rows], believed[rows], exact[rows])
+        parameters = believed[rows], exact[rows]
+        return iteration.weighted(jacobians_along(modelled, real[rows], states[rows], deformed[rows], *parameters))
 
     return factors_along(len(log), jacobians, gain)
 

@@ -125,6 +125,8 @@ class Simulator:
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",
             "why not compiled": self.why_not_compiled,
         }
+        if controller.deformation.iteration.weights is not None:
+            facts["weights"] = [list(row) for row in controller.deformation.iteration.weights]
         if force.record:
             facts["live"] = [[time, dict(values)] for time, values in force.record]
         points = set_point_record(problem, setpoints)

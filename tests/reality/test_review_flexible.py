@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.deformation.base import Iteration
 from fpirhc.errors import InvalidProblem
 from fpirhc.review.grid import review_grid
 from fpirhc.review.questions.reality import LOOP, RESONANCE
@@ -82,7 +83,7 @@ def test_the_motor_turns_with_its_load(grid: Any) -> None:
 
 
 def test_modes_beyond_the_rigid_motor_are_those_of_shaft_and_current(grid: Any) -> None:
-    poles = np.sort_complex(extra_modes(grid, real_points(grid)[0], grid.problem.plant.approximate).poles)
+    poles = np.sort_complex(extra_modes(grid, real_points(grid)[0], grid.problem.plant.approximate, Iteration()).poles)
     every = np.linalg.eigvals(MATRIX)
     assert poles == pytest.approx(np.sort_complex(every[np.abs(every) > 100]), rel=1e-6)
 

@@ -12,6 +12,7 @@ import reviewed
 from test_reality import lagged, slow_sensor, task
 
 import fpirhc as fp
+from fpirhc.deformation.base import Iteration
 from fpirhc.report.html import chart_data
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
@@ -124,7 +125,7 @@ def test_loop_question_agrees_with_runs():
 def test_slow_sensor_is_a_lag():
     """The pole of the sensor is what the reality has beyond its settled self; the settled gain is that of the plant."""
     grid = review_grid(task(reality=fp.Reality(slow_sensor(0.01), seen={"y": "s"})), 0.0, 0)
-    modes = extra_modes(grid, real_points(grid)[0], grid.problem.plant.approximate)
+    modes = extra_modes(grid, real_points(grid)[0], grid.problem.plant.approximate, Iteration())
     assert modes.poles == pytest.approx([-100.0])
     assert np.abs(modes.eigenvalues) == pytest.approx([2.0], rel=0.01)
 
@@ -139,7 +140,7 @@ def test_what_is_behind_a_spring_moves_along():
         lambda q, v, u, p: {"y": k * (q.motor - q.y) / load, "motor": (u.u - k * (q.motor - q.y)) / motor},
     )
     grid = review_grid(quick(plant), 0.0, 0)
-    modes = extra_modes(grid, real_points(grid)[0], grid.problem.plant.approximate)
+    modes = extra_modes(grid, real_points(grid)[0], grid.problem.plant.approximate, Iteration())
     assert sorted(modes.poles.imag) == pytest.approx([-300.0, 300.0])
     assert np.abs(modes.eigenvalues) == pytest.approx([1 / (load + motor)], rel=0.01)
 

@@ -153,7 +153,7 @@ def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
     """Reasons why large errors may not converge: the steepest secant of the map leaves its limit near the reference."""
     deformation = controller.deformation
     believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
-    eigenvalues = eigenvalues_near(grid, believed, grid.draws[:1], near=True).ravel()
+    eigenvalues = eigenvalues_near(grid, believed, grid.draws[:1], deformation.iteration, near=True).ravel()
     if not eigenvalues.size:
         return ["the response Jacobian is not finite near the reference"]
     reached = float((deformation.secant_gain() * np.abs(eigenvalues) ** 2 / eigenvalues.real).max())

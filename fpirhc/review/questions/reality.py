@@ -61,13 +61,19 @@ _DAMPING = 0.3
 _REAL = 1e-6  # share of the imaginary part, below which a pole is real
 
 
+def _extras(case: Case) -> list[Extra]:
+    """At points along the reference."""
+    iteration = case.controller.deformation.iteration
+    return [extra_modes(case.grid, point, case.believed, iteration) for point in real_points(case.grid)]
+
+
 def leaves_room(case: Case) -> Answer | None:
     """Return N Lambda tau, and the largest a lambda with some damping; None without a reality, an unpaired lag or a known law."""
     law = law_of(case.grid, case.controller) if case.grid.real is not None else None
     if law is None or case.controller.deformation.mirror.lags:
         return None  # paired through it, which the loop with the reality judges
     rate, poles = law
-    extras = [extra_modes(case.grid, point, case.believed) for point in real_points(case.grid)]
+    extras = _extras(case)
     lags = [float(np.sum(-1 / one.poles.real[_is_lag(one.poles)])) for one in extras]
     lag = max(lags, default=0.0)
     if lag == 0:
@@ -106,7 +112,7 @@ def stays_below(case: Case) -> Answer | None:
     if law is None or gain == 0:
         return None
     rate, poles = law
-    extras = [extra_modes(case.grid, point, case.believed) for point in real_points(case.grid)]
+    extras = _extras(case)
     limits = [(_limit(case.problem.period, rate, poles, one, pole), pole) for one in extras for pole in _swinging(one)]
     if not limits:
         return None

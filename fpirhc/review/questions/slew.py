@@ -22,7 +22,6 @@ from fpirhc.review.loops import is_planned
 from fpirhc.review.prediction import errors_without_adaptation, response_errors
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.speed import law_of
-from fpirhc.review.spectra import spectrum_near
 from fpirhc.review.state_slopes import below_responses, state_slopes
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.task.disturbance import disturbed_place
@@ -190,9 +189,7 @@ def _largest_error(case: Case) -> float | None:
 def _smallest_eigenvalue(case: Case) -> float | None:
     """Smallest real part along the reference; None where it is not positive."""
     try:
-        smallest = float(
-            spectrum_near(case.grid, case.believed, case.grid.draws[:1], near=False).eigenvalues.real.min()
-        )
+        smallest = float(case.spectrum(case.grid.draws[:1]).eigenvalues.real.min())
     except InvalidValue:
         return None
     return smallest if smallest > 0 else None

@@ -1,4 +1,4 @@
-"""A map as it is near its fixed point, r+ = r - a (f - d), with the gain a in its memory.
+"""A map as it is near its fixed point, r+ = r - a W (f - d), with the gain a in its memory.
 
 Every map is this one to first order. The loop of one map for every gain is then one loop with other memories, affine in a.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
+
+import casadi as ca
 
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation, Iteration, with_inner
@@ -19,18 +21,20 @@ GAIN = "map_gain"  # in the memory
 
 @dataclass(frozen=True)
 class LinearMap(Deformation):
-    """r+ = r - a (f - d).
+    """r+ = r - a W (f - d).
 
     Args:
         gain: a at the start.
+        weights: W by rows; None: the one matrix.
     """
 
     gain: float
+    weights: tuple[tuple[float, ...], ...] | None = None
 
     @property
     def iteration(self) -> Iteration:
         """Of no limit, because a gain that a run refuses has poles too."""
-        return Iteration(limited=False)
+        return Iteration(limited=False, weights=self.weights)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         del elements
@@ -39,7 +43,9 @@ class LinearMap(Deformation):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        return request - memory[GAIN] * (response - desired), {GAIN: memory[GAIN]}
+        error = response - desired
+        weighted = error if self.weights is None else ca.DM(self.weights) @ error
+        return request - memory[GAIN] * weighted, {GAIN: memory[GAIN]}
 
     def effective_gain(self) -> float:
         return self.gain
@@ -67,5 +73,5 @@ def near_fixed_point(controller: Controller) -> Controller:
 
 def _linear(deformation: Deformation) -> Deformation:
     if deformation.inner is None:
-        return LinearMap(deformation.effective_gain())
+        return LinearMap(deformation.effective_gain(), deformation.iteration.weights)
     return with_inner(deformation, _linear(deformation.inner))

@@ -40,7 +40,7 @@ def measured(problem: Problem, run: Run) -> float | None:  # noqa: ARG001 -- eve
     """Return the factor that is fitted to requests and responses of the run; NaN where they do not excite every direction."""
     if not _adapts(run):
         return None
-    return identified_factor(run["deformed"], run["plant_realised"], _gain(run))
+    return identified_factor(run["deformed"], run["plant_realised"], _gain(run), _weights(run))
 
 
 def _gain(run: Run) -> float:
@@ -49,8 +49,13 @@ def _gain(run: Run) -> float:
     return gain
 
 
+def _weights(run: Run) -> np.ndarray | None:
+    rows = run.settings.get("weights")
+    return None if rows is None else np.array(rows)
+
+
 def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
-    """Return the eigenvalues of the response Jacobian at sampled cycles of a run, with the parameters of its controller's model.
+    """Return the eigenvalues of the weighted response Jacobian at sampled cycles of a run, with its controller's parameters.
 
     The cycles are those from `measure_from` on, without the first of the run, before which there is no request.
 
@@ -67,7 +72,8 @@ def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
     real = run["reality_state"][rows] if "reality_state" in run.layout else states
     exact = np.tile(task.real_plant.exact, (len(rows), 1))
     jacobians = jacobians_along(modelled, real, states, deformed, approximate, exact)
-    return Spectrum(np.linalg.eigvals(jacobians[np.isfinite(jacobians).all(axis=(1, 2))]))
+    finite, weights = jacobians[np.isfinite(jacobians).all(axis=(1, 2))], _weights(run)
+    return Spectrum(np.linalg.eigvals(finite if weights is None else finite @ weights))
 
 
 def _differentiable(problem: Problem, run: Run) -> bool:

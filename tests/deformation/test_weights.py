@@ -1,0 +1,121 @@
+"""A gain matrix: what it does to coupled responses, what is refused, and that every part of a review knows it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.conformance import check_deformation
+from fpirhc.deformation.base import Deformation, Iteration
+from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+
+GAINS = np.array([[0.8, 0.3], [-0.5, 0.4]])
+
+
+def coupled(form: Deformation) -> tuple[fp.Problem, fp.ComputedTorque]:
+    """Two masses whose exact gains are coupled and whose model has none of it, under computed torque."""
+    names = ("q", "p")
+    entries = {f"b{i}{j}": fp.Parameter(float(i == j), float(GAINS[i, j]), "1") for i, j in np.ndindex(2, 2)}
+
+    def response(q, v, u, p):
+        return {name: p[f"b{i}0"] * u.u + p[f"b{i}1"] * u.w - 0.5 * v[name] for i, name in enumerate(names)}
+
+    plant = fp.Plant(dict.fromkeys(names, "m"), {"u": "m/s^2", "w": "m/s^2"}, entries, response)
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"q": ca.sin(2 * t), "p": ca.cos(3 * t)}),
+        start={"q": 0.0, "p": 1.0, "q'": 2.0},
+        period=1e-2,
+        duration=3.0,
+        measure_from=1.0,
+    )
+    return problem, fp.ComputedTorque(fp.Exponential(rate=3.0), form)
+
+
+def error(form: Deformation) -> float:
+    problem, controller = coupled(form)
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    return float(np.linalg.norm([*fp.measure(problem, run).rms_error.values()]))
+
+
+INVERSE = tuple(map(tuple, np.linalg.inv(GAINS).round(3).tolist()))
+
+
+@pytest.mark.parametrize("weights", [(1.0, 1.0), (2.0, 0.5), ((1.0, 0.2), (-0.3, 2.0))])
+def test_the_step_is_the_matrix_times_the_error(weights):
+    """r+ = r + A_c / 2 W (f - d), also where W is given by its diagonal."""
+    one = fp.Affine(gain=-0.6, weights=weights)
+    matrix = np.array(weights) if isinstance(weights[0], tuple) else np.diag(weights)
+    r, f, d = np.array([1.0, 2.0]), np.array([0.3, -0.7]), np.array([0.1, 0.5])
+    after, memory = one.step(ca.SX(r), ca.SX(f), ca.SX(d), {})
+    assert np.asarray(ca.evalf(ca.SX(after))).ravel() == pytest.approx(r - 0.3 * matrix @ (f - d), abs=1e-15)
+    assert memory == {}
+
+
+def test_with_equal_weights_all_laws_hold():
+    """W = 1 is the map without weights, and keeps its laws."""
+    check_deformation(replace(fp.Affine(gain=-0.5), weights=None), seed=0)
+    assert error(fp.Affine(gain=-0.5, weights=(1.0, 1.0))) == pytest.approx(error(fp.Affine(gain=-0.5)), rel=1e-9)
+
+
+def test_the_inverse_of_the_gains_is_deadbeat():
+    """With A_c = -2 and W the inverse of the gains an error is gone after one cycle; one number for both leaves more."""
+    best = min(error(fp.Affine(gain=g)) for g in (-0.8, -1.6, -2.4, -2.8))
+    weighted = fp.Affine(gain=-2.0, weights=INVERSE)
+    assert error(weighted) < 0.75 * best
+    problem, controller = coupled(weighted)
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert run["contraction"].max() < 2e-3
+    assert fp.measure(problem, run).values["contraction.measured"][""] < 0.05
+
+
+def test_a_gain_that_converges_with_its_weights_alone_is_not_refused():
+    """The limit is that of the eigenvalues of J W: a sign turned by the weights is right, and refused without them."""
+    problem, controller = coupled(fp.Affine(gain=0.5, weights=(-1.0, -1.0)))
+    assert fp.simulate(problem, controller, seed=0, compiled=False).stop is None
+    with pytest.raises(NotContractive, match="wrong sign"):
+        fp.simulate(problem, replace(controller, deformation=fp.Affine(gain=0.5)), seed=0, compiled=False)
+    large = fp.Affine(gain=-0.9, weights=(1.0, 19.0))
+    with pytest.raises(NotContractive, match=r"converges only for effective gains below 0\.28"):
+        fp.simulate(problem, replace(controller, deformation=large), seed=0, compiled=False)
+
+
+@pytest.mark.parametrize(
+    ("form", "wider"),  # a filter of the error with the pole p has (1 + p) / (1 - p) times the limit
+    [(fp.ModelReferenced, 1.0), (lambda one: fp.Filtered(one, pole=0.5), 3.0), (lambda one: one, 1.0)],
+)
+def test_a_review_sees_the_loop_with_its_weights(form, wider):
+    """Its factor is that of J W, its loop the run's; a suggestion and a prediction keep the weights."""
+    problem, controller = coupled(form(fp.Affine(gain=-1.0, weights=INVERSE)))
+    review = fp.review(problem, {"weighted": controller}, mismatch=0.0, seed=0)
+    answers = {one.question: one for one in review.answers}
+    gain = answers["Is the map's gain admissible?"].numbers
+    assert gain["factor"] == pytest.approx(0.5, abs=1e-3)
+    assert gain["linear_limit"] == pytest.approx(-2.4 * wider, rel=0.01)
+    assert answers["Does the deformation converge?"].verdict == "yes"
+    assert answers["Does adaptation lower the response error?"].verdict == "yes"
+    prediction = fp.predict_response(problem, controller, mismatch=None, compiled=False)
+    assert np.isfinite(prediction.half_width["q"])
+    found = fp.suggest(problem, controller, chatter=1.0, noise={"q": 0.01, "p": 0.01})
+    assert found.deformation.iteration.weights == INVERSE
+
+
+@pytest.mark.parametrize("weights", [(), (1.0, 0.0), ((1.0, 2.0), (2.0, 4.0)), ((1.0, 2.0),)])
+def test_weights_that_are_no_regular_matrix_are_refused(weights):
+    with pytest.raises(InvalidValue, match="expected a tuple with a finite number other than zero"):
+        fp.Affine(gain=-0.5, weights=weights)
+
+
+def test_a_wrong_number_of_weights_is_refused():
+    problem, controller = coupled(fp.Affine(gain=-0.5, weights=(1.0, 2.0, 3.0)))
+    with pytest.raises(NotSupported, match=r"3 weights are given, but the plant has 2 controlled coordinates \(q, p\)"):
+        fp.simulate(problem, controller, seed=0, compiled=False)
+
+
+def test_what_has_no_weights_is_left_as_it_is():
+    one = np.eye(2)
+    assert Iteration().weighted(one) is one
