@@ -320,6 +320,7 @@ def test_both_signs_of_an_inverse_are_inside():
         (0.25, 0.9, "unknown", "the smallest limit is -0.5, set by a pole", "Use gain = -0.25, half of it."),
         (0.2, 0.9, "unknown", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
         (0.2, 1.0, "no", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
+        (0.2, 1.5, "no", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
         (math.inf, 0.9, "yes", f"no gain up to {FAR:g} times as large is a limit of the whole loop", ""),
     ],
 )
