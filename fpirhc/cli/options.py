@@ -120,6 +120,12 @@ def add_json(parser: Parser, instead: str) -> None:
     parser.add_argument("--json", action="store_true", help=f"print one JSON object instead of {instead}")
 
 
+def add_format(parser: Parser, table: str, default: str | None) -> None:
+    """--format csv or parquet."""
+    text = f"kind of the file with {table} (default: {default or 'no such file'}); parquet needs pyarrow"
+    parser.add_argument("--format", choices=("csv", "parquet"), default=default, help=text)
+
+
 class Former(argparse.Action):
     """An option under its earlier name: accepted for one version with a notice, and not shown in help."""
 

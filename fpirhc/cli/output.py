@@ -1,15 +1,24 @@
-"""The folders to which commands write their results, and what is said of a command that is interrupted or breaks."""
+"""What commands write and print: results of a study, and what is said of a command that is interrupted or breaks."""
 
 from __future__ import annotations
 
+import argparse
+import importlib.util
 import os
+import shlex
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from fpirhc.cli.verb import ExitCode
+from fpirhc.cli.verb import ExitCode, Verb
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from fpirhc.studies.view import View
 
 RESULTS = "results.json"  # what --json prints, beside every report
 
@@ -43,6 +52,85 @@ def output_folder(folder: Path) -> Path:
     except OSError as error:
         raise not_writable(folder, error, "--out") from None
     return folder
+
+
+def publish(view: View, page: str, folder: Path, *, as_json: bool) -> None:
+    """Write the page of a study and its JSON object, and print the object, or the verdict and the tables.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    from fpirhc.report.terminal import show
+    from fpirhc.studies.view import to_json
+    from fpirhc.whole_file import write_whole
+
+    report, facts = folder / "report.html", to_json(view.facts)
+    write_whole(page, report, "report")
+    write_whole(f"{facts}\n", folder / RESULTS, "report")
+    if as_json:
+        print(facts)
+    else:
+        show(view, report)
+
+
+def table_writer(form: str | None) -> Callable[[DataFrame, Path], None]:
+    """Return a function that writes a table to a path whose suffix becomes that of the form; it writes nothing without a form.
+
+    Raises:
+        NotSupported: pyarrow is missing, which is said before a study runs.
+    """
+    from fpirhc.errors import NotSupported
+    from fpirhc.whole_file import write_whole
+
+    if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise NotSupported("--format parquet needs pyarrow, which is not installed: pip install pyarrow")
+
+    def write(table: DataFrame, path: Path) -> None:
+        if form is not None:
+            content = table.to_csv(index=False) if form == "csv" else table.to_parquet(index=False)
+            write_whole(content, path.with_suffix(f".{form}"), "table")
+
+    return write
+
+
+_NO_NUMBERS = {
+    "out",
+    "json",
+    "format",
+    "processes",
+    "cluster",
+    "debug",
+    "help",
+}  # options that change no number of a study
+
+
+def reproducing(verb: Verb, options: argparse.Namespace) -> str:
+    """Return the command line that reproduces a study: its seed, and every option that is not as it is by default."""
+    words = ["fpirhc", verb.name]
+    for action in sorted(verb.parser()._actions, key=lambda one: (bool(one.option_strings), one.dest != "seed")):
+        value = getattr(options, action.dest, None)
+        if action.help is argparse.SUPPRESS or action.dest in _NO_NUMBERS or value is None:
+            continue
+        if not action.option_strings:
+            words.append(value)
+        elif action.dest == "seed" or value != action.default:
+            words += _as_given(action, value)
+    return shlex.join(words)
+
+
+def _as_given(action: argparse.Action, value: Any) -> list[str]:
+    """The words of an option; what may be given again is given once for each of its values."""
+    option = action.option_strings[-1]
+    if value is True:
+        return [option]
+    if isinstance(value, tuple):
+        return [option, "/".join(map(str, value))]
+    texts = [
+        f"{one:.15g}" if isinstance(one, float) else str(one) for one in (value if isinstance(value, list) else [value])
+    ]
+    if isinstance(action, argparse._AppendAction):
+        return [word for text in texts for word in (option, text)]
+    return [option, *texts]
 
 
 @contextmanager

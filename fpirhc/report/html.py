@@ -202,22 +202,12 @@ def _new_numbers(entry: Entry) -> Iterator[tuple[float, str, float]]:
         last = numbers
 
 
-def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
-    """Write the report, atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    write_whole(render_scenarios(comparison), path, "report")
-
-
 def render_scenarios(comparison: ScenarioComparison) -> str:
     """Return the page's text."""
     figure = mismatch_figure(comparison) if comparison.summaries else None
-    chart = Image(figure.address, "Error against mismatch", _MISMATCH) if figure else None
     kept = {name: [one.get("pictures", {}) for one in some] for name, some in comparison.records.items()}
     own = [image for wanted in comparison.pictures if (image := _of_cases(wanted, kept))]
-    return render_page("scenarios.html", comparison.view, chart=chart, own=own)
+    return render_charted(comparison.view, figure, "Error against mismatch", _MISMATCH, own)
 
 
 def _of_cases(wanted: Picture, kept: Mapping[str, Sequence[Mapping[str, Kept]]]) -> Image | None:
@@ -227,26 +217,25 @@ def _of_cases(wanted: Picture, kept: Mapping[str, Sequence[Mapping[str, Kept]]])
     return _drawn(wanted, list(shown), lambda figure: wanted.draw_cases(figure, readable(shown)))
 
 
-def write_limits(found: OperatingLimits, path: Path) -> None:
-    """Write the report, atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    figure = limits_figure(found) if found.limits else None
-    chart = Image(figure.address, "Error against what grows", _LIMITS) if figure else None
-    write_whole(render_page("scenarios.html", found.view, chart=chart, own=()), path, "report")
+def render_limits(found: OperatingLimits) -> str:
+    """Return the page's text."""
+    return render_charted(
+        found.view, limits_figure(found) if found.limits else None, "Error against what grows", _LIMITS
+    )
 
 
-def write_sweep(found: Sweep, path: Path) -> None:
-    """Write the report, atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+def render_sweep(found: Sweep) -> str:
+    """Return the page's text."""
     name = " and ".join(axis.path for axis in found.axes)
-    chart = Image(sweep_figure(found).address, f"Over {name}", _SWEEP if len(found.axes) > 1 else _LINES)
-    write_whole(render_page("scenarios.html", found.view, chart=chart, own=()), path, "report")
+    return render_charted(found.view, sweep_figure(found), f"Over {name}", _SWEEP if len(found.axes) > 1 else _LINES)
+
+
+def render_charted(
+    view: View, figure: Drawing | None = None, heading: str = "", caption: str = "", own: Sequence[Image] = ()
+) -> str:
+    """Return the text of a page with a figure, where there is one, below a heading, and with the problem's own pictures."""
+    chart = Image(figure.address, heading, caption) if figure else None
+    return render_page("scenarios.html", view, chart=chart, own=own)
 
 
 def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:

@@ -22,9 +22,9 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, Mistakes, near
 from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
+from fpirhc.problem_files.settings import current_setting, is_whole
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
+from fpirhc.studies.scenarios.bench import Conditions, Trials, fingerprint
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
@@ -367,14 +367,13 @@ class _Runner:
     def __init__(
         self, task: Task, name: str, grid: _Grid, conditions: Conditions, aim: Objective, ledger: Ledger
     ) -> None:
-        self._task, self._name, self._grid = replace(task, controllers={name: task.controllers[name]}), name, grid
-        self._conditions, self._aim, self._ledger = conditions, aim, ledger
+        self._name, self._grid, self._aim, self._ledger = name, grid, aim, ledger
         self._controller = task.controllers[name]
         own = [axis.path for axis in grid.axes if axis.path not in grid.of_problem]
         self._now = {path: value for path in own if (value := self._current(path)) is not None}
         self._without = tuple(path for path in own if path not in self._now)
         self._of_problem = {path: v for path in grid.of_problem if (v := _of_problem(task.problem, path)) is not None}
-        self._rebuilt: tuple[dict[str, float], Bench] | None = None
+        self._trials = Trials(task, name, list(self._now), conditions)
 
     def map(self, progress: Progress | None) -> SweepMap:
         """Return the map; cells that the ledger has are not run again."""
@@ -424,17 +423,13 @@ class _Runner:
         return {p: round(v) if is_whole(self._controller, p) else v for p, v in found.items()}
 
     @cached_property
-    def _bench(self) -> Bench:
-        return Bench(self._task, self._conditions, {self._name: list(self._now)})
-
-    @cached_property
     def _live(self) -> bool:
-        return not self._now or self._bench.changes(self._name)
+        return self._trials.live()
 
     def _record(self, cell: int, place: tuple[int, ...]) -> dict[str, Any]:
         settings, case = self._settings(place), self._grid.case(place)
         try:
-            record = self._run(settings, case)
+            record = self._trials.record(case, settings, live=self._live)
         except FpirhcError as error:
             record = {"skipped": str(error)}
         reason = record.get("skipped") or record.get("stop") or ""
@@ -446,15 +441,6 @@ class _Runner:
             "value": value if math.isfinite(value) else None,
             "reason": reason.partition(";")[0],
         }
-
-    def _run(self, settings: Mapping[str, float], case: int) -> dict[str, Any]:
-        if self._live:
-            return self._bench.record(case, self._name, settings or None)
-        if self._rebuilt is None or self._rebuilt[0] != settings:
-            changed = with_settings(self._controller, settings)
-            bench = Bench(replace(self._task, controllers={self._name: changed}), self._conditions)
-            self._rebuilt = dict(settings), bench
-        return self._rebuilt[1].record(case, self._name)
 
 
 # --- What is said of it --------------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from fpirhc.cli import discovery
 from fpirhc.cli import verbs as package
 from fpirhc.cli.discovery import shipped
 from fpirhc.cli.main import main
+from fpirhc.cli.output import reproducing
 from fpirhc.cli.verb import OF_EVERY_VERB, ExitCode
 from fpirhc.probing.probe import Probe, probe
 from fpirhc.probing.rule import Rule
@@ -149,6 +150,23 @@ def test_help_has_examples_and_every_exit_code(verb, capsys):
         assert f"{code:<4d} {meaning}" in printed
     assert all(action.help for action in verb.parser()._actions)
     assert "%%" not in printed
+
+
+@pytest.mark.parametrize("name", ["compare", "limits", "robust", "sweep"])
+def test_the_command_of_a_report_reproduces_its_options(name):
+    """Parsed again, it gives every option that a number can depend on."""
+    verb = shipped()[name]
+    lines = [line for line, _ in verb.examples if line.startswith(f"fpirhc {name} ")]
+    more = [
+        "--no-compile --seed 3 --out elsewhere",
+        *(["--scenarios 9 --shard 2/3 --mismatch 12.5"] if name == "compare" else []),
+    ]
+    for line in (*lines, *(f"{lines[0]} {options}" for options in more)):
+        options = verb.options(shlex.split(line)[2:])
+        again = verb.options(shlex.split(reproducing(verb, options))[2:])
+        for one in (options, again):
+            vars(one).update(dict.fromkeys(("out", "processes", "cluster", "json")))
+        assert options == again
 
 
 @pytest.mark.parametrize("verb", VERBS, ids=lambda v: v.name)

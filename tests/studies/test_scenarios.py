@@ -17,6 +17,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import pandas as pd
 import pytest
 from line import EXACT, line_text
 from scipy import stats
@@ -493,9 +494,12 @@ def test_command_line_journey(task, capsys):
     assert "CTC+FPI has a smaller error than CTC" in page
     assert Path("out/mismatch.png").stat().st_size > 10_000
     before = lines_of(Path("out"))
-    assert main([*ARGUMENTS, "--scenarios", "5", "--out", "out"]) == 0
+    assert main([*ARGUMENTS, "--scenarios", "5", "--out", "out", "--format", "csv"]) == 0
     assert "CTC+FPI" in capsys.readouterr().out
     assert lines_of(Path("out"))[: len(before)] == before
+    rows = pd.read_csv("out/scenarios.csv")
+    assert rows[rows.controller == "CTC"]["error"].tolist()[:4] == document["controllers"]["CTC"]["errors"]
+    assert {"scenario", "mismatch", "outcome", "rms_error.y", "at_limit"} <= set(rows.columns)
     Path("line.py").write_text(LINE.replace("rate=6.0", "rate=7.0"))
     assert main([*ARGUMENTS, "--out", "out"]) == 3
     message = capsys.readouterr().err

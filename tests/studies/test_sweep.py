@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import fpirhc as fp
 from fpirhc.cli.main import main
+from fpirhc.cli.output import table_writer
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError, OutputError
 from fpirhc.problem_files.problem_file import Task
@@ -164,6 +166,27 @@ def test_a_whole_number_has_whole_values(tmp_path: Path) -> None:
             folder=tmp_path,
             controllers=["RHC"],
         )
+
+
+@pytest.mark.parametrize(
+    "command", ["sweep two_mass --over exact.m1=1:2:2", "compare two_mass --scenarios 2 --mismatch 9"]
+)
+def test_parquet_without_pyarrow_is_refused_before_a_run(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: pytest.fail(name) if name != "pyarrow" else None)
+    assert main([*command.split(), "--format", "parquet", "--out", str(tmp_path)]) == 2
+    assert "--format parquet needs pyarrow, which is not installed: pip install pyarrow" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_table_in_parquet_is_the_table_in_csv(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    table = swept(tmp_path, "exact.b=0.5:2:3").to_dataframe()
+    for form in ("csv", "parquet"):
+        table_writer(form)(table, tmp_path / "sweep")
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "sweep.parquet"), table)
+    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "sweep.csv"), table)
 
 
 def test_the_command_writes_table_page_picture_and_facts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.cli.options import (
     add_cases,
     add_controllers,
+    add_format,
     add_json,
     add_mismatch,
     add_no_compile,
@@ -21,7 +21,7 @@ from fpirhc.cli.options import (
     add_seed,
     shard,
 )
-from fpirhc.cli.output import RESULTS, results_folder, resumable
+from fpirhc.cli.output import publish, reproducing, results_folder, resumable, table_writer
 from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
@@ -81,13 +81,11 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
-    from fpirhc.report.html import write_report
-    from fpirhc.report.terminal import announce_backend, progress_bars, show
+    from fpirhc.report.html import render
+    from fpirhc.report.terminal import announce_backend, progress_bars
     from fpirhc.studies.comparison.compare import compare, select
     from fpirhc.studies.comparison.optimiser_choices import with_optimisers
     from fpirhc.studies.tuning.tuned_file import noted, read_tuned, with_tuned
-    from fpirhc.studies.view import to_json
-    from fpirhc.whole_file import write_whole
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     task = with_tuned(task, tuned.values) if tuned else task
@@ -103,19 +101,12 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
             controllers=controllers,
             headline=options.headline,
             compiled=not options.no_compile,
-            command=_command(options),
+            command=reproducing(VERB, options),
             progress=progress,
         )
     comparison = noted(comparison, tuned.notes) if tuned else comparison
-    report = folder / "report.html"
-    write_report(comparison, report)
-    view = comparison.view
-    write_whole(f"{to_json(view.facts)}\n", folder / RESULTS, "report")
     announce_backend(entry.run for entry in comparison.entries)
-    if options.json:
-        print(to_json(view.facts))
-    else:
-        show(view, report)
+    publish(comparison.view, render(comparison), folder, as_json=options.json)
     return _code(comparison)
 
 
@@ -123,22 +114,6 @@ def _code(comparison: Comparison) -> ExitCode:
     if any(why.startswith("interrupted") for why in comparison.skipped.values()):
         return ExitCode.INTERRUPTED
     return ExitCode.FINISHED if comparison.entries else ExitCode.BAD_INPUT
-
-
-def _command(options: argparse.Namespace) -> str:
-    """The command that reproduces this comparison."""
-    words = ["fpirhc", "compare", options.problem, "--seed", str(options.seed)]
-    if options.controllers:
-        words += ["--controllers", *options.controllers]
-    if options.optimisers:
-        words += ["--optimisers", *options.optimisers]
-    if options.tuned:
-        words += ["--tuned", options.tuned]
-    if options.headline:
-        words += ["--headline", options.headline]
-    if options.no_compile:
-        words.append("--no-compile")
-    return shlex.join(words)
 
 
 def _add_scenarios(parser: argparse.ArgumentParser) -> None:
@@ -154,6 +129,7 @@ def _add_scenarios(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--baseline", metavar="NAME", help=text)
     text = "run every N-th scenario from the K-th on, here; 'fpirhc merge' joins the folders"
     group.add_argument("--shard", type=shard, metavar="K/N", help=text)
+    add_format(group, "a row per scenario and controller", None)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -171,7 +147,7 @@ def _check(options: argparse.Namespace) -> None:
             "--cases have the parameters that they state; leave --mismatch out, or compare --scenarios N"
         )
     if options.scenarios is None and not options.cases:
-        named = [n for n in ("mismatch", "baseline", "shard", "cluster") if getattr(options, n) is not None]
+        named = [n for n in ("mismatch", "baseline", "shard", "cluster", "format") if getattr(options, n) is not None]
         named += ["processes"] if options.processes != 1 else []
         if named:
             raise InvalidValue(f"--{named[0]} needs --scenarios N, the number of scenarios")
@@ -184,27 +160,19 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
     """Run the scenarios, write report.html, results.json, mismatch.png and scenarios.jsonl, and print the comparison."""
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import mismatch_figure, save_figure
-    from fpirhc.report.html import write_scenarios
-    from fpirhc.report.terminal import show
-    from fpirhc.studies.view import to_json
-    from fpirhc.whole_file import write_whole
+    from fpirhc.report.html import render_scenarios
 
-    task = load_problem(options.problem)
+    task, write_table = load_problem(options.problem), table_writer(options.format)
     drawn = f"scenarios_{options.mismatch or 0:g}percent"
     name = f"{'tuned_' if options.tuned else ''}{'cases' if options.cases else drawn}_seed{options.seed}"
     name += "_shard{}of{}".format(*options.shard) if options.shard else ""
     folder = results_folder(options.out, task.name, name)
     comparison = _compared(options, task, folder)
-    report = folder / "report.html"
-    write_scenarios(comparison, report)
-    view = comparison.view
-    write_whole(f"{to_json(view.facts)}\n", folder / RESULTS, "report")
     if comparison.summaries:
         save_figure(mismatch_figure(comparison), folder / "mismatch.png")
-    if options.json:
-        print(to_json(view.facts))
-    else:
-        show(view, report)
+    if options.format:
+        write_table(comparison.to_dataframe(), folder / "scenarios")
+    publish(comparison.view, render_scenarios(comparison), folder, as_json=options.json)
     return ExitCode.FINISHED if comparison.summaries else ExitCode.BAD_INPUT
 
 
@@ -231,25 +199,9 @@ def _compared(options: argparse.Namespace, task: Task, folder: Path) -> Scenario
             tuned=tuned.values if tuned else None,
             tuning=tuned.notes if tuned else None,
             compiled=not options.no_compile,
-            command=_scenarios_command(options),
+            command=reproducing(VERB, options),
             progress=progress,
         )
-
-
-def _scenarios_command(options: argparse.Namespace) -> str:
-    """The command that reproduces these scenarios."""
-    words = ["fpirhc", "compare", options.problem, "--seed", str(options.seed)]
-    drawn = ["--scenarios", str(options.scenarios), "--mismatch", f"{options.mismatch or 0:g}"]
-    words += ["--cases", *options.cases] if options.cases else drawn
-    words += ["--shard", "{}/{}".format(*options.shard)] if options.shard else []
-    for name in ("baseline", "tuned", "headline"):
-        if getattr(options, name):
-            words += [f"--{name}", getattr(options, name)]
-    if options.controllers:
-        words += ["--controllers", *options.controllers]
-    if options.no_compile:
-        words.append("--no-compile")
-    return shlex.join(words)
 
 
 VERB = Verb(

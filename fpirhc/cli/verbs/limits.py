@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 
 from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_out, add_problem, add_seed
-from fpirhc.cli.output import RESULTS, results_folder
+from fpirhc.cli.output import publish, reproducing, results_folder
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -28,11 +27,9 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.figures import limits_figure, save_figure
-    from fpirhc.report.html import write_limits
-    from fpirhc.report.terminal import progress_bars, show
+    from fpirhc.report.html import render_limits
+    from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.operating_limits import FAILS, operating_limits
-    from fpirhc.studies.view import to_json
-    from fpirhc.whole_file import write_whole
 
     folder = results_folder(options.out, task.name, "limits")
     with progress_bars() as progress:
@@ -43,26 +40,13 @@ def _run(options: argparse.Namespace) -> ExitCode:
             fails=FAILS if options.fails is None else options.fails,
             seed=options.seed,
             compiled=not options.no_compile,
-            command=_command(options),
+            command=reproducing(VERB, options),
             progress=progress,
         )
-    write_limits(found, folder / "report.html")
-    write_whole(f"{to_json(found.view.facts)}\n", folder / RESULTS, "report")
     if found.limits:
         save_figure(limits_figure(found), folder / "limits.png")
-    if options.json:
-        print(to_json(found.view.facts))
-    else:
-        show(found.view, folder / "report.html")
+    publish(found.view, render_limits(found), folder, as_json=options.json)
     return ExitCode.FINISHED if found.limits else ExitCode.BAD_INPUT
-
-
-def _command(options: argparse.Namespace) -> str:
-    words = ["fpirhc", "limits", options.problem, "--seed", str(options.seed)]
-    words += ["--controllers", *options.controllers] if options.controllers else []
-    words += ["--over", *options.over] if options.over else []
-    words += [] if options.fails is None else ["--fails", f"{options.fails:g}"]
-    return shlex.join([*words, *(["--no-compile"] if options.no_compile else [])])
 
 
 VERB = Verb(

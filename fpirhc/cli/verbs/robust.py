@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 
 from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_out, add_problem, add_seed
-from fpirhc.cli.output import RESULTS, results_folder
+from fpirhc.cli.output import publish, reproducing, results_folder
 from fpirhc.cli.verb import ExitCode, Verb
 
 _SHARES = {
@@ -31,18 +30,12 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
-    from fpirhc.report.html import render_page
-    from fpirhc.report.terminal import progress_bars, show
+    from fpirhc.report.html import render_charted
+    from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.robust import robust_boxes
-    from fpirhc.studies.view import to_json
-    from fpirhc.whole_file import write_whole
 
     folder = results_folder(options.out, task.name, "robust")
     shares = {name: getattr(options, name) for name in _SHARES if hasattr(options, name)}
-    words = ["fpirhc", "robust", options.problem, "--seed", str(options.seed)]
-    words += ["--controllers", *options.controllers] if options.controllers else []
-    words += [word for name, value in shares.items() for word in (f"--{name}", f"{value:g}")]
-    words += ["--no-compile"] if options.no_compile else []
     with progress_bars() as progress:
         found = robust_boxes(
             task,
@@ -50,16 +43,10 @@ def _run(options: argparse.Namespace) -> ExitCode:
             **shares,
             seed=options.seed,
             compiled=not options.no_compile,
-            command=shlex.join(words),
+            command=reproducing(VERB, options),
             progress=progress,
         )
-    page = render_page("scenarios.html", found.view, chart=None, own=())
-    write_whole(page, folder / "report.html", "report")
-    write_whole(f"{to_json(found.view.facts)}\n", folder / RESULTS, "report")
-    if options.json:
-        print(to_json(found.view.facts))
-    else:
-        show(found.view, folder / "report.html")
+    publish(found.view, render_charted(found.view), folder, as_json=options.json)
     return ExitCode.FINISHED if found.boxes else ExitCode.BAD_INPUT
 
 

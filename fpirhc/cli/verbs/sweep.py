@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
-import math
-import shlex
 
-from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_out, add_problem, add_seed
-from fpirhc.cli.output import RESULTS, results_folder, resumable
+from fpirhc.cli.options import add_controllers, add_format, add_json, add_no_compile, add_out, add_problem, add_seed
+from fpirhc.cli.output import publish, reproducing, results_folder, resumable, table_writer
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -24,6 +20,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(parser, "results/PROBLEM/sweep_PATH...")
     add_no_compile(parser)
     add_json(parser, "the table")
+    add_format(parser, "a row per run", "csv")
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -31,12 +28,11 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.figures import save_figure, sweep_figure
-    from fpirhc.report.html import write_sweep
-    from fpirhc.report.terminal import progress_bars, show
+    from fpirhc.report.html import render_sweep
+    from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.sweep import LEDGER, Axis, sweep
-    from fpirhc.studies.view import to_json
-    from fpirhc.whole_file import write_whole
 
+    write_table = table_writer(options.format)
     axes = [Axis.parsed(text) for text in options.over]
     folder = results_folder(options.out, task.name, "_".join(["sweep", *(axis.path for axis in axes)]))
     with resumable(folder / LEDGER), progress_bars() as progress:
@@ -48,31 +44,13 @@ def _run(options: argparse.Namespace) -> ExitCode:
             metric=options.metric,
             seed=options.seed,
             compiled=not options.no_compile,
-            command=_command(options),
+            command=reproducing(VERB, options),
             progress=progress,
         )
-    rows = list(found.rows())
-    text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0])
-    writer.writeheader()
-    writer.writerows({k: "" if isinstance(v, float) and math.isnan(v) else v for k, v in row.items()} for row in rows)
-    write_whole(text.getvalue(), folder / "sweep.csv", "table")
-    write_sweep(found, folder / "report.html")
-    write_whole(f"{to_json(found.view.facts)}\n", folder / RESULTS, "report")
+    write_table(found.to_dataframe(), folder / "sweep")
     save_figure(sweep_figure(found), folder / "sweep.png")
-    if options.json:
-        print(to_json(found.view.facts))
-    else:
-        show(found.view, folder / "report.html")
+    publish(found.view, render_sweep(found), folder, as_json=options.json)
     return ExitCode.FINISHED
-
-
-def _command(options: argparse.Namespace) -> str:
-    words = ["fpirhc", "sweep", options.problem, "--seed", str(options.seed)]
-    words += [word for text in options.over for word in ("--over", text)]
-    words += ["--controllers", *options.controllers] if options.controllers else []
-    words += ["--metric", options.metric] if options.metric else []
-    return shlex.join([*words, *(["--no-compile"] if options.no_compile else [])])
 
 
 VERB = Verb(
@@ -100,6 +78,7 @@ VERB = Verb(
 A path that begins with exact. (the parameter of what moves), approximate., known., start. or a field of the problem, such as
 limits.inputs.Q1.1 or dead_time.inputs.Q1, is the problem's. Every other path is the controllers'; those without it are the same
 along it. Settings that can be live are numbers of one compiled loop; for others every value has a loop of its own, and the
-report says so. Finished runs are kept, and the same command goes on with them. sweep.csv has a row per run.
+report says so. Finished runs are kept, and the same command goes on with them.
+sweep.csv (with --format parquet sweep.parquet) has a row per run.
 """,
 )

@@ -8,7 +8,8 @@ import json
 import math
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from typing import Any
 
@@ -21,6 +22,7 @@ from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.settings import with_settings
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
@@ -204,6 +206,44 @@ def scenarios(task: Task, conditions: Conditions) -> Scenarios:
         assert task.cases is not None
         return NamedCases(task.cases, task.problem, conditions.seed)
     return RandomScenarios(task.problem, conditions.seed, conditions.use, conditions.percent)
+
+
+class Trials:
+    """Runs of one controller with other numbers of its settings: in one loop where they can be live, else in one for each set.
+
+    Args:
+        task: the loaded problem file.
+        name: of the controller.
+        paths: of the settings.
+        conditions: of the scenarios.
+    """
+
+    def __init__(self, task: Task, name: str, paths: Sequence[str], conditions: Conditions) -> None:
+        self._task, self._name, self._paths = replace(task, controllers={name: task.controllers[name]}), name, paths
+        self._conditions = conditions
+        self._rebuilt: tuple[dict[str, float], Bench] | None = None
+
+    @cached_property
+    def _bench(self) -> Bench:
+        return Bench(self._task, self._conditions, {self._name: self._paths})
+
+    def live(self, scenarios: Sequence[int] = (0,)) -> bool:
+        """Whether the settings can be live in these scenarios."""
+        return not self._paths or all(self._bench.changes(self._name, k) for k in scenarios)
+
+    def record(self, number: int, settings: Mapping[str, float], *, live: bool) -> dict[str, Any]:
+        """Return the record of a scenario with these numbers; the loop that is built for numbers that are not live is kept.
+
+        Raises:
+            FpirhcError: numbers that the controller does not take.
+        """
+        if live:
+            return self._bench.record(number, self._name, settings or None)
+        if self._rebuilt is None or self._rebuilt[0] != settings:
+            changed = with_settings(self._task.controllers[self._name], settings)
+            task = replace(self._task, controllers={self._name: changed})
+            self._rebuilt = dict(settings), Bench(task, self._conditions)
+        return self._rebuilt[1].record(number, self._name)
 
 
 def scenario_numbers(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
@@ -16,6 +16,9 @@ from fpirhc.studies.scenarios.paired import Record, Summary, noun
 from fpirhc.studies.tuning.objective import Objective
 from fpirhc.studies.view import Study, View, status_shares
 from fpirhc.summary import Column, Table, line, written_out
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _ERRORS = "Errors are rms errors divided by the range of the reference, root mean square over the judged coordinates. "
 _MEANING = (
@@ -69,6 +72,20 @@ class ScenarioComparison(Study, FoundByName):
         counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"
         return line(self, self.problem, *counts, self.verdict[0])
 
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a row per controller and scenario as a pandas DataFrame: numbers of a metric in columns 'rms_error.q1'."""
+        import pandas as pd
+
+        rows = [
+            {
+                **{name: one for name, one in record.items() if name not in ("metrics", "pictures")},
+                **_flat(record["metrics"]),
+            }
+            for some in self.records.values()
+            for record in some
+        ]
+        return pd.DataFrame(rows)
+
     @property
     def view(self) -> View:
         return _view(self)
@@ -98,6 +115,11 @@ def _view(comparison: ScenarioComparison) -> View:
         skipped=comparison.skipped,
         facts=_facts(comparison),
     )
+
+
+def _flat(metrics: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Numbers by 'metric.element', and by 'metric' where there is one number."""
+    return {f"{name}.{e}" if e else name: value for name, some in metrics.items() for e, value in some.items()}
 
 
 def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:

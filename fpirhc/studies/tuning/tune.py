@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.harm import harm_of_adaptation
-from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint, scenario_numbers
+from fpirhc.studies.scenarios.bench import Conditions, Trials, fingerprint, scenario_numbers
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
@@ -226,7 +226,9 @@ def _tuned(
     spans = task.tuning[name]
     known = {r["trial"]: r for r in ledger.records if r["controller"] == name}
     before = {path: current_setting(task.controllers[name], path) for path in spans}
-    judge = _Judge(task, name, tuple(spans), conditions, numbers, aim)
+    # A trial keeps its cost alone, so no other metric is measured.
+    needed = [metric for metric in task.metrics if metric.name in ("rms_error", aim.metric.name if aim.metric else "")]
+    runs = Trials(replace(task, metrics=needed), name, tuple(spans), conditions)
     study = optuna.create_study()
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
     for number in range(_PRESENT, trials):
@@ -236,7 +238,7 @@ def _tuned(
             shares = {} if trial is None else dict(trial.params)
             settings = before if number == _PRESENT else _numbers(task, name, spans, shares)
             record = {"controller": name, "trial": number, "shares": shares, "settings": settings}
-            record |= judge.judged(settings)
+            record |= _judged(runs, numbers, aim, settings)
             ledger.append(record)
             known[number] = record
         if trial is not None:
@@ -267,39 +269,14 @@ def _numbers(task: Task, name: str, spans: TuningSpans, shares: Mapping[str, flo
     return {p: round(v) if is_whole(task.controllers[name], p) else v for p, v in settings.items()}
 
 
-class _Judge:
-    """Judges settings of one controller in all scenarios: with one loop where the settings can be live, else one for each."""
-
-    def __init__(
-        self,
-        task: Task,
-        name: str,
-        paths: Sequence[str],
-        conditions: Conditions,
-        numbers: Sequence[int],
-        aim: Objective,
-    ) -> None:
-        # A trial keeps its cost alone, so no other metric is measured.
-        needed = {"rms_error", aim.metric.name if aim.metric else ""}
-        self._task = replace(task, metrics=[metric for metric in task.metrics if metric.name in needed])
-        self._name, self._conditions, self._scenarios, self._aim = name, conditions, numbers, aim
-        self._paths, self._bench = paths, cast(Bench | None, None)
-
-    def judged(self, settings: Mapping[str, float]) -> dict[str, float]:
-        """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all of them."""
-        try:
-            records = self._records(settings)
-        except (InvalidValue, InvalidProblem):
-            return {"cost": self._aim.refused, "failures": len(self._scenarios)}
-        costs = [self._aim.cost(record) for record in records]
-        failures = sum(r.get("outcome") != "finished" for r in records)
-        return {"cost": math.fsum(costs) / len(self._scenarios), "failures": failures}
-
-    def _records(self, settings: Mapping[str, float]) -> list[dict[str, Any]]:
-        if self._bench is None:
-            self._bench = Bench(self._task, self._conditions, {self._name: self._paths})
-        if all(self._bench.changes(self._name, k) for k in self._scenarios):
-            return [self._bench.record(k, self._name, settings) for k in self._scenarios]
-        changed = with_settings(self._task.controllers[self._name], settings)
-        bench = Bench(replace(self._task, controllers={self._name: changed}), self._conditions)
-        return [bench.record(k, self._name) for k in self._scenarios]
+def _judged(
+    trials: Trials, scenarios: Sequence[int], aim: Objective, settings: Mapping[str, float]
+) -> dict[str, float]:
+    """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all of them."""
+    try:
+        live = trials.live(scenarios)
+        records = [trials.record(k, settings, live=live) for k in scenarios]
+    except (InvalidValue, InvalidProblem):
+        return {"cost": aim.refused, "failures": len(scenarios)}
+    failures = sum(r.get("outcome") != "finished" for r in records)
+    return {"cost": math.fsum(map(aim.cost, records)) / len(scenarios), "failures": failures}
