@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.horizon.cost import View
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value, expression
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.layout import Expression, Named, Signal
 from fpirhc.task.limits import Limits
 
 _GAP = 1e-9  # half width of the bounds of a terminal equality
@@ -44,6 +44,27 @@ def limited(limits: Limits, plant: Plant, view: View, step: float) -> list[Const
         ConstraintState(name, one.unit, one.named_value(name, view), one.lower, one.upper)
         for name, one in limits.members(plant, step).items()
     ]
+
+
+def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> list[ConstraintState]:
+    """Hard limits of states and paths after so many steps inside a stage of a map: the nodes do not see what is between them.
+
+    Args:
+        limits: of the problem; soft and priced ones, and those of a change of inputs, hold at the nodes alone.
+        plant: the map.
+        view: the stage after these steps.
+        seen: the state then, as it will be measured.
+        step: number of the steps, for the names.
+    """
+    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
+    nodes_alone = limits.soft.keys() | limits.prices.keys()
+    states = [ConstraintState(e, units[e], seen[e], *ends) for e, ends in limits.states.items()]
+    paths = [
+        ConstraintState(name, one.unit, one.named_value(name, view), one.lower, one.upper)
+        for name, one in limits.paths.items()
+        if not one.uses_rate
+    ]
+    return [replace(w, name=f"{w.name}, step {step}") for w in (*states, *paths) if w.name not in nodes_alone]
 
 
 def ends(

@@ -16,6 +16,7 @@ from fpirhc.horizon.constraint_states import (
     ends,
     hard,
     hard_state_bounds,
+    inside,
     limited,
     measured,
     narrowed,
@@ -29,6 +30,7 @@ from fpirhc.horizon.nominal import feedforward, known_on_reference, nominal_moti
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
 from fpirhc.plant.integrators import spurious_growth
+from fpirhc.plant.maps import over
 from fpirhc.plant.motion import outside_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.latest import Latest
@@ -284,6 +286,9 @@ def _written(
     for entry in entries:
         if ca.SX(entry.expression).numel() != 1:
             raise InvalidProblem(f"limits: path '{entry.name}' must be one scalar, got {entry.expression.shape}")
+    for k, earlier in enumerate(_steps_inside(plant, horizon, limits, view, data), 1):
+        state = Named(plant.state.elements, _seen(plant, horizon, earlier.state.vector, data), "state")
+        entries += inside(limits, plant, earlier, state, k)
     seen_next = _seen(plant, horizon, x_next, data)
     if horizon.margins:
         margin = dict(zip(horizon.margins, ca.vertsplit(data["margin"]), strict=True))
@@ -293,6 +298,25 @@ def _written(
     if horizon.terminal:
         entries += ends(horizon.terminal, plant, x_next, data["target"], data["last"])
     return entries
+
+
+def _steps_inside(
+    plant: Plant, horizon: Horizon, limits: Limits, view: View, data: Mapping[str, Expression]
+) -> list[View]:
+    """The stage as it is after each step of a map but the last, whose state is the next node's; empty without limits on them.
+
+    Where stages have several lengths, a shorter one stays at its end.
+    """
+    if plant.step is None or not horizon.discretisation.steps_maps or not (limits.states or limits.paths):
+        return []
+    one, per_stage = over(plant, plant.step), round(horizon.step / plant.step)
+    u, p, x, views = view.input.vector, data["parameters"], view.state.vector, []
+    for k in range(1, round(horizon.longest / plant.step)):
+        later = one.equations.next(x, u, p, ca.SX.zeros(len(plant.names)))
+        x = later if k < per_stage else ca.if_else(k < per_stage * data["length"], later, x)
+        state = Named(plant.state.elements, x, "state")
+        views.append(replace(view, state=state, output=_outputs(plant, x, u, p), time=view.time + k * plant.step))
+    return views
 
 
 def _seen(plant: Plant, horizon: Horizon, x: Expression, data: Mapping[str, Expression]) -> Expression:

@@ -164,7 +164,8 @@ class _Rate(Limit):
 class Limits(Checked):
     """Limits of a problem.
 
-    The plant's actuator clips the inputs to their limits. All other limits bind an optimiser's plan.
+    The plant's actuator clips the inputs to their limits. All other limits bind an optimiser's plan, at the nodes between its
+    stages; where a stage is many steps of a map, hard limits of states and paths hold after each of them.
 
     Args:
         inputs: intervals (lower, upper) by name of the input.

@@ -129,6 +129,35 @@ def test_a_metered_ramp_saves_time() -> None:
     assert metered[:, 4].max() < 33
 
 
+# The time spent
+
+
+def test_an_economic_plan_is_the_published_run() -> None:
+    """The rates of 17 minutes and the time spent after 96 steps of sym-metanet's metering, which IPOPT solves there and here."""
+    shipped, rates = (
+        task("freeway_economic"),
+        np.loadtxt(DATA.with_name("metering.csv"), delimiter=",", skiprows=1)[:, 1],
+    )
+    known = fp.ExactModel(fp.RecedingHorizon(fp.Ipopt()))
+    run = fp.simulate(replace(shipped.problem, duration=17 / 60), known, seed=0, compiled=False)
+    assert run["command.r"] == pytest.approx(rates, abs=0.002)
+    assert run["plant_state.spent"][16] == pytest.approx(96.813, abs=0.011)
+
+
+@pytest.mark.slow
+def test_the_iteration_spends_more_time() -> None:
+    """The second table of the description: a wrong model, where the density is not what is wrong."""
+    rows = task("freeway_economic").description.split("largest queue [veh]")[1].splitlines()[1:6]
+    table = {name: numbers for name, *numbers in (line.strip().rsplit(maxsplit=2) for line in rows)}
+    states = open_loop()[:174]
+    spent = T * (2 * states[:, :6].sum() + states[:, 12:].sum())
+    assert float(table.pop("open ramp")[0]) == pytest.approx(spent, abs=0.05)
+    for name, (time, queue) in table.items():
+        run = fp.simulate(task("freeway_economic").problem, task("freeway_economic").controllers[name], seed=0)
+        assert run["plant_state.spent"].max() == pytest.approx(float(time), abs=0.06), name
+        assert run["plant_state.w2"].max() == pytest.approx(float(queue), abs=0.06), name
+
+
 # Emission
 
 
