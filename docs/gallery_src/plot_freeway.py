@@ -50,7 +50,8 @@ density.draw(plt.figure(figsize=density.size(len(runs)), layout="constrained"), 
 # %%
 # Emission is another task. It settles when traffic has settled, and the model of the
 # controller is the map from a metering rate to the emission at rest: an output of order
-# zero. The iteration acts on the target of the static inverse, once a minute.
+# zero. The iteration acts on the target of the static inverse, once a minute. A PI law on
+# the measured emission needs no model and is as good: a draw.
 
 emission = fp.load_problem("freeway")
 runs = {

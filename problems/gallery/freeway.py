@@ -13,11 +13,21 @@ than it may let in. Errors count from half an hour on.
 
     rms error, seed 0    emission [kg/h]
     static map                        72
-    static map+FPI                     5
+    static map+FPI                   1.6
+    PI                               1.6
 
 The wrong map asks for more than the largest rate all the time. The exact map has no error at rest; what is left of it are
 the mainstream and the time that traffic takes to settle. The iteration makes up for all three. It is `Cascade`, which
-deforms the target and passes the shift through a lag of a minute before it compares.
+deforms the target and compares at once; a lag of a minute before it compares allows less gain, and is worse.
+
+It is a draw with a PI law on the measured emission, without any model. Both add up the error once a minute:
+
+    emission [kg/h]    this mainstream    a swing of 120 veh/h in an hour    noise of 5 kg/h
+    static map+FPI                 1.6                                4.0                5.1
+    PI                             1.6                                1.7                6.7
+
+The proportional part of the PI law follows a faster mainstream, and it passes more of the sensor's noise on. The gains of both
+are about half of those at which they oscillate.
 """
 
 from dataclasses import replace
@@ -31,7 +41,6 @@ metanet = fp.load_problem(str(Path(__file__).with_name("freeway_metering.py"))).
 LENGTH, LANES, BEFORE, BEHIND = 1.0, 2, 4, 2  # km; segments before and behind the ramp
 RAMP, LARGEST = 2000.0, 0.6  # veh/h at the rate 1 while cars wait; largest metering rate
 NEWTON = 8  # steps
-LAG = 1 / 60  # h, in which traffic behind the ramp settles
 
 
 def per_km(speed):
@@ -106,6 +115,7 @@ problem = fp.Problem(
 static = fp.FeedforwardOnly()
 controllers = {
     "static map": static,
-    "static map+FPI": fp.Cascade(static, fp.Affine(gain=-1.0), fp.ThroughModel(lag=LAG)),
+    "static map+FPI": fp.Cascade(static, fp.Affine(gain=-2.5), fp.ThroughModel(lag=0.0)),
+    "PI": fp.PID({"emission": 0.006}, {"emission": 0.4}),  # h/kg, 1/kg
 }
 headline = ("static map", "static map+FPI")

@@ -200,11 +200,11 @@ def test_every_target_has_a_rate() -> None:
 def test_the_iteration_holds_the_emission() -> None:
     """The figures of the description; the map alone stays at its largest rate."""
     assert error("freeway", "static map") == pytest.approx(71.8, rel=0.02)
-    assert error("freeway", "static map+FPI") == pytest.approx(5.0, rel=0.02)
+    assert error("freeway", "static map+FPI") == pytest.approx(1.56, rel=0.02)
     assert run_of("freeway", "static map")["clipped"].all()
     assert run_of("freeway", "static map+FPI")["clipped"][30:].sum() == 0
     assert run_of("freeway", "static map+FPI")["reality_state.w2"].min() > 6  # so the ramp is never short of cars
-    assert run_of("freeway", "static map+FPI")["reality_state.w2"].max() < 1710
+    assert run_of("freeway", "static map+FPI")["reality_state.w2"].max() < 1760
 
 
 def test_even_the_exact_map_is_worse_than_the_iteration() -> None:
@@ -222,19 +222,28 @@ def test_even_the_exact_map_is_worse_than_the_iteration() -> None:
 
 
 def test_the_shift_of_the_target_is_that_of_a_loop_by_hand() -> None:
-    """The cascade and METANET in numpy: map by bisection, pairing through the lag, ten seconds per step."""
+    """Half the map's gain times the measured error is taken off the target, once a minute, where the rate is inside its limits."""
     run, problem = run_of("freeway", "static map+FPI"), task("freeway").problem
-    lag, period, gain = 1 / 60, problem.period, 0.5
-    emission, shift, under_way = run["output.emission"], 0.0, float(run["output.emission"][0] - 2140.0)
-    decay = np.exp(-period / lag)
-    free = run["clipped"] == 0
+    period, gain, shift = problem.period, 1.25, 0.0
+    emission, free = run["output.emission"], run["clipped"] == 0
     for k in range(1, 120):
-        under_way = decay * under_way + (1 - decay) * shift
-        reference = 2140 + 25 * np.sin(2 * np.pi * k * period)
-        wanted = shift - gain * (emission[k] - reference - under_way + shift)
+        wanted = shift - gain * (emission[k] - 2140 - 25 * np.sin(2 * np.pi * k * period))
         shift = float(run["shift.emission"][k])
         if free[k - 1] or abs(wanted) < abs(shift):
             assert shift == pytest.approx(wanted, abs=1e-8)
+
+
+def test_a_pi_law_is_as_good() -> None:
+    """The second table of the description: this mainstream, one that swings faster, and a sensor with noise."""
+    problem, shipped = task("freeway").problem, task("freeway").controllers
+    rows = task("freeway").description.split("noise of 5 kg/h")[1].splitlines()[1:3]
+    faster = {**problem.signals, "demand": fp.Unknown(lambda t: 2500 + 120 * ca.sin(2 * ca.pi * t))}
+    noisy = fp.Sensing(sensors={"emission": fp.Sensor(noise=fp.Noise(5.0))})
+    variants = problem, replace(problem, signals=faster), replace(problem, sensing=noisy)
+    for name, *numbers in (line.strip().rsplit(maxsplit=3) for line in rows):
+        for variant, number in zip(variants, numbers, strict=True):
+            run = fp.simulate(variant, shipped[name], seed=0, compiled=False)
+            assert fp.measure(variant, run).rms_error["emission"] == pytest.approx(float(number), abs=0.06), name
 
 
 class Road:
