@@ -316,7 +316,7 @@ def test_plans_on_a_wrong_static_map_are_made_up_for() -> None:
 
 
 def test_plans_hold_the_emission_of_a_freeway() -> None:
-    """On the settled map of a wrong model, with the swing of the mainstream unknown: no worse than a gentle iteration on targets."""
+    """On the settled map of a wrong model, the mainstream's swing unknown: no worse than a gentle iteration on targets."""
     task = fp.load_problem("freeway")
     gentle = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-1.0), fp.ThroughModel(lag=1 / 60))
     cost = fp.Quadratic(outputs={"emission": 1.0}, rate={"r": 10.0})
