@@ -243,15 +243,6 @@ def test_box_spans_model_and_plant_and_a_margin():
     )  # good for the plant, too large for the lightest of the box
 
 
-def test_prediction_is_the_review_s_verdict():
-    """The verdict does not depend on the questions that are asked beside it."""
-    for seed in (0, 9):
-        case = random_case(seed)
-        answers_by_question = answers(case.problem, case.controller)
-        one = predict(case.problem, case.controller)
-        assert about(answers_by_question, "Does the deformation converge").verdict == one.verdict
-
-
 def test_a_plan_that_is_too_stiff_for_its_map_is_found():
     """The case that two_mass shows failing: the start asks for more than 0.81 S per cycle."""
     task = fp.load_problem("two_mass")
