@@ -19,3 +19,8 @@ def on_problem(member: Any) -> tuple[Controller, Problem]:
     task = load_problem(member.problem) if member.problem else None
     problem = replace(task.problem if task else two_masses(), **{"measure_from": 0.0, **member.changes})
     return (task.controllers[member.controller] if task and member.value is None else member.value), problem
+
+
+def named(values: Any) -> list[str]:
+    """Names of parameters: class and number."""
+    return [f"{type(v).__name__}-{k}" for k, v in enumerate(values)]

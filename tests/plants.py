@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 
 import fpirhc as fp
+from fpirhc.controllers.contract import Controller
 
 
 def linear(gain: float, believed: float) -> fp.Plant:
@@ -73,3 +74,8 @@ def known(number: float | None) -> float:
     """A number of a plan that is finite."""
     assert number is not None
     return number
+
+
+def simulated(problem: fp.Problem, controller: Controller, seed: int = 0) -> fp.Run:
+    """A run in the virtual machine: most runs of tests are shorter than their compilation."""
+    return fp.simulate(problem, controller, seed=seed, compiled=False)

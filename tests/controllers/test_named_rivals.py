@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from plants import chain, linear, pendulum
+from plants import simulated as run
 
 import fpirhc as fp
 from fpirhc.controllers.rivals.intelligent_pid import window_weights
@@ -40,10 +41,6 @@ def first_order(**changes: Any) -> fp.Problem:
     )
     moving = fp.Trajectory(lambda t: {"y": ca.sin(3 * t)})
     return pushed(plant, sensing=DIFFERENCES, **{"reference": moving, **changes})
-
-
-def run(problem: fp.Problem, controller: Any) -> fp.Run:
-    return fp.simulate(problem, controller, seed=0, compiled=False)
 
 
 def assert_same(problem: fp.Problem, one: Any, other: Any, tolerance: float = 1e-12) -> None:

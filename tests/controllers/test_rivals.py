@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from plants import chain, linear, pendulum
+from plants import simulated as simulate
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
@@ -39,11 +40,6 @@ def swing(**changes):
     settings = {"reference": fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)}), "start": {"angle": 0.1}}
     settings |= {"plant": pendulum(), "period": 1e-3, "duration": 4.0, "measure_from": 2.0}
     return fp.Problem(**{**settings, **changes})
-
-
-def simulate(problem, controller):
-    """A short run is over before it would be compiled."""
-    return fp.simulate(problem, controller, seed=0, compiled=False)
 
 
 def rms(values):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from plants import pendulum
+from plants import simulated as run
 
 import fpirhc as fp
 from fpirhc.cli.main import main
@@ -32,11 +33,6 @@ def crane(start: dict[str, float], **changes: Any) -> fp.Problem:
     """The crane from another start, measured from the first cycle."""
     values = {e: start.get(e, 0.0) for e in CRANE.problem.plant.state.elements}
     return replace(CRANE.problem, start=values, measure_from=0.0, **changes)
-
-
-def run(problem: fp.Problem, controller: Controller) -> fp.Run:
-    """A run that is too short to be worth compiling."""
-    return fp.simulate(problem, controller, seed=0, compiled=False)
 
 
 def switches(run_: fp.Run) -> np.ndarray:

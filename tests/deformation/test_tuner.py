@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.special import betainc
+from test_noise import noisy as noisy_two_mass
 
 import fpirhc as fp
 from fpirhc.deformation.wrappers.tuned import expected_sign
@@ -74,12 +75,6 @@ def test_tuner_settles_at_its_target_in_noise(start, target):
     log = step.mapaccum("run", noise.size)(np.append(0.0, layout.start()), noise).full()
     gain = start * log[1 + layout.slice("tuner_factor").start, 10_000:]
     assert np.log(gain).mean() == pytest.approx(np.log(target), abs=0.15)
-
-
-def noisy_two_mass() -> fp.Problem:
-    """Two masses whose accelerometers have a noise of 1 m/s^2."""
-    noise = {name: fp.Sensor(noise=fp.Noise(1.0)) for name in ("q1''", "q2''")}
-    return replace(fp.load_problem("two_mass").problem, sensing=fp.Sensing(noise))
 
 
 def changing_drive() -> fp.Problem:

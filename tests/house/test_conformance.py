@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from on_problem import named
 from wrong.tables import CONTROLLERS as WRONG_CONTROLLERS
 from wrong.tables import LOUD
 from wrong.tables import MAPS as WRONG_MAPS
@@ -40,10 +41,6 @@ from fpirhc.tracking.base import Tracking
 
 FINE = 1e-6  # tolerance of the optimisers, N
 TRACKING = fp.Exponential(rate=8.0)
-
-
-def named(values: Any) -> list[str]:
-    return [f"{type(v).__name__}-{k}" for k, v in enumerate(values)]
 
 
 def breaks(law: Any) -> str:

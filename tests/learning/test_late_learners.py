@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 from plants import linear, pendulum
+from plants import simulated as run
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.replanning import Replanning
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.symbolic.expression import Signals
@@ -52,10 +52,6 @@ def spring(**changes: Any) -> fp.Problem:
         "cost": fp.Quadratic(states={"y": 1e2, "y'": 1.0}, deviation={"u": 0.01}),
     }
     return fp.Problem(**(settings | changes))
-
-
-def run(problem: fp.Problem, controller: Controller) -> fp.Run:
-    return fp.simulate(problem, controller, seed=0, compiled=False)
 
 
 # Pairs

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from on_problem import on_problem
+from on_problem import named, on_problem
 
 import fpirhc as fp
 from fpirhc.conformance.live import check_live, number_paths
@@ -37,10 +37,6 @@ def some_paths(problem: Problem, controller: Controller) -> list[str]:
     if controller.planner is None:
         chosen = [p for p in chosen if not p.startswith("cost.")]
     return [*chosen, *bounds, *[p for p in number_paths(problem, controller) if p.startswith("limits")][:1]]
-
-
-def named(values: Any) -> list[str]:
-    return [f"{type(v).__name__}-{k}" for k, v in enumerate(values)]
 
 
 def check(controller: Controller, problem: Problem, least: int = 1) -> None:

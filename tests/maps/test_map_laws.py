@@ -12,6 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from plants import simulated
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 
@@ -79,11 +80,6 @@ def task(plant: fp.Plant, period: float, **changes: Any) -> fp.Problem:
         "duration": 6.0,
     }
     return fp.Problem(**{**arguments, **changes})
-
-
-def simulated(problem: fp.Problem, controller: Controller) -> fp.Run:
-    """A run in the virtual machine."""
-    return fp.simulate(problem, controller, seed=0, compiled=False)
 
 
 def test_with_the_same_commands_the_states_are_the_same_at_the_samples() -> None:

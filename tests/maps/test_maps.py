@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from plants import simulated
 
 import fpirhc as fp
 from fpirhc.controllers.slots.slot import output_chain
@@ -57,11 +58,6 @@ def task(plant: fp.Plant | None = None, **changes: Any) -> fp.Problem:
         "duration": 600.0,
     }
     return fp.Problem(**{**arguments, **changes})
-
-
-def simulated(problem: fp.Problem, controller: Any, seed: int = 0) -> fp.Run:
-    """A run in the virtual machine."""
-    return fp.simulate(problem, controller, seed=seed, compiled=False)
 
 
 def by_hand(cycles: int, steps: int, gain: float) -> tuple[np.ndarray, np.ndarray]:

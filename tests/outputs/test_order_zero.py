@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from test_cascade import affine, simulated
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
@@ -25,11 +26,6 @@ from fpirhc.studies.comparison.compare import compare
 STATIC = fp.FeedforwardOnly()
 COLD, WARMER = 20.0, 4e-3  # Ohm, 1/K
 HEAT, LOSS = 50.0, 2.0  # J/K, W/K
-
-
-def affine(gain: float) -> fp.Affine:
-    """The affine map with this effective gain."""
-    return fp.Affine(gain=-2 * gain)
 
 
 def resistance(x: Any, p: Any) -> Any:
@@ -62,11 +58,6 @@ def heated(plant: fp.Plant, **settings: Any) -> fp.Problem:
         "measure_from": 5.0,
     }
     return fp.Problem(plant=plant, **{**values, **settings})
-
-
-def simulated(problem: fp.Problem, controller: Controller) -> fp.Run:
-    """A run in the virtual machine."""
-    return fp.simulate(problem, controller, seed=1, compiled=False)
 
 
 def rms_of(problem: fp.Problem, run: fp.Run, name: str) -> float:

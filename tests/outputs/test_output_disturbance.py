@@ -13,7 +13,8 @@ import casadi as ca
 import numpy as np
 import pytest
 from own_disturbance import Sawtooth
-from test_outputs import OPTIMISER, SAME, SHORT, TWO_MASS, curve, hill, on_outputs, planned, sedated, simulated
+from plants import simulated
+from test_outputs import OPTIMISER, SAME, SHORT, TWO_MASS, curve, hill, on_outputs, planned, sedated
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem

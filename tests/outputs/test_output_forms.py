@@ -8,7 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from test_outputs import ARM, arm, circle, hill, sedated, simulated
+from plants import simulated
+from test_outputs import ARM, arm, circle, hill, sedated
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller

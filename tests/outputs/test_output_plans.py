@@ -12,8 +12,9 @@ import numpy as np
 import output_plans as study
 import pytest
 from own_nmpc import FINE, equations, own_run, runge_kutta
+from plants import simulated
 from scipy.integrate import solve_ivp
-from test_outputs import OPTIMISER, planned, simulated
+from test_outputs import OPTIMISER, planned
 
 import fpirhc as fp
 from fpirhc.status import Status

@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from plants import simulated
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
@@ -32,11 +33,6 @@ def on_outputs(problem: fp.Problem) -> fp.Problem:
     assert isinstance(problem.cost, fp.Quadratic)
     cost = replace(problem.cost, states={}, outputs=problem.cost.states)
     return replace(problem, plant=replace(problem.plant, outputs=SAME), cost=cost)
-
-
-def simulated(problem: fp.Problem, controller: Controller, seed: int = 0) -> fp.Run:
-    """A run in the virtual machine: most runs here are shorter than their compilation."""
-    return fp.simulate(problem, controller, seed=seed, compiled=False)
 
 
 @pytest.mark.parametrize("name", ["CTC", "CTC+FPI (eq 6)"])

@@ -9,7 +9,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from test_outputs import OPTIMISER, arm, circle, hill, planned, sedated, simulated
+from plants import simulated
+from test_outputs import OPTIMISER, arm, circle, hill, planned, sedated
 
 import fpirhc as fp
 from fpirhc.controllers.wrappers.predicted import output_ahead

@@ -13,7 +13,9 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from test_outputs import arm, circle, hill, planned, sedated, simulated
+from plants import simulated
+from test_outputs import arm, circle, hill, planned, sedated
+from test_outputs import depth_error as rms
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
@@ -87,10 +89,6 @@ def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
         x, w = z[:4], z[4:]
         assert np.allclose(run["estimate"][k], w, rtol=1e-3, atol=1e-4)
     assert np.ptp(run["estimate"], axis=0).min() > 0.05
-
-
-def rms(problem: fp.Problem, controller: fp.ComputedTorque | fp.RecedingHorizon | fp.Estimating) -> float:
-    return fp.measure(problem, simulated(problem, controller)).rms_error["depth"]
 
 
 def test_offset_free_control_of_a_wrong_curve() -> None:

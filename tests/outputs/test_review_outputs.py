@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_outputs import ARM, TRACK, arm, circle, curve, hill, planned, sedated, simulated
+from plants import simulated
+from test_outputs import ARM, TRACK, arm, circle, curve, hill, planned, sedated
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from on_problem import on_problem
-from test_outputs import simulated
+from plants import simulated
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller

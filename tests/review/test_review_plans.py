@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from plants import heavy
+from reviewed import about
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
@@ -52,11 +53,6 @@ def rate_weighted_gain(weight: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.
 def answers(problem: fp.Problem, controller: Controller) -> dict[str, fp.Answer]:
     report = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0)
     return {a.question: a for a in report.answers}
-
-
-def about(all_answers: dict[str, fp.Answer], words: str) -> fp.Answer:
-    [question] = [q for q in all_answers if words in q]
-    return all_answers[question]
 
 
 PLAIN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-3))

@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from filters import extended_filter, runge_kutta
+from plants import simulated as run
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.sensing.base import StateObserver
@@ -62,10 +62,6 @@ def sedated(observer: StateObserver | None, believed: float = 4.0, **changes: An
         "measure_from": 3.0,
     }
     return fp.Problem(plant=plant, reference=fp.Trajectory(motion), **(settings | changes))
-
-
-def run(problem: fp.Problem, controller: Controller, seed: int = 0) -> fp.Run:
-    return fp.simulate(problem, controller, seed=seed, compiled=False)
 
 
 # What is believed

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from gaps import gone_on
+from gaps import gone_on, status
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
@@ -69,10 +69,6 @@ def measurements() -> tuple[np.ndarray, np.ndarray]:
     """Times and samples of an ordinary run."""
     run = fp.simulate(TANK, fp.ComputedTorque(TRACK, SHAPE), seed=0, compiled=False)
     return run.time, raw_measurements(run)
-
-
-def status(stepper: fp.Stepper) -> Status:
-    return Status(int(stepper.trace()["status"][0]))
 
 
 def before_the_fault(stepper: fp.Stepper) -> tuple[np.ndarray, np.ndarray]:

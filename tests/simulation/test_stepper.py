@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from gaps import status
 from plants import linear
 
 import fpirhc as fp
@@ -40,10 +41,6 @@ def sample(run: fp.Run, cycle: int, **bad: float) -> tuple[float, np.ndarray, np
     """Time, state and response of one cycle, the named ones multiplied by a bad number."""
     time, state, realised = (bad.get(name, 1.0) for name in ("time", "state", "realised"))
     return time * float(run.time[cycle]), state * run["state"][cycle], realised * run["realised"][cycle]
-
-
-def status(stepper: fp.Stepper) -> Status:
-    return Status(int(stepper.trace()["status"][0]))
 
 
 @pytest.mark.parametrize("name", ["computed torque", "plan"])

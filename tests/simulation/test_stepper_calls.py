@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from gaps import status
 
 import fpirhc as fp
 from fpirhc.controllers.contract import named_in_task
@@ -41,10 +42,6 @@ def stepper(problem=PROBLEM, controller=CONTROLLER, **settings) -> fp.Stepper:
 def plain() -> fp.Stepper:
     """One for tests that leave it as it is."""
     return stepper()
-
-
-def status(one: fp.Stepper) -> Status:
-    return Status(int(one.trace()["status"][0]))
 
 
 def test_it_says_what_it_is():
