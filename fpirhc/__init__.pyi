@@ -84,6 +84,7 @@ from .simulation.pictures.base import Quantity
 from .simulation.pictures.grid import Grid
 from .simulation.pictures.heat_map import HeatMap
 from .simulation.pictures.over_time import OverTime
+from .simulation.pictures.planar import Planar, Shape
 from .simulation.pictures.portrait import Portrait
 from .simulation.pictures.raster import Raster
 from .simulation.run import Run, load_run
@@ -190,6 +191,7 @@ __all__ = [
     "PathConstraint",
     "Periodic",
     "Plan",
+    "Planar",
     "Plant",
     "Portrait",
     "PositionDifference",
@@ -219,6 +221,7 @@ __all__ = [
     "Sensor",
     "SequentialQuadratic",
     "Setpoint",
+    "Shape",
     "ShiftPolynomial",
     "Sigmoid",
     "Sine",

@@ -80,3 +80,17 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")
+
+
+def mechanism(q, v, p):
+    """Rail, cart and pole; the angle is from upright."""
+    tip = (q.cart - p.l * ca.sin(q.angle), p.l * ca.cos(q.angle))
+    return [
+        fp.Shape.line((-1.5, -0.09), (1.5, -0.09)),
+        fp.Shape.box((q.cart, 0.0), 0.3, 0.18),
+        fp.Shape.line((q.cart, 0.0), tip),
+        fp.Shape.disc(tip, 0.1 * p.m ** (1 / 3)),
+    ]
+
+
+pictures = (fp.Planar("Cart and pole", plant, mechanism, controllers=headline),)

@@ -84,3 +84,17 @@ controllers = {
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }
 headline = ("slots", "slots+FPI")
+
+
+def mechanism(q, v, p):
+    """Rail, cart, rope and load."""
+    load = (q.cart + p.l * ca.sin(q.angle), -p.l * ca.cos(q.angle))
+    return [
+        fp.Shape.line((-1.5, 0.07), (0.5, 0.07)),
+        fp.Shape.box((q.cart, 0.0), 0.3, 0.14),
+        fp.Shape.line((q.cart, 0.0), load),
+        fp.Shape.disc(load, 0.08 * p.m ** (1 / 3)),
+    ]
+
+
+pictures = (fp.Planar("The crane", plant, mechanism, controllers=headline),)

@@ -152,3 +152,18 @@ controllers = {
     "Slotine-Li+FPI": fp.rivals.SlotineLi(6.0, damping, projection, bounds, deformation=sigmoid),
 }
 headline = ("CT", "CT+FPI")
+
+
+def mechanism(q, v, p):
+    """Two links from the base, and the load at the tip."""
+    elbow = (L1 * ca.cos(q.q1), L1 * ca.sin(q.q1))
+    tip = (elbow[0] + L2 * ca.cos(q.q1 + q.q2), elbow[1] + L2 * ca.sin(q.q1 + q.q2))
+    return [
+        fp.Shape.disc((0.0, 0.0), 0.03),
+        fp.Shape.line((0.0, 0.0), elbow, tip),
+        fp.Shape.disc(elbow, 0.02),
+        fp.Shape.disc(tip, 0.03 * p.load ** (1 / 3)),
+    ]
+
+
+pictures = (fp.Planar("The arm", plant, mechanism, controllers=headline),)

@@ -96,6 +96,21 @@ controllers = {
     "RHC+FPI, stiff, small S": fp.RecedingHorizon(optimiser, fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), cost=stiff),
 }
 headline = ("RHC", "RHC+FPI")  # the published form
+
+
+def mechanism(q, v, p):
+    """Ceiling, springs and masses; a mass is as large as it is heavy."""
+    size1, size2 = 0.4 * p.m1 ** (1 / 3), 0.4 * p.m2 ** (1 / 3)
+    return [
+        fp.Shape.line((-0.7, 0.0), (0.7, 0.0)),
+        fp.Shape.spring((0.0, 0.0), (0.0, size1 / 2 - q.q1), width=0.3),
+        fp.Shape.box((0.0, -q.q1), size1, size1),
+        fp.Shape.spring((0.0, -q.q1 - size1 / 2), (0.0, size2 / 2 - q.q2), width=0.3),
+        fp.Shape.box((0.0, -q.q2), size2, size2),
+    ]
+
+
+pictures = (fp.Planar("The two masses", plant, mechanism, "The distance downwards is q.", controllers=headline),)
 tuning = {
     "CTC": {"tracking.rate": fp.LogSpan(2.0, 20.0)},  # 1/s
     "CTC+FPI (eq 6)": {"tracking.rate": fp.LogSpan(2.0, 20.0), "deformation.gain": fp.LogSpan(-1.5, -0.05)},

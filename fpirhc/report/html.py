@@ -12,7 +12,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +30,7 @@ from fpirhc.report.figures import (
 )
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
 from fpirhc.simulation.log import shown_motion
+from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import readable
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import Column, Table
@@ -101,18 +102,21 @@ def write_report(comparison: Comparison, path: Path) -> None:
 def render(comparison: Comparison) -> str:
     """Return the page's text."""
     pair, entries = headline_pair(comparison), comparison.entries
-    series = {**chart_data(comparison, PALETTE), "bands": BANDS, "begin": [e.name for e in pair] if pair else []}
+    own, motions = own_pictures(comparison)
+    begin = [e.name for e in pair] if pair else []
+    series = {**chart_data(comparison, PALETTE), "bands": BANDS, "begin": begin, "motions": motions}
     data = json.dumps(series, separators=(",", ":")).replace("<", "\\u003c")
     contraction, lyapunov = contraction_figure(comparison), lyapunov_figure(comparison)
     return render_page(
         "comparison.html",
         comparison.view,
-        (asset("uPlot.iife.min.js"), f"const DATA={data};\n{asset('report.js')}"),
+        (asset("uPlot.iife.min.js"), planar.script(), f"const DATA={data};\n{asset('report.js')}"),
         predicted=any(e.prediction is not None and e.prediction.tube is not None for e in entries),
         slots=_slots(comparison),
         bands=BANDS,
         pairs=_pairs(*pair) if pair else [],
-        own=own_pictures(comparison),
+        own=own,
+        motions=motions,
         contraction=[Image(contraction.address, _CONTRACTION)] if contraction else [],
         contracts=_contracts(comparison),
         lyapunov=[Image(lyapunov.address, "Lyapunov function over time with its ultimate bound", _LYAPUNOV)]
@@ -161,15 +165,19 @@ def _pairs(plain: Entry, adaptive: Entry) -> list[Image]:
     ]
 
 
-def own_pictures(comparison: Comparison) -> list[Image]:
-    """Return the pictures that the problem file lists; one of whose controllers none ran is left out."""
-    runs = {e.name: e.run for e in comparison.entries if e.run.cycles > 1}
-    return [image for wanted in comparison.pictures if (image := _own(wanted, runs))]
-
-
-def _own(wanted: Picture, runs: Mapping[str, Run]) -> Image | None:
-    shown = {name: run for name, run in runs.items() if not wanted.controllers or name in wanted.controllers}
-    return _drawn(wanted, list(shown), lambda figure: wanted.draw(figure, shown))
+def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, Any]]]:
+    """Return the pictures that the problem file lists, and those that move; one of whose controllers none ran is left out."""
+    runs, images, motions = {e.name: e.run for e in comparison.entries if e.run.cycles > 1}, [], []
+    for wanted in comparison.pictures:
+        shown = {name: run for name, run in runs.items() if not wanted.controllers or name in wanted.controllers}
+        try:
+            motion = dict(wanted.motion(shown))
+        except FpirhcError:
+            motion = {}  # `draw` says why
+        image = None if motion else _drawn(wanted, list(shown), partial(wanted.draw, runs=shown))
+        motions += [motion] if motion else []
+        images += [image] if image else []
+    return images, motions
 
 
 def _drawn(wanted: Picture, names: Sequence[str], draw: Callable[[Drawing], None]) -> Image | None:
@@ -253,7 +261,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     from markupsafe import Markup
 
     every = [Markup(script) for script in (asset("table.js"), *scripts)]
-    styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")]
+    styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")] + [Markup(planar.styles())]
     template = _environment().get_template(name)
     return template.render(view=view, policy=Markup(_policy(every)), styles=styles, scripts=every, **context)
 

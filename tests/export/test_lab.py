@@ -35,7 +35,8 @@ globalThis.postMessage = (said) => { if (said.ready) return onmessage({ data: { 
 def made(name: str, duration: float | None = None) -> Lab:
     task = fp.load_problem(name)
     problem = task.problem if duration is None else replace(task.problem, duration=duration, measure_from=0.0)
-    return make_lab(name, task.title, name, problem, {n: task.controllers[n] for n in CASES[name]})
+    chosen = {n: task.controllers[n] for n in CASES[name]}
+    return make_lab(name, task.title, name, problem, chosen, pictures=task.pictures)
 
 
 def answers(lab: Lab, moved: dict[str, float], folder: Path) -> Any:
@@ -100,6 +101,11 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
         for column, values in zip(loop.shown, one["columns"], strict=True):
             wanted = np.ravel(run[column])[:: loop.every]
             assert np.abs(np.array(values) - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max()), column
+        assert (loop.picture is not None) == (name in ("two_mass", "crane_slots"))
+        if loop.picture:
+            followed = np.array([run[c][:: loop.frame] for c in loop.picture.columns(run.layout)])
+            wanted = np.array(loop.drawn(followed, variant.plant.exact)).T.ravel()
+            assert np.abs(np.array(one["frames"]) - wanted).max() <= 1e-12 * np.abs(wanted).max()
         error = np.reshape(run[loop.error], (problem.cycles, -1))
         counted = error[int(np.ceil(problem.measure_from / problem.period - 1e-9)) :]
         assert np.allclose(one["squares"], (counted**2).sum(axis=0), rtol=1e-9, atol=0)
@@ -192,5 +198,5 @@ def test_a_page_runs_its_own_scripts_and_webassembly_alone(short, monkeypatch):
     assert "default-src 'none'" in policy
     assert "'wasm-unsafe-eval'; worker-src blob:;" in policy
     assert "<title>&lt;b&gt;&amp;: lab</title>" in text
-    assert text.count("</script>") == 2
+    assert text.count("</script>") == 3
     assert "@" not in resources.files("fpirhc.export.lab").joinpath("lab.js").read_text()

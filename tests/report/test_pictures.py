@@ -13,7 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, InvalidValue, ProblemFileError
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
 from fpirhc.report.html import own_pictures, render, render_scenarios
 from fpirhc.simulation.pictures.base import Kept, extremes
 from fpirhc.simulation.pictures.heat_map import averaged
@@ -129,7 +129,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path, monkey
         FILE % "fp.Portrait('good', x='state.q', y='error.q'), fp.Portrait('bad', x='state.p', y='state.q')"
     )
     comparison = fp.compare(fp.load_problem(str(path)), seed=0, compiled=False)
-    good, bad = own_pictures(comparison)
+    (good, bad), _ = own_pictures(comparison)
     assert good.source.startswith("data:image/png")
     assert not bad.source
     page = render(comparison).partition("Pictures of this problem")[2].partition("</section>")[0]
@@ -137,7 +137,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path, monkey
     assert "bad is not drawn" in page
     first: Any = comparison.pictures[0]
     absent = replace(first, controllers=("RHC",))
-    assert own_pictures(replace(comparison, pictures=(absent,))) == []
+    assert own_pictures(replace(comparison, pictures=(absent,))) == ([], [])
     assert "Pictures of this problem" not in render(replace(comparison, pictures=()))
 
 
@@ -275,3 +275,74 @@ def test_pictures_of_cases_are_drawn_from_what_was_kept(tmp_path, monkeypatch):
     run = fp.simulate(task.cases.problem("light", task.problem), task.controllers["CTC"], seed=0, compiled=False)
     np.testing.assert_allclose(first, run["state.q"], atol=1e-12)
     assert first != second
+
+
+def cart(q, p):
+    """A cart that is as long as it is heavy, its wheel, and the spring to the wall."""
+    return [
+        fp.Shape.box((q.q, 0.0), p.mass, 0.2),
+        fp.Shape.disc((q.q, -0.1), 0.05),
+        fp.Shape.spring((-2.0, 0.0), (q.q, 0.0)),
+    ]
+
+
+def planar(shapes: Any = None) -> fp.Planar:
+    return fp.Planar("cart", spring().plant, shapes or (lambda q, v, p: cart(q, p)))
+
+
+def test_a_mechanism_has_the_numbers_of_the_run_and_of_its_reference(runs):
+    """Corners of the box are the position and half the exact mass; the reference's lie behind, with its position."""
+    run, picture = runs["slow"], planar()
+    numbers = picture.frames(run, np.arange(run.cycles))
+    width = sum(2 * one["points"] + one["disc"] for one in picture.outlines)
+    assert numbers.shape == (run.cycles, 2 * width)
+    for begin, signal in ((0, "plant_state.q"), (width, "reference.q")):
+        np.testing.assert_allclose(numbers[:, begin], run[signal] - 0.5, atol=1e-12)
+        np.testing.assert_allclose(numbers[:, begin + 2], run[signal] + 0.5, atol=1e-12)
+        np.testing.assert_allclose(
+            numbers[:, begin + 8 : begin + 11].T, [run[signal], *np.full((2, run.cycles), [[-0.1], [0.05]])], atol=1e-12
+        )
+        np.testing.assert_allclose(numbers[:, begin + width - 2], run[signal], atol=1e-12)
+
+
+def test_a_page_has_the_frames_that_move_and_the_numbers_that_stand_still(runs):
+    motion: Any = planar().motion(runs)
+    one = motion["runs"][1]
+    assert (one["name"], one["step"], motion["duration"], motion["seconds"]) == ("quick", 4e-3, 1.0, 10.0)
+    frames = np.array(one["numbers"]).reshape(-1, len(one["moves"]))
+    assert len(frames) == 250
+    whole = np.tile(one["still"], (250, 1))
+    whole[:, one["moves"]] = frames
+    np.testing.assert_allclose(whole, planar().frames(runs["quick"], np.arange(0, 1000, 4)), rtol=1e-4, atol=1e-6)
+    assert planar().motion({}) == {}
+
+
+def test_a_mechanism_stands_still_where_nothing_can_move(runs):
+    """Moments of the run, a panel for each controller, three shapes each."""
+    figure = Figure()
+    planar().draw(figure, runs)
+    assert [a.get_title() for a in figure.axes] == ["slow", "quick"]
+    assert [len(a.lines) for a in figure.axes] == [9, 9]
+    assert [len(a.patches) for a in figure.axes] == [18, 18]
+
+
+def test_a_notebook_plays_a_mechanism_in_a_frame_of_its_own(runs):
+    shown = planar().player({"<b>": runs["slow"]})._repr_html_()
+    assert "sandbox='allow-scripts'" in shown
+    assert "<b>" not in shown
+    assert "src=" not in shown.replace("srcdoc=", "")
+    assert "prefers-reduced-motion" in shown
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        (lambda q, v, p: "box", r"Planar\('cart', shapes=...\): expected a list of fp.Shape, got 'box'"),
+        (lambda q, v, p: [], r"expected a list of fp.Shape, got \[\]"),
+        (lambda q, v, p: [fp.Shape.line((0, 0, 0))], r"expected points \(x, y\) of scalars"),
+        (lambda q, v, p: [fp.Shape.disc((q.q, 0.0), p.radius)], r"Planar\('cart', shapes=...\).*radius.*mass"),
+    ],
+)
+def test_a_mistake_in_a_mechanism_is_named(shapes, message):
+    with pytest.raises((InvalidValue, InvalidProblem), match=message):
+        planar(shapes)

@@ -30,9 +30,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
     path = Path(options.out or "results")
     path = path / f"{task.name}-lab.html" if path.is_dir() or not options.out else path
     output_folder(path.parent)
-    lab = make_lab(
-        task.name, task.title, options.problem, task.problem, {name: chosen[name] for name in names}, options.live
-    )
+    shown = {name: chosen[name] for name in names}
+    lab = make_lab(task.name, task.title, options.problem, task.problem, shown, options.live, task.pictures)
     write_lab(lab, path)
     print(f"{len(lab.sliders)} sliders for {', '.join(names)}")
     for number, why in lab.without.items():

@@ -59,6 +59,10 @@ function changed() {
   remember();
 }
 
+// The mechanism, and the cursor of the charts at its time
+const point = (time) => charts.forEach(({ plot }) => plot.setCursor({ left: plot.valToPos(time, "x"), top: -10 }, false));
+const moving = DATA.motion && play(document.getElementById("motion"), DATA.motion, point, true);
+
 // Charts
 const charts = DATA.charts.map((spec) => {
   const box = document.createElement("div"), title = document.createElement("h3");
@@ -71,7 +75,8 @@ const charts = DATA.charts.map((spec) => {
   const axis = { stroke: ink, grid: { stroke: faint, width: 1 }, ticks: { stroke: faint, width: 1 } };
   const plot = new uPlot(
     { width: box.clientWidth || 400, height: 200, series: [{ label: "t [" + DATA.timeUnit + "]" }, ...lines], scales: { x: { time: false } },
-      axes: [{ ...axis, label: "t [" + DATA.timeUnit + "]", size: 30, labelSize: 18 }, { ...axis, size: 62 }], cursor: { sync: { key: "time" } } },
+      axes: [{ ...axis, label: "t [" + DATA.timeUnit + "]", size: 30, labelSize: 18 }, { ...axis, size: 62 }], cursor: { sync: { key: "time" } },
+      hooks: { setCursor: [(u) => u.cursor.left >= 0 && moving?.follow(u.posToVal(u.cursor.left, "x"))] } },
     [[], ...lines.map(() => [])], box);
   return { spec, box, plot };
 });
@@ -86,6 +91,7 @@ function draw(answers) {
     if (spec.aims !== null) series.push(longest.columns[spec.aims]);
     plot.setData([longest.columns[0], ...series]);
   }
+  moving?.load(answers.map((one, k) => ({ name: DATA.loops[k].name, color: colors[k], step: DATA.motion.step, width: one.frameWidth, numbers: one.frames })));
   say("sentence", verdict(answers));
   const sorted = [...times].slice(-50).sort((a, b) => a - b), worst = sorted[Math.floor(0.95 * (sorted.length - 1))];
   say("rate", answers.map((a, k) => DATA.loops[k].name + " " + a.took.toFixed(0) + " ms").join(", ") +

@@ -17,6 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
@@ -29,6 +30,9 @@ from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.loop import start_memory
+from fpirhc.simulation.pictures import planar
+from fpirhc.simulation.pictures.base import Picture
+from fpirhc.simulation.pictures.planar import Planar
 from fpirhc.simulation.simulate import Simulator, run_tables, simulator
 from fpirhc.symbolic.driver import SIGNATURE
 from fpirhc.symbolic.live import PREFIX
@@ -38,6 +42,7 @@ from fpirhc.task.reference import pairs
 from fpirhc.whole_file import write_whole
 
 _POINTS = 2000  # of a curve
+_FRAMES = 500  # of a mechanism that moves
 _SPAN = 4.0  # a slider goes from a fourth to four times its number
 _WAIT = 5  # cycles of dead time that an input without any may get
 _RANDOM = ("sensing", "disturbances")  # parts of a problem with random series
@@ -90,10 +95,12 @@ class LabLoop:
     Args:
         name: of the controller.
         ready: the loop with its live settings.
+        picture: the mechanism that moves with it; None: none.
     """
 
     name: str
     ready: Simulator
+    picture: Planar | None = None
 
     @cached_property
     def start(self) -> np.ndarray:
@@ -150,15 +157,40 @@ class LabLoop:
                 for k, size in enumerate(count)
             ),
             "arguments": "\n".join(f"    arg[{k + 1}] = table_{k} + k * {size};" for k, size in enumerate(count)),
+            "frame": str(self.frame),
+            "drawing": "static void draw(int row, const double* held) { (void)row, (void)held; }",
         }
-        files = {"lab_run.c": template("loop.c", words, __package__)}
-        files |= {f"lab_step{k}.c": text for k, text in enumerate(own)}
+        files = {f"lab_step{k}.c": text for k, text in enumerate(own)}
+        if self.picture:
+            drawn, sizes = c_of(self.drawn, "lab_drawn")
+            files |= {f"lab_drawn{k}.c": text for k, text in enumerate(drawn)}
+            followed = [places[name] for name in self.picture.columns(loop.trace)]
+            numbers = {"numbers": self.drawn.numel_out(0), "exact": loop.memory.slice("_exact").start}
+            words["drawing"] = template(
+                "drawing.c",
+                {key: str(size) for key, size in (sizes | numbers).items()}
+                | {"declaration": words["declaration"].replace("lab_raw", "lab_drawn_raw")}
+                | {"followed": ", ".join(map(str, followed)), "count": str(len(followed))},
+                __package__,
+            )
+        files["lab_run.c"] = template("loop.c", words, __package__)
         return web_module(with_own_math(files, "lab"))
 
     @property
     def every(self) -> int:
         """A curve has one point per so many cycles."""
         return max(1, self.ready.problem.cycles // _POINTS)
+
+    @property
+    def frame(self) -> int:
+        """The mechanism has one frame per so many cycles."""
+        return max(1, self.ready.problem.cycles // _FRAMES)
+
+    @cached_property
+    def drawn(self) -> ca.Function:
+        """The Function (signals that the mechanism follows, exact parameters) -> numbers of its shapes."""
+        assert self.picture is not None
+        return self.picture.function(len(self.picture.columns(self.ready.loop.trace)))
 
     @cached_property
     def tables(self) -> list[np.ndarray]:
@@ -188,7 +220,13 @@ class Lab:
 
 
 def make_lab(
-    title: str, about: str, file: str, problem: Problem, controllers: dict[str, Controller], live: Sequence[str] = ()
+    title: str,
+    about: str,
+    file: str,
+    problem: Problem,
+    controllers: dict[str, Controller],
+    live: Sequence[str] = (),
+    pictures: Sequence[Picture] = (),
 ) -> Lab:
     """Return the loops of some controllers with their sliders.
 
@@ -199,6 +237,7 @@ def make_lab(
         problem: the task; its equations run in the page, so a reality outside cannot.
         controllers: by name.
         live: paths of settings with a slider; none: gains, rates, and the limits of inputs.
+        pictures: of the problem; the first `Planar` moves with the loops.
 
     Raises:
         NotSupported: a plant outside, zig is not installed, or a controller that needs a solver's own library.
@@ -212,7 +251,8 @@ def make_lab(
     for name, controller in controllers.items():
         roomy = _with_room(problem, controller)
         wanted = list(live) or _usual(roomy, controller)
-        loops.append(LabLoop(name, _with_live(roomy, controller, wanted, without)))
+        ready = _with_live(roomy, controller, wanted, without)
+        loops.append(LabLoop(name, ready, _mechanism(ready, pictures, without)))
     lost = [path for path in live if not any(loop.opens(path) for loop in loops)]
     if lost:
         raise NotSupported(
@@ -225,6 +265,21 @@ def make_lab(
         *_set_points(problem, loops),
     ]
     return Lab(title, about, file, tuple(loops), tuple(sliders), without)
+
+
+def _mechanism(ready: Simulator, pictures: Sequence[Picture], without: dict[str, str]) -> Planar | None:
+    """The first picture of a mechanism, whose state and parameters the loop must have."""
+    picture = next((one for one in pictures if isinstance(one, Planar)), None)
+    if picture is None:
+        return None
+    loop = ready.loop
+    lost = [name for name in picture.columns(loop.trace) if name not in loop.trace.columns]
+    if not lost and loop.memory["_exact"].elements == tuple(picture.plant.parameters):
+        return picture
+    without[picture.title] = (
+        f"the plant that moves has no '{lost[0]}'" if lost else "the plant that moves is another one"
+    )
+    return None
 
 
 def _usual(problem: Problem, controller: Controller) -> list[str]:
@@ -443,9 +498,10 @@ def page(lab: Lab) -> str:
         "setPoints": {name: pairs(name, own) for name, own in problem.reference.set_points.items()},
         "without": lab.without,
         "charts": _charts(lab),
+        "motion": _motion(lab),
     }
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    scripts = (asset("uPlot.iife.min.js"), f"const DATA={text};\n{_own('lab.js')}")
+    scripts = (asset("uPlot.iife.min.js"), planar.script(), f"const DATA={text};\n{_own('lab.js')}")
     hashes = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in scripts)
     policy = (
         f"default-src 'none'; script-src {hashes} 'wasm-unsafe-eval'; worker-src blob:; style-src 'unsafe-inline'; "
@@ -455,7 +511,7 @@ def page(lab: Lab) -> str:
         "title": html.escape(lab.title),
         "about": html.escape(" ".join(lab.about.split())),
         "policy": policy,
-        "styles": asset("uPlot.min.css") + asset("report.css") + _own("lab.css"),
+        "styles": asset("uPlot.min.css") + asset("report.css") + planar.styles() + _own("lab.css"),
         "scripts": "\n".join(f"<script>{one}</script>" for one in scripts),
     }
     return template("page.html", words, __package__)
@@ -476,7 +532,17 @@ def _loop_data(loop: LabLoop) -> dict[str, Any]:
         "shown": len(loop.shown),
         "errors": len(loop.ready.loop.trace[loop.error].columns),
         "live": list(loop.ready.live.paths),
+        "frame": loop.frame,
+        "numbers": loop.drawn.numel_out(0) if loop.picture else 0,
     }
+
+
+def _motion(lab: Lab) -> dict[str, Any] | None:
+    """What the page says of the mechanism; None where a loop has none."""
+    first, problem = lab.loops[0], lab.loops[0].ready.problem
+    if not all(loop.picture for loop in lab.loops) or first.picture is None:
+        return None
+    return first.picture.played(problem.duration, problem.time_unit) | {"step": first.frame * problem.period}
 
 
 def _charts(lab: Lab) -> list[dict[str, Any]]:

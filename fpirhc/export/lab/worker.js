@@ -30,7 +30,8 @@ function run(loop, numbers, parts) {
   const kept = new Float64Array(e.memory.buffer, e.kept_at(), rows * width);
   const columns = Array.from({ length: width }, (_, j) => Float64Array.from({ length: rows }, (_, k) => kept[k * width + j]));
   const squares = [...new Float64Array(e.memory.buffer, e.squares_at(), loop.errors)];
-  return { cycles, columns, squares, took: performance.now() - began };
+  const frames = loop.numbers ? new Float64Array(e.memory.buffer, e.frames_at(), Math.ceil(cycles / loop.frame) * loop.numbers).slice() : null;
+  return { cycles, columns, squares, frames, frameWidth: loop.numbers, took: performance.now() - began };
 }
 
 onmessage = async ({ data }) => {

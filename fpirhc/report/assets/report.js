@@ -60,6 +60,15 @@ function changes(chart, spec) {
   ctx.restore();
 }
 
+// Moving pictures show the time of the charts' cursor, and the charts' cursor is at the time that they show.
+const players = [];
+function follow(chart) {
+  if (chart.cursor.left >= 0) for (const one of players) one.follow(chart.posToVal(chart.cursor.left, "x"));
+}
+function point(time) {
+  for (const { chart, box } of plots) if (!box.hidden) chart.setCursor({ left: chart.valToPos(time, "x"), top: -10 }, false);
+}
+
 // All boxes stand in the grid before a chart is drawn: a box that is alone in it is as wide as the page.
 function place(spec) {
   const box = document.createElement("div");
@@ -93,7 +102,7 @@ function draw({ box, spec }) {
     scales: { x: { time: false } },
     axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, size: 62 }],
     cursor: { sync: { key: sync.key } },
-    hooks: { setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => changes(chart, spec)] },
+    hooks: { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => changes(chart, spec)] },
   };
   const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });
@@ -136,6 +145,11 @@ function control(controller) {
   return { box, name: controller.name };
 }
 
+document.querySelectorAll(".moves").forEach((box, k) => {
+  const spec = DATA.motions[k];
+  spec.runs.forEach((run) => (run.color = colors[run.name]));
+  players.push(play(box, spec, point));
+});
 const boxes = DATA.controllers.map(control);
 DATA.charts.map(place).forEach(draw);
 // Begin with the controllers of the verdict's first sentence, so that a diverged one does not set every scale.

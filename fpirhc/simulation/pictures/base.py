@@ -66,6 +66,10 @@ class Picture(Checked, ABC):
             InvalidName: a run does not have a signal; the message names the nearest one.
         """
 
+    def motion(self, runs: Mapping[str, Run]) -> Mapping[str, object]:  # noqa: ARG002
+        """Return what a page needs to play the runs, by name of their controller; nothing where the picture stands still."""
+        return {}
+
     def kept(self, run: Run) -> Kept:  # noqa: ARG002
         """Return what the picture needs of the run of a case to show many of them; nothing where it shows single runs."""
         return {}
