@@ -79,14 +79,11 @@ from .sensing.observers.moving_horizon_states import MovingHorizonStates
 from .simulation.lyapunov_view import lyapunov_view
 from .simulation.machine import RunMonitor
 from .simulation.metrics import Metric, figures, measure
-from .simulation.pictures.band import Band
 from .simulation.pictures.base import Quantity
-from .simulation.pictures.grid import Grid
+from .simulation.pictures.cases import Band, Grid
 from .simulation.pictures.heat_map import HeatMap
-from .simulation.pictures.over_time import OverTime
+from .simulation.pictures.lines import OverTime, Portrait, Raster
 from .simulation.pictures.planar import Planar, Shape
-from .simulation.pictures.portrait import Portrait
-from .simulation.pictures.raster import Raster
 from .simulation.run import Run, load_run
 from .simulation.simulate import simulate, simulator
 from .simulation.stepper import Stepper

@@ -55,7 +55,7 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
     def check(problem: str | Path, controller: str | None = None) -> Judgement | None:
         __tracebackhide__ = True
         from fpirhc.baselines.check import check_baseline
-        from fpirhc.baselines.outline import clean, headline, remarks, sentence
+        from fpirhc.baselines.printing import clean, headline, remarks, sentence
         from fpirhc.problem_files.problem_file import load_problem
 
         path = config.rootpath / problem

@@ -210,6 +210,15 @@ def _new_numbers(entry: Entry) -> Iterator[tuple[float, str, float]]:
         last = numbers
 
 
+def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
+    """Write the report, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_whole(render_scenarios(comparison), path, "report")
+
+
 def render_scenarios(comparison: ScenarioComparison) -> str:
     """Return the page's text."""
     figure = mismatch_figure(comparison) if comparison.summaries else None

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.errors import InvalidName, InvalidProblem, nearest
+from fpirhc.errors import InvalidProblem
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.certificate import Certificate, certify
 from fpirhc.optimisers.plan import Plan, solve
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
+from fpirhc.studies.comparison.optimiser_choices import chosen_optimisers
 from fpirhc.task.exogenous import previewed_values
 
 
@@ -48,10 +48,7 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
     problem = task.problem
     if problem.horizon is None or problem.cost is None:
         raise InvalidProblem(f"problem '{task.name}' has no horizon or no cost; give Problem(horizon=..., cost=...)")
-    choices = optimiser_choices()
-    unknown = [n for n in names if n != "all" and n not in choices]
-    if unknown:
-        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
+    choices = chosen_optimisers(names)
     plant = problem.plant
     ahead = previewed_values(plant, problem.signals)
     limits, start = problem.limits, problem.start_state
@@ -60,8 +57,7 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
     data = np.asarray(data_of(0.0, plant.approximate).full())
     first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
     solved = []
-    for name in choices if "all" in names else dict.fromkeys(names):
-        label, build = choices[name]
+    for label, build in choices.values():
         plan = solve(ocp, build(tolerance), first, data)
         solved.append(Solved(label, plan, None if plan.overflow() else certify(plan)))
     return solved

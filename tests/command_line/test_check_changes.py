@@ -14,8 +14,7 @@ from fpirhc.baselines.bands import BANDED, Expected, Metric
 from fpirhc.baselines.baseline import Baseline, Settings, to_text
 from fpirhc.baselines.judging import BETTER, CHANGED, HOLDS, WORSE, Judgement, Row, ignoring, judge
 from fpirhc.baselines.measuring import FINISHED, Measurement
-from fpirhc.baselines.outline import change, outline
-from fpirhc.baselines.printing import show_check, to_markdown
+from fpirhc.baselines.printing import cells, change, explained, headline, in_summary, sentence, show_check, to_markdown
 from fpirhc.baselines.reading import new_metrics, new_settings, read_baseline
 from fpirhc.cli.options import percent
 
@@ -70,15 +69,15 @@ def test_the_largest_change_stands_first(capsys):
     """An outcome before all numbers; what holds comes last."""
     old = {"RHC": errors(a=1.0, b=1.0, c=1.0, d=1.0), "PID": errors(a=1.0)}
     new = {"RHC": errors(a=1.1, b=3.0, c=0.5, d=1.0), "PID": errors(a=1.2)}
-    section = outline([judged(old, new, SAME, SAME)]).sections[0]
-    assert [(line.cells[0], line.cells[3]) for line in section.by_size if not line.holds] == [
+    _, rows = explained(judged(old, new, SAME, SAME))
+    assert [(row.controller, cells(row)[3]) for row in rows if not row.holds] == [
         ("RHC", "+200 %"),
         ("RHC", "-50 %"),
         ("PID", "+20 %"),
         ("RHC", "+10 %"),
     ]
-    assert section.by_size[-1].holds
-    show_check(outline([judged(old, new, SAME, SAME)]), every=False)
+    assert rows[-1].holds
+    show_check([judged(old, new, SAME, SAME)], {}, every=False)
     shown = capsys.readouterr().out
     assert shown.index("+200 %") < shown.index("-50 %") < shown.index("+20 %") < shown.index("+10 %")
 
@@ -89,21 +88,20 @@ def test_a_stale_setting_stands_first_with_its_consequences_folded(capsys):
     old = {"RHC": errors(a=1.0, b=1.0), "PID": errors(a=1.0)}
     new = {"RHC": errors(a=1.1, b=3.0), "PID": errors(a=1.2)}
     judgement = judged(old, new, SAME, now)
-    contents = outline([judgement])
-    [cause] = contents.sections[0].causes
-    assert cause.text == "stale: controller 'RHC': gain was 1.0, is 1.5"
-    assert [line.cells[3] for line in cause.lines] == ["+200 %", "+10 %"]
-    assert [line.cells[3] for line in contents.sections[0].by_size if not line.holds] == ["+20 %"]
-    show_check(contents, every=False)
+    [(text, own)], others = explained(judgement)
+    assert text == "stale: controller 'RHC': gain was 1.0, is 1.5"
+    assert [cells(row)[3] for row in own] == ["+200 %", "+10 %"]
+    assert [cells(row)[3] for row in others if not row.holds] == ["+20 %"]
+    show_check([judgement], {}, every=False)
     shown = " ".join(capsys.readouterr().out.split())
     assert shown.startswith("case: stale: controller 'RHC': gain was 1.0, is 1.5")
     assert "2 metrics changed with it (RHC: rms_error.b +200 %; RHC: rms_error.a +10 %); --all shows them" in shown
     assert shown.index("gain was") < shown.index("2 metrics changed") < shown.index("+20 %")
     assert shown.count("gain was") == 1
-    page = to_markdown(contents)
+    page = to_markdown([judgement], {})
     assert page.index("gain") < page.index("<details><summary>2 metrics changed with it") < page.index("+20 ")
     assert page.index("+200 ") < page.index("</details>") < page.index("+20 ")
-    show_check(contents, every=True)
+    show_check([judgement], {}, every=True)
     assert "+10 %" in capsys.readouterr().out
 
 
@@ -112,10 +110,9 @@ def test_a_setting_of_the_problem_explains_every_change():
     now = Settings({"period": 2e-3}, {**SAME.controllers, "RHC": {"gain": 1.5}})
     old = {"RHC": errors(a=1.0), "PID": errors(a=1.0)}
     new = {"RHC": errors(a=1.1), "PID": errors(a=1.2)}
-    section = outline([judged(old, new, SAME, now)]).sections[0]
-    assert [len(cause.lines) for cause in section.causes] == [2, 0]
-    assert section.unclear
-    assert all(line.holds for line in section.by_size)
+    causes, others = explained(judged(old, new, SAME, now))
+    assert [len(rows) for _, rows in causes] == [2, 0]
+    assert all(row.holds for row in others)
 
 
 def test_a_floor_ignores_small_changes_and_nothing_else():
@@ -209,7 +206,7 @@ def test_what_is_not_compared_is_renamed_too():
     assert changed == {"cost.correction": "cost.deviation"}
 
 
-# Terminal and Markdown say the same about a check, because they lay out one outline
+# Terminal and Markdown say the same about a check, because they lay out the same rows, headlines and remarks
 
 
 HOLDING = Row("RHC", "rms_error.y", 1.0, 1.0, 0.1, "holds")
@@ -222,29 +219,24 @@ BAD = Judgement(
 )
 MISSING = Judgement("missing", unusable=("there is no baseline 'missing.json'",))
 BROKEN = Judgement("broken", broken="no file at 'broken.py'")
-EVERY = outline([GOOD, BAD, MISSING, BROKEN], [("chain", "takes a minute")])
+EVERY = [GOOD, BAD, MISSING, BROKEN], {"chain": "takes a minute"}
 
 
 @pytest.fixture
 def texts(capsys):
     """Both outputs, without what their formats add."""
-    show_check(EVERY, every=False)
+    show_check(*EVERY, every=False)
     terminal = " ".join(capsys.readouterr().out.split())
-    markdown = to_markdown(EVERY).replace("&#95;", "_").replace("&#58;", ":")
+    markdown = to_markdown(*EVERY).replace("&#95;", "_").replace("&#58;", ":")
     return {"terminal": terminal, "markdown": markdown}
 
 
-def test_an_outline_groups_by_controller_and_knows_what_changed():
-    """Controllers stand in the order of their rows; what is unclear is so for a reason."""
-    bad = EVERY.sections[1]
-    assert [case.controller for case in bad.cases] == ["RHC", "RHC+FPI", "PID"]
-    assert [line.cells[1] for case in bad.cases for line in case.changed] == ["effort.u", "outcome"]
-    assert [line.in_summary for line in bad.lines] == [True, False, True, True]
-    assert [one.holds for one in EVERY.sections] == [True, False, False, False]
-    assert [one.unclear for one in EVERY.sections] == [False, False, True, True]
-    assert bad.headline == "bad: 2 of 4 metrics changed"
-    assert bad.lines[2].sentence == "RHC+FPI: effort.u was 1, is 2 (+100 %, band \u00b1 0.1): worse"
-    assert bad.lines[3].sentence == "PID: outcome was finished, is ended early: changed"
+def test_a_summary_says_what_changed():
+    """A row in a sentence, a problem in one."""
+    assert [in_summary(row) for row in BAD.rows] == [True, False, True, True]
+    assert headline(BAD) == "bad: 2 of 4 metrics changed"
+    assert sentence(MUCH_WORSE) == "RHC+FPI: effort.u was 1, is 2 (+100 %, band \u00b1 0.1): worse"
+    assert sentence(ENDED) == "PID: outcome was finished, is ended early: changed"
 
 
 @pytest.mark.parametrize("form", ["terminal", "markdown"])
@@ -258,5 +250,5 @@ def test_metrics_that_hold_are_not_in_the_way(texts, capsys):
     """A count that holds is in no summary; --all shows it on the terminal."""
     assert "cycles" not in texts["terminal"]
     assert "cycles" not in texts["markdown"]
-    show_check(EVERY, every=True)
+    show_check(*EVERY, every=True)
     assert "cycles" in capsys.readouterr().out

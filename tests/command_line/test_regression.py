@@ -29,7 +29,6 @@ from fpirhc.baselines.measuring import (
     metric_of,
     variants,
 )
-from fpirhc.baselines.outline import outline
 from fpirhc.baselines.places import problems_here
 from fpirhc.baselines.printing import to_markdown
 from fpirhc.baselines.reading import read_baseline
@@ -362,7 +361,7 @@ def test_hostile_names_are_only_text(name):
     """Markdown holds no tag, link, mention or column of theirs."""
     row = Row(name, f"cost.{name}", 1.0, name, 0.1, "changed")
     judgement = Judgement(name, (row,), (f"stale: {name}",), "", name, name, (name,))
-    page = to_markdown(outline([judgement], [(name, name)]))
+    page = to_markdown([judgement], {name: name})
     tags = _Tags()
     tags.feed(page)
     assert tags.found == {("code", ())}

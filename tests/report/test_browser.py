@@ -19,7 +19,7 @@ from plants import chain, linear
 import fpirhc as fp
 from fpirhc.export.lab.lab import make_lab, write_lab
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.html import render_scenarios, write_report
+from fpirhc.report.html import write_report, write_scenarios
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 
@@ -126,7 +126,7 @@ def reports(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     write_report(compare(many, seed=0, compiled=False), paths["many"])
     write_report(compare(few, seed=0, compiled=False), paths["order_one"])
     study = compare_scenarios(few, count=3, percent=10.0, seed=0, folder=folder, compiled=False)
-    paths["scenarios"].write_text(render_scenarios(study), encoding="utf-8")
+    write_scenarios(study, paths["scenarios"])
     return paths
 
 

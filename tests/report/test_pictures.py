@@ -17,7 +17,7 @@ from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFile
 from fpirhc.report.html import own_pictures, render, render_scenarios
 from fpirhc.simulation.pictures.base import Kept, extremes
 from fpirhc.simulation.pictures.heat_map import averaged
-from fpirhc.simulation.pictures.raster import passages
+from fpirhc.simulation.pictures.lines import passages
 
 
 def spring(time=1.0):

@@ -11,8 +11,7 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.studies.scenarios.bench import RecordFields
 from fpirhc.studies.scenarios.ledger import Ledger, header_of
-from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
-from fpirhc.studies.scenarios.shards import merge_shards
+from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios, merge_shards
 
 STUDY = ("mrac_pendulum", "--scenarios", "7", "--mismatch", "20", "--controllers", "CTC", "CTC+FPI", "--no-compile")
 

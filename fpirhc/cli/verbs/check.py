@@ -28,9 +28,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.baselines.judging import ignoring
-    from fpirhc.baselines.outline import check_replaceable, outline
     from fpirhc.baselines.places import problems_here
-    from fpirhc.baselines.printing import MARK, show_check, to_markdown
+    from fpirhc.baselines.printing import MARK, check_replaceable, show_check, to_markdown
     from fpirhc.whole_file import write_whole
 
     if options.markdown:
@@ -38,10 +37,9 @@ def _run(options: argparse.Namespace) -> ExitCode:
     problems, unchecked = (options.problems, {}) if options.problems else problems_here(Path(), options.baselines)
     measured = _judgements(options, list(dict.fromkeys(map(str, problems))))
     judgements = [ignoring(judgement, options.ignore_below / 100) for judgement in measured]
-    contents = outline(judgements, list(unchecked.items()))
-    show_check(contents, options.all)
+    show_check(judgements, unchecked, options.all)
     if options.markdown:
-        write_whole(to_markdown(contents), options.markdown, "report")
+        write_whole(to_markdown(judgements, unchecked), options.markdown, "report")
     return _code(judgements)
 
 

@@ -17,8 +17,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     """Join the parts, and say what the whole has and how its report is made."""
-    from fpirhc.studies.scenarios.scenario_study import LEDGER
-    from fpirhc.studies.scenarios.shards import merge_shards
+    from fpirhc.studies.scenarios.scenario_study import LEDGER, merge_shards
 
     joined = merge_shards(options.folders, options.out)
     twice = f", {joined.twice} of them twice" if joined.twice else ""

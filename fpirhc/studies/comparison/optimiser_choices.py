@@ -26,6 +26,19 @@ def optimiser_choices() -> dict[str, Choice]:
     return choices
 
 
+def chosen_optimisers(names: Sequence[str]) -> dict[str, Choice]:
+    """Return the choices of these names; 'all' among them stands for every optimiser.
+
+    Raises:
+        InvalidName: an unknown optimiser.
+    """
+    choices = optimiser_choices()
+    unknown = [n for n in names if n != "all" and n not in choices]
+    if unknown:
+        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
+    return choices if "all" in names else {name: choices[name] for name in names}
+
+
 def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str] | None) -> Task:
     """Return the task with its planning controllers once per optimiser: the headline pair, or those named.
 
@@ -35,18 +48,14 @@ def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str]
         InvalidName: an unknown optimiser.
         InvalidProblem: no planning controller to vary.
     """
-    choices = optimiser_choices()
-    unknown = [n for n in names if n != "all" and n not in choices]
-    if unknown:
-        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
-    keys = list(choices) if "all" in names else list(dict.fromkeys(names))
+    choices = list(chosen_optimisers(names).values())
     sources = list(controllers or task.headline or task.controllers)
     planning = [name for name in sources if task.controllers[name].planner is not None]
     if not planning:
         raise InvalidProblem(f"problem '{task.name}': none of {', '.join(sources)} plans with an optimiser")
     varied: dict[str, Controller] = {}
     for name in sources if controllers else planning:
-        varied |= _varied(name, task.controllers[name], [choices[key] for key in keys])
+        varied |= _varied(name, task.controllers[name], choices)
     return replace(task, controllers=varied, headline=None)
 
 
