@@ -55,6 +55,42 @@ def rate_of(plant, command):
     return lambda t, x: plant.equations.rate(x, values(t), plant.exact).full().ravel()
 
 
+# Hahnfeldt's tumour
+
+
+def test_a_tumour_and_its_vessels_are_those_of_the_source():
+    """Untreated from 180, 625 mm^3: 11157.5 and 14907.8 mm^3 after 20 days, 17346.5 mm^3 in the end; 14.58 mg/kg/day hold 100."""
+    plant = task("tumour_vessels").problem.plant
+    start = np.array([np.log(180), np.log(625), 0.0])
+    grown = solve_ivp(rate_of(plant, 0.0), (0, 20), start, "LSODA", rtol=1e-10, atol=1e-12).y[:2, -1]
+    np.testing.assert_allclose(np.exp(grown), [11157.5, 14907.8], atol=0.06)
+    largest = np.log([17346.5, 17346.5])
+    np.testing.assert_allclose(rate_of(plant, 0.0)(0, np.array([*largest, 0.0])), 0, atol=1e-4)
+    held = np.array([np.log(100), np.log(100), 14.58 / 1.7])
+    np.testing.assert_allclose(rate_of(plant, 14.58)(0, held), 0, atol=3e-3)
+
+
+def test_rounded_doses_are_whole_portions():
+    """What the level of the drug gains is that of a multiple of 5 mg/kg/day, whatever was asked for."""
+    problem = task("tumour_portions").problem
+    for asked, given in ((12.4, 10.0), (12.6, 15.0), (1.0, 0.0)):
+        rates = rate_of(problem.reality.plant, asked)(0, np.zeros(3))
+        assert rates[2] == pytest.approx(given)
+
+
+def test_rounding_is_not_what_the_plain_form_loses_by():
+    """With any dose, twice a day, the plain form is still three times as bad as none, and the model-referenced one has no error."""
+    shipped = task("tumour_portions")
+    problem = replace(shipped.problem, reality=None)
+
+    def error(name):
+        run = fp.simulate(problem, shipped.controllers[name], seed=0, compiled=False)
+        return fp.measure(problem, run).rms_error["size"]
+
+    assert error("RHC+FPI") > 3 * error("RHC")
+    assert error(SAFE) < 0.01 * error("RHC")
+
+
 # Hodgkin and Huxley
 
 REST = np.array([-64.9964, 0.05296, 0.59599, 0.31773])
