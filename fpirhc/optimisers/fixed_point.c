@@ -281,6 +281,7 @@ INLINE void remember(const Search* s, const Plan* best, Out memory) {
   memory[MEMORY - 1] = s->tau;
 }
 
+/* The new memory may lie where the old one lies, which is read as a whole before. */
 INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
   static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
   In s0 = arg[0] ? arg[0] : nothing, data = arg[1] ? arg[1] : nothing, memory = arg[4] ? arg[4] : nothing;

@@ -70,7 +70,8 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     texts.insert(1, linearise)
     sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
-    return Driver("\n".join(texts), leaves, {**sizes, **_constants(settings, measures)}, _room(ocp, measures))
+    constants = {**sizes, **_constants(settings, measures)}
+    return Driver("\n".join(texts), leaves, constants, _room(ocp, measures), in_place=(4, 2))  # the memory
 
 
 def _room(ocp: OptimalControl, measures: Scales) -> int:

@@ -131,9 +131,8 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[st
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     texts.insert(1, linearise)
-    return Driver(
-        "\n".join(texts), leaves, {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings), **stops}, _room(ocp)
-    )
+    constants = {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings), **stops}
+    return Driver("\n".join(texts), leaves, constants, _room(ocp), in_place=(4, 2))  # the memory
 
 
 def _room(ocp: OptimalControl) -> int:

@@ -29,6 +29,14 @@ _OF_ALL = {
     ca.OP_MMIN: ("fmin({0},{1})", "INFINITY"), ca.OP_MMAX: ("fmax({0},{1})", "-INFINITY"),
     ca.OP_NORMINF: ("fmax({0},fabs({1}))", "0"),
 }  # fmt: skip
+_NAMED = ("exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "log1p",
+          "expm1", "floor", "ceil", "pow", "atan2", "hypot", "fmod", "copysign", "erf")  # fmt: skip
+SCALAR = {
+    **_TWO, **_ONE, ca.OP_SIGN: "({0}<0 ? -1 : {0}>0 ? 1 : {0})", ca.OP_CONSTPOW: "pow({0},{1})",
+    **{getattr(ca, f"OP_{name.upper()}"): f"{name}({{0}}{',{1}' * (name in ('pow', 'atan2', 'hypot', 'fmod', 'copysign'))})"
+       for name in _NAMED},
+}  # fmt: skip
+_MOST = 4000  # instructions of scalar code that is written into its caller
 _SPLITS = (ca.OP_VERTSPLIT, ca.OP_HORZSPLIT)
 
 
@@ -39,13 +47,15 @@ class Unwritten(Exception):
 class Callee(NamedTuple):
     """How a C function is called: its name, the pointers that it needs in arg and res, its numbers in w, and its kind.
 
-    One that writes all of its results, and asks for no address whether there is one, is `sure`.
+    One that writes all of its results, and asks for no address whether there is one, is `sure`. An argument and a result that are
+    `in_place` may lie at one place.
     """
 
     name: str
     pointers: tuple[int, int]
     room: int
     sure: bool = False
+    in_place: tuple[int, int] | None = None
 
 
 @dataclass(eq=False)
@@ -121,6 +131,7 @@ class Call:
     times: int = 1
     same: tuple[bool, ...] = ()
     rows: list[Value] = field(default_factory=list)  # the arguments, each in one row
+    scalar: ca.Function | None = None  # code that is written in place of the call
 
     @property
     def regions(self) -> tuple[Region, ...]:
@@ -214,7 +225,7 @@ class Dataflow:
     tables: list[str] = field(default_factory=list)
 
     def region(self, function: ca.Function, inputs: Sequence[Value]) -> Region:
-        """Return the steps of a Function, or of a choice between two.
+        """Return the steps of a Function, of a choice between two, or of scalar code.
 
         Raises:
             Unwritten: it has an operation that is not known here.
@@ -222,6 +233,9 @@ class Dataflow:
         region, branches = Region(), branches_of(function)
         if branches is not None:
             region.outputs = self._chosen(region, branches, inputs)
+            return region
+        if function.is_a("SXFunction"):
+            region.outputs = self._scalar(region, function, inputs)
             return region
         values, outputs = dict[int, Value](), [dict[int, Value]() for _ in range(function.n_out())]
         for k in range(function.n_instructions()):
@@ -297,11 +311,19 @@ class Dataflow:
                 return region.include(self.region(function, operands))
             except Unwritten:
                 pass  # CasADi writes it
+        if self.sites[hash(function)] == 1 and is_written(function):
+            return self._scalar(region, function, operands)
         branches = branches_of(function)
         if branches is not None and self.sites[hash(function)] == 1:
             return self._chosen(region, branches, operands)
         results = [Node(function.nnz_out(k), region=region) for k in range(function.n_out())]
         region.steps.append(self._call(function, operands, results))
+        return [whole(node) for node in results]
+
+    @staticmethod
+    def _scalar(region: Region, function: ca.Function, operands: Sequence[Value]) -> list[Value]:
+        results = [Node(function.nnz_out(k), region=region) for k in range(function.n_out())]
+        region.steps.append(Call(Callee("", (0, 0), 0), list(operands), results, 1, (), list(operands), function))
         return [whole(node) for node in results]
 
     def _chosen(
@@ -325,6 +347,15 @@ class Dataflow:
             same.append(all(part(value, k * size, (k + 1) * size) == first for k in range(1, times)))
             arguments.append(first if same[-1] else value)
         return Call(self.callee(facts["f"]), arguments, results, times, tuple(same))
+
+
+def is_written(function: ca.Function) -> bool:
+    """Return whether a Function is scalar code whose operations are all known here, and short enough for its caller."""
+    if not function.is_a("SXFunction") or function.n_instructions() > _MOST:
+        return False
+    codes = [function.instruction_id(k) for k in range(function.n_instructions())]
+    constants = (function.instruction_constant(k) for k, code in enumerate(codes) if code == ca.OP_CONST)
+    return {*codes} <= {*SCALAR, ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST} and all(map(math.isfinite, constants))
 
 
 def is_graph(function: ca.Function) -> bool:

@@ -34,7 +34,7 @@ OF_TYPE = """#include <float.h>
 """
 _LARGE_OR_SMALL = re.compile(r"(?<![\w.])\d\.\d{16}e[+-](?:[3-9]\d|\d{3})\b")
 _drivers: dict[str, str] = {}
-_rooms: dict[str, int] = {}
+_needs: dict[str, tuple[int, tuple[int, int] | None]] = {}
 _LATEST: Latest[ca.Function] = Latest(16)
 
 
@@ -48,12 +48,14 @@ class Driver:
         leaves: generated Functions by key.
         constants: preprocessor definitions by name.
         room: numbers that the driver needs in w.
+        in_place: (argument, result) that may lie at one place: the argument is not read after the result is begun.
     """
 
     text: str
     leaves: Mapping[str, ca.Function]
     constants: Mapping[str, object]
     room: int = 0
+    in_place: tuple[int, int] | None = None
 
     def source(self) -> str:
         """Return the whole C file, in which the entry is called ENTRY."""
@@ -79,7 +81,7 @@ def registered(name: str, driver: Driver) -> str:
     """Return the unique name of a driver: a Function of this name has it as its body in C."""
     source = driver.source()
     unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
-    _drivers[unique], _rooms[f"{unique}_driver"] = source, driver.room
+    _drivers[unique], _needs[unique] = source, (driver.room, driver.in_place)
     return unique
 
 
@@ -123,9 +125,9 @@ def is_driver(name: str) -> bool:
     return name in _drivers
 
 
-def entry_of(name: str) -> tuple[str, int]:
-    """Return the name of the C function of a driver, and the numbers that it needs in w."""
-    return f"{name}_driver", _rooms[f"{name}_driver"]
+def entry_of(name: str) -> tuple[str, int, tuple[int, int] | None]:
+    """Return the name of the C function of a driver, the numbers that it needs in w, and what may lie at one place."""
+    return f"{name}_driver", *_needs[name]
 
 
 def file_of(name: str) -> str:

@@ -14,6 +14,7 @@ from itertools import pairwise
 import casadi as ca
 
 from fpirhc.symbolic.dataflow import (
+    SCALAR,
     Call,
     Callee,
     Choice,
@@ -26,6 +27,7 @@ from fpirhc.symbolic.dataflow import (
     branches_of,
     call_sites,
     is_graph,
+    is_written,
     length,
     part,
     whole,
@@ -61,13 +63,13 @@ class FlatCode:
         self._known: dict[int, Callee] = {}
         self._sites: Counter[int] = Counter()
 
-    def callee(self, function: ca.Function) -> Callee:
-        """Return how a Function is called, and write it where it is not written yet."""
+    def callee(self, function: ca.Function, *, always: bool = False) -> Callee:
+        """Return how a Function is called, and write it where it is not written yet; `always` where it is scalar code, too."""
         key = hash(function)
         if not self._sites:
             self._sites = call_sites(function)
         if key not in self._known:
-            composed = is_graph(function) or branches_of(function) is not None
+            composed = is_graph(function) or branches_of(function) is not None or (always and is_written(function))
             self._known[key] = self._written(function) if composed else self._outside(function)
         return self._known[key]
 
@@ -103,7 +105,9 @@ class _Writer:
 
     def _write(self, region: Region, indent: str) -> None:
         for step in region.steps:
-            if isinstance(step, Call):
+            if isinstance(step, Call) and step.scalar is not None:
+                self._scalar(step, step.scalar, indent)
+            elif isinstance(step, Call):
                 self._call(step, indent)
             elif isinstance(step, Choice):
                 self._choice(step, indent)
@@ -159,6 +163,27 @@ class _Writer:
         lines.append(f"if ({step.callee.name}(arg1, res1, iw, {f'w+{room}' if room else 'w'}, 0)) return 1")
         loop = f"for (i=0; i<{step.times}; ++i) " if many else ""
         self._lines.extend([f"{indent}{loop}{{\n", *(f"{indent}  {line};\n" for line in lines), f"{indent}}}\n"])
+
+    def _scalar(self, step: Call, code: ca.Function, indent: str) -> None:
+        """Write the instructions of scalar code, each number in a variable."""
+        given = [[_entry(node, at + k) for node, at, size in value for k in range(size)] for value in step.arguments]
+        places, lines = set[int](), list[str]()
+        for k in range(code.n_instructions()):
+            what, read, made = code.instruction_id(k), code.instruction_input(k), code.instruction_output(k)
+            if what == ca.OP_OUTPUT:
+                if self._placed.wanted(step.results[made[0]], step):
+                    lines.append(f"{_entry(step.results[made[0]], made[1])} = s{read[0]}")
+                continue
+            if what == ca.OP_INPUT:
+                text = given[read[0]][read[1]]
+            elif what == ca.OP_CONST:
+                text = f"{code.instruction_constant(k):.16e}"
+            else:
+                text = SCALAR[what].format(*(f"s{i}" for i in read))
+            places.add(made[0])
+            lines.append(f"s{made[0]} = {text}")
+        lines.insert(0, f"casadi_real {', '.join(f's{k}' for k in sorted(places))}")
+        self._lines.extend([f"{indent}{{\n", *(f"{indent}  {line};\n" for line in lines if places), f"{indent}}}\n"])
 
     def _choice(self, step: Choice, indent: str) -> None:
         condition = _entry(step.condition[0].node, step.condition[0].at)

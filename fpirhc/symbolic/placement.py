@@ -82,7 +82,8 @@ class Placement:
 
     def _settle(self, region: Region) -> None:
         for step in region.steps:
-            if isinstance(step, Call):
+            if isinstance(step, Call) and step.scalar is None:
+                self._share(step, region)
                 step.rows = [self._row(value, region) for value in step.arguments]
         for step in region.steps:
             for k, node in enumerate(step.results):
@@ -93,6 +94,14 @@ class Placement:
                     if node not in self.pointed:
                         self._claim(value, node.base, node.offset, inner)
                 self._settle(inner)
+
+    def _share(self, step: Call, region: Region) -> None:
+        """Let an argument that nothing else reads lie where the result is wanted that the call computes in its place."""
+        if step.callee.in_place is not None:
+            argument, result = step.callee.in_place
+            value, node = step.arguments[argument], step.results[result]
+            if node.base and len(value) == 1 and self.uses[value[0].node] == 1 and isinstance(value[0].node, Operation):
+                self._claim(value, node.base, node.offset, region)
 
     def _needs_place(self, step: Step, node: Node) -> bool:
         if isinstance(step, Operation):

@@ -38,7 +38,7 @@ def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
         raise NotSupported("it calls a Function that is already compiled; compile the whole instead")
     leaves = _Leaves()
     flat = FlatCode(leaves.callee)
-    inner = flat.callee(function)
+    inner = flat.callee(function, always=bool(calls))
     text = leaves.text(_stub(function, calls))
     stub = _STUB.search(text)
     assert stub is not None
@@ -87,8 +87,8 @@ class _Leaves:
         name = function.name()
         if is_driver(name):
             self._needs(name)
-            entry, room = entry_of(name)
-            return Callee(entry, (function.n_in(), function.n_out()), room)
+            entry, room, in_place = entry_of(name)
+            return Callee(entry, (function.n_in(), function.n_out()), room, in_place=in_place)
         for inner in function.find_functions() if function.is_a("MXFunction") else ():
             if is_driver(inner.name()):
                 self._needs(inner.name())

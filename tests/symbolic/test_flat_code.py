@@ -99,3 +99,37 @@ def test_what_is_called_in_one_place_is_no_function_of_its_own():
     assert sorted(call_sites(function).values()) == [1, 2, 3]
     names = re.findall(r"^/\* (fpirhc_\w+) \*/$", generate(function)[0], re.MULTILINE)
     assert names == ["fpirhc_many", "fpirhc_called"]
+
+
+@needs_compiler
+def test_scalar_code_in_its_caller_has_the_bits_of_its_own_function():
+    """Every operation that is written there, and results that nobody reads."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    unary = [ca.exp, ca.log, ca.sin, ca.cos, ca.tan, ca.asin, ca.acos, ca.atan, ca.sinh, ca.cosh, ca.tanh, ca.asinh, ca.atanh,
+             ca.log1p, ca.expm1, ca.floor, ca.ceil, ca.sqrt, ca.fabs, ca.sign, ca.logic_not, ca.erf]  # fmt: skip
+    binary = [ca.fmin, ca.fmax, ca.atan2, ca.hypot, ca.fmod, ca.copysign, ca.logic_or, ca.logic_and]
+    values = [*(f(x) for f in unary), ca.acosh(x + 2), *(f(x, y) for f in binary), *(f(y, x) for f in binary)]
+    values += [
+        x**y,
+        x**2.5,
+        x * x,
+        2 * x,
+        1 / x,
+        -x,
+        x - y,
+        x / y,
+        x < y,
+        x <= y,
+        x == y,
+        x != y,
+        ca.if_else(x > y, x, y),
+    ]
+    leaf = ca.Function("fpirhc_operations", [x, y], [ca.vertcat(*values), x + y, ca.vertcat(y, x)])
+    a, b = MX.sym("a"), MX.sym("b", 2)
+    results, _, turned = leaf(a, b[1])
+    whole = ca.Function("fpirhc_operations_inside", [a, b], [ca.vertcat(results, turned), turned[0] * 2])
+    assert "casadi_f1(" not in generate(whole)[0], "it is written into its caller"
+    for first, second in ((0.3, 0.7), (0.9, -0.2), (0.5, 0.5)):
+        at = first, np.array([5.0, second])
+        for one, other in zip(native(whole, required=True).function(*at), whole(*at), strict=True):
+            np.testing.assert_array_equal(one.full(), other.full())
