@@ -85,16 +85,24 @@ class NoAnswer(NotSupported):
     """A question that these numbers leave without an answer, as where a run does not stay finite."""
 
 
+class NoCode(NotSupported):
+    """A Function that cannot be written as C; it runs in CasADi's virtual machine."""
+
+
+class NotInstalled(NotSupported):
+    """A package or a compiler that is not installed, or too old."""
+
+
 def package(name: str, extra: str, what: str = "this") -> Any:
     """Import a package of an extra.
 
     Raises:
-        NotSupported: it is not installed.
+        NotInstalled: it is not installed.
     """
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as missing:
-        raise NotSupported(
+        raise NotInstalled(
             f"{what} needs {missing.name}, which is not installed: pip install 'fpirhc[{extra}]'"
         ) from None
 

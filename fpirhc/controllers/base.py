@@ -90,22 +90,24 @@ def closing_blocks(
     """Return the blocks deform, invert, limit, judge and running with what they remember; `judged` are solver statuses."""
     plant = problem.plant
     closing, delays = commanding_blocks(problem, judged)
-    mirrors, mirror_delays = mirror_blocks(problem, deformation)
-    largest = largest_response(problem)
+    deform = deform_block(plant, deformation, problem.warm_up_cycles, largest_response(problem))
+    last = plant.response_signal(_REQUEST)
+    before, remembered = (
+        ([], [Delay(last, "deformed")]) if last.name in deform.reads else mirror_blocks(problem, deformation)
+    )
     blocks = [
-        *mirrors,
+        *before,
         with_held_deformation(
             plant,
             deformation,
-            deform_block(plant, deformation, problem.warm_up_cycles, largest),
+            deform,
             settles=problem.sensing.estimates,
             answered=math.inf if problem.dead_time.queued else problem.warm_up_cycles,
         ),
         invert_block(plant),
         *closing,
     ]
-    before = [] if mirrors else [Delay(plant.response_signal("_deformed_last"), "deformed")]
-    return blocks, [*delays, *mirror_delays, *before]
+    return blocks, [*delays, *remembered]
 
 
 def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:

@@ -18,7 +18,7 @@ from fpirhc.contraction.delayed import delayed_limit, leaking_limit
 from fpirhc.contraction.gains import assess_gain, linear_limit
 from fpirhc.contraction.measured import jacobians_along
 from fpirhc.contraction.spectrum import Spectrum
-from fpirhc.controllers.contract import Controller, resolved
+from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.controllers.model_inputs import NONE
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import form_inside
@@ -272,16 +272,6 @@ def check_form(problem: Problem, controller: Controller) -> None:
             model-referenced form inside it compares.
     """
     refuse(_of_form(problem, nominal(controller.deformation)))
-
-
-def refuse(reasons: Iterator[str]) -> None:
-    """Raise with the first reason, where there is one.
-
-    Raises:
-        NotSupported: with the reason.
-    """
-    for reason in reasons:
-        raise NotSupported(reason)
 
 
 def _of_outputs(problem: Problem, controller: Controller) -> Iterator[str]:

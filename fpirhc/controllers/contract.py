@@ -441,6 +441,16 @@ def without_deformation(controller: Controller) -> Controller:
     return controller.with_deformation(Identity()) if controller.deformation.adapts else controller
 
 
+def refuse(reasons: Iterator[str]) -> None:
+    """Raise with the first reason, where there is one.
+
+    Raises:
+        NotSupported: with the reason.
+    """
+    for reason in reasons:
+        raise NotSupported(reason)
+
+
 def check_chains(problem: Problem, law: str) -> None:
     """Raise for an output of order 0, which has no derivative below its response.
 
@@ -450,9 +460,11 @@ def check_chains(problem: Problem, law: str) -> None:
     Raises:
         NotSupported: with the law.
     """
-    for name, order in problem.plant.response_orders.items():
-        if not order:
-            raise NotSupported(f"{law}, and the command moves '{name}' at once (order 0); use DisturbanceObserver")
+    refuse(
+        f"{law}, and the command moves '{name}' at once (order 0); use DisturbanceObserver"
+        for name, order in problem.plant.response_orders.items()
+        if not order
+    )
 
 
 def check_derivatives(problem: Problem, law: str) -> None:

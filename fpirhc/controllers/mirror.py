@@ -49,10 +49,8 @@ __all__ = ["MEASURED", "MEASURED_OUTPUT", "MEASURED_TIME", "measured_reads", "mi
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
-    """Return the block that writes '_modelled', with what it remembers; none where the deformation is not model-referenced."""
+    """Return the block that writes '_modelled', the response that a model-referenced map reads, with what it remembers."""
     mirror = deformation.mirror
-    if not mirror.referenced:
-        return [], []
     estimator, part = problem.sensing.estimator, mirror.measurement % 1 > NONE
     inputs = problem.plant.input
     last, waits = Signal("_command_before", inputs.elements, inputs.units), Queue(mirror.cycles, longest=mirror.longest)

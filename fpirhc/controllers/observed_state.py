@@ -17,10 +17,10 @@ from typing import cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.contract import Controller, refuse
 from fpirhc.controllers.model_inputs import CommandPath
 from fpirhc.controllers.reference_states import nominal_motion
-from fpirhc.errors import NoAnswer, NotSupported
+from fpirhc.errors import NoAnswer
 from fpirhc.horizon.nominal import known_on_reference, nominal_run, reference_state
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
@@ -238,7 +238,7 @@ def check_observed(problem: Problem) -> None:
     """Raise if errors are neither observed nor decay, and the observer cannot bear that.
 
     Raises:
-        NotSupported: with the states, and what would help.
+        NoAnswer: with the states, and what would help.
     """
     observer = problem.sensing.observer
     if observer is None or not observer.needs_detectability:
@@ -246,7 +246,7 @@ def check_observed(problem: Problem) -> None:
     free = unobservable_errors(problem)
     if not free.decays:
         measured = ", ".join(observer.uses(problem.sensing.measures(problem.plant)))
-        raise NotSupported(
+        raise NoAnswer(
             f"{type(observer).__name__}: {' and '.join(free.states)} cannot be observed along the reference from {measured}, and "
             f"an error of what is believed does not decay (pole {free.pole:.3g} {problem.rate_unit}); measure {free.states[0]}, or "
             "another quantity that depends on it; ModelStates() believes the model alone"
@@ -260,23 +260,27 @@ def check_believed(problem: Problem, controller: Controller) -> None:
         NotSupported: an adaptive controller whose response nobody measures; a model with other parameters than the problem's;
             errors that are neither observed nor decay.
     """
+    if problem.sensing.observer is not None:
+        refuse(_against(problem, controller))
+        check_observed(problem)
+
+
+def _against(problem: Problem, controller: Controller) -> Iterator[str]:
+    """Reasons against believed states."""
     sensing, plant = problem.sensing, problem.plant
-    if sensing.observer is None:
-        return
     lost = sensing.believed_response(plant)
     if lost and controller.deformation.adapts:
-        raise NotSupported(
+        yield (
             f"the response that {type(controller.deformation).__name__} compares needs {', '.join(lost)}, which no sensor shows: "
             "the model's own response is the request, from which nothing can be learned. Measure it, or choose an estimator of "
             f"what is measured ({', '.join(sensing.measures(plant))})"
         )
     model = controller.plant_model(problem).plant
     if model.parameter.elements != plant.parameter.elements:
-        raise NotSupported(
+        yield (
             f"{type(controller).__name__} has a model with other parameters than the problem's, and states are believed by the "
             "problem's; leave the observer out, or give both the same parameters"
         )
-    check_observed(problem)
 
 
 def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:

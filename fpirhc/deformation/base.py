@@ -63,6 +63,14 @@ class Mirror:
         """Where the next request begins."""
         return desired
 
+    def require_last_request(self, refusal: str) -> None:
+        """Raise where a map is not given its own last request, with the refusal; a plan, or a law on commands, has nothing else.
+
+        Raises:
+            NotSupported: a model-referenced form.
+        """
+        raise NotSupported(refusal)
+
     @property
     def lags(self) -> bool:
         """Whether an actuator is believed to lag."""
@@ -77,6 +85,9 @@ class LastRequest(Mirror):
 
     def origin(self, request: Expression, desired: Expression) -> Expression:  # noqa: ARG002
         return request
+
+    def require_last_request(self, refusal: str) -> None:
+        pass
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, discrete
 from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne, finite_number
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.functions import stays
@@ -125,26 +125,15 @@ class ModelReferenced(Wrapper):
         return Queue(self._delays, longest=None if self.longest is None else self.longest + self.measurement)
 
 
-def require_own_requests(refusal: str, deformation: Deformation) -> None:
-    """Check that a map may be given its own last request.
-
-    Raises:
-        NotSupported: a model-referenced form, with the refusal.
-    """
-    if deformation.mirror.referenced:
-        raise NotSupported(refusal)
-
-
 def require_map_of_plan(owner: str, deformation: Deformation) -> None:
     """Check that a map may be given its own last request, as a plan has nothing else.
 
     Raises:
         NotSupported: a model-referenced form.
     """
-    require_own_requests(
+    deformation.mirror.require_last_request(
         f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a plan's "
-        "gradient has no model beside it; use the map inside",
-        deformation,
+        "gradient has no model beside it; use the map inside"
     )
 
 

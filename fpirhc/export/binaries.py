@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from fpirhc.errors import CompileError, NotSupported, package
+from fpirhc.errors import CompileError, NotInstalled, package
 from fpirhc.symbolic.native import find_compiler
 
 # No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.
@@ -59,7 +59,7 @@ def program(sources: Sequence[Path], made: Path, *flags: str) -> None:
     """Build a program of C files for this machine.
 
     Raises:
-        NotSupported: there is no compiler.
+        NotInstalled: there is no compiler.
         CompileError: it refuses the files.
     """
     command = [
@@ -80,11 +80,11 @@ def own_compiler() -> str:
     """Return the C compiler of this machine.
 
     Raises:
-        NotSupported: there is none.
+        NotInstalled: there is none.
     """
     own = find_compiler()
     if own is None:
-        raise NotSupported(
+        raise NotInstalled(
             "a program of this machine needs a C compiler: install gcc or clang, or name one by FPIRHC_CC"
         )
     return own
@@ -94,7 +94,7 @@ def web_module(files: Mapping[str, str]) -> bytes:
     """Return a WebAssembly module of C files, without imports.
 
     Raises:
-        NotSupported: ziglang is not installed.
+        NotInstalled: ziglang is not installed.
         CompileError: it refuses the files.
     """
     package("ziglang", "compiler", "the target wasm")
@@ -112,7 +112,7 @@ def arm_programs(files: Mapping[str, str], around: Mapping[str, str], script: st
         script: of the linker.
 
     Raises:
-        NotSupported: ziglang is not installed.
+        NotInstalled: ziglang is not installed.
         CompileError: it refuses the files.
     """
     package("ziglang", "cortex", "the target cortex-m")

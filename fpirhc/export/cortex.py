@@ -64,7 +64,7 @@ class Board:
         counted: name of the function whose instructions are counted.
 
     Raises:
-        NotSupported: Unicorn is not installed.
+        NotInstalled: Unicorn is not installed.
     """
 
     def __init__(self, image: Image, source: BinaryIO, to: BinaryIO, counted: str = "") -> None:

@@ -133,11 +133,12 @@ def processor_of(target: Target) -> Callable[[Path, str], Sequence[str]]:
     """Return the function that gives a target's program.
 
     Raises:
-        NotSupported: it has none, or it cannot be built here.
+        InvalidValue: it has none.
+        NotInstalled: it cannot be built here.
     """
     if target.processor is None:
         there = ", ".join(one.name for one in targets().values() if one.processor is not None)
-        raise NotSupported(f"--check is there for {there}, not for {target.name}")
+        raise InvalidValue(f"--check is there for {there}, not for {target.name}")
     if target.builder is not None:
         target.builder()
     return target.processor

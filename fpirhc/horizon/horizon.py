@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Count, Duration
 from fpirhc.plant.integrators import USUAL, Integrator
@@ -43,8 +43,8 @@ class Horizon(Checked):
 
     Raises:
         InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, margins that are not one
-            finite number of at least 0 for every stage, or plans that follow in no whole number of cycles.
-        NotSupported: an integrator that is not made of plain expressions.
+            finite number of at least 0 for every stage, plans that follow in no whole number of cycles, or an integrator that is
+            not made of plain expressions.
     """
 
     stages: Count
@@ -88,7 +88,7 @@ class Horizon(Checked):
                     f"{margin!r}"
                 )
         if self.discretisation.opaque:
-            raise NotSupported(
+            raise InvalidValue(
                 "a horizon needs an integrator of plain expressions, such as RungeKutta4() or RadauIIA()"
             )
 

@@ -232,15 +232,18 @@ def _with_theta(regressor: Regressor) -> Plant:
 
 def _check_plant(plant: Plant) -> None:
     if len(plant.inputs) != len(plant.names) or plant.controlled_names != plant.names:
-        raise NotSupported(
-            f"a regressor needs a fully actuated plant: {len(plant.names)} coordinates but {len(plant.inputs)} input(s), "
+        why = (
+            f"a fully actuated plant: {len(plant.names)} coordinates but {len(plant.inputs)} input(s), "
             f"controlled: {', '.join(plant.controlled_names)}; use ComputedTorque, whose model needs no regressor"
         )
-    if plant.equations.inverse_opaque:
-        raise NotSupported(
-            "a regressor needs an inverse response made of symbols, and this one needs a root finder; "
+    elif plant.equations.inverse_opaque:
+        why = (
+            "an inverse response made of symbols, and this one needs a root finder; "
             "give Plant(inverse=...) that solves the response for the inputs"
         )
+    else:
+        return
+    raise NotSupported(f"a regressor needs {why}")
 
 
 def _check_linear(regressor: Regressor) -> None:

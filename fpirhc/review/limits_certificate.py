@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.check import refuse
-from fpirhc.controllers.contract import resolved, tracking_law, with_margins
+from fpirhc.controllers.contract import refuse, resolved, tracking_law, with_margins
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count
 from fpirhc.plant.mismatch import exact_ranges

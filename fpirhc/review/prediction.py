@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like
-from fpirhc.controllers.check import refuse
-from fpirhc.controllers.contract import resolved, tracking_law, without_deformation
+from fpirhc.controllers.contract import refuse, resolved, tracking_law, without_deformation
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.describe import identity

@@ -20,7 +20,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import refuse_without, resolved, without_deformation
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
-from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, NotContractive, NotSupported, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import loops_along
@@ -92,9 +92,9 @@ def suggest(
     `ringing` kappa = a lambda / (1 - p), 0 for no filter.
 
     Raises:
-        InvalidValue: a budget that is not positive, a negative noise or ringing, no noise. InvalidName: unknown input
-        or coordinate. NotSupported: a controller without adaptation; a response that is estimated, whose noise must
-        be given. NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
+        InvalidValue: a budget that is not positive, a negative noise or ringing, no noise, as of a response that is estimated,
+        whose noise must be given. InvalidName: unknown input or coordinate. NotSupported: a controller without adaptation.
+        NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
     """
     found = within_budget(problem, controller, chatter=chatter, noise=noise, ringing=ringing)
     return replace(found, harm=_harm(problem, controller, found.deformation))
@@ -236,8 +236,8 @@ def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, f
     Parameters: `controller`, resolved; `noise`: standard deviation of the measured response by controlled coordinate.
 
     Raises:
-        InvalidValue: no noise, a negative one. InvalidName: an unknown coordinate. NotSupported: a response that is
-        estimated, whose noise must be given. NotContractive: no finite response Jacobian.
+        InvalidValue: no noise, as of a response that is estimated, or a negative one. InvalidName: an unknown coordinate.
+        NotContractive: no finite response Jacobian.
     """
     jacobians, inverses = _along_the_reference(
         grid, controller.plant_model(grid.problem).parameters(grid.problem.plant)
@@ -252,7 +252,7 @@ def chatter_of(grid: ReviewGrid, controller: Controller, gain: float, pole: floa
     Parameters: `controller`, resolved; effective `gain` and `pole` of the filter of its error.
 
     Raises:
-        InvalidValue, NotSupported, NotContractive: as `noisy_points`.
+        InvalidValue, NotContractive: as `noisy_points`.
     """
     noisy = noisy_points(grid, controller, None)
     return dict(zip(grid.problem.plant.inputs, map(float, noisy.steps(gain, pole)), strict=True))
@@ -285,7 +285,7 @@ def _of_sensors(problem: Problem) -> dict[str, float]:
     plant, sensing = problem.plant, problem.sensing
     measured = dict(zip(response_names(plant), plant.controlled_names, strict=True))
     if sensing.sensors and not set(measured) & set(sensing.measures(plant)):
-        raise NotSupported(
+        raise InvalidValue(
             f"suggest: the response is estimated by {type(sensing.estimator).__name__}, whose noise is not white; give "
             "noise={coordinate: standard deviation of the estimated response}"
         )

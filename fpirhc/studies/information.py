@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.controllers.reference_states import nominal_motion, reference_states
-from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.maps import step_of
 from fpirhc.plant.motion import known_exactly
@@ -97,7 +97,7 @@ def compare_information(problem: Problem, *, drift: Mapping[str, float] | None =
 
     Raises:
         InvalidProblem: an unknown coordinate, or a drift that is not positive.
-        NotSupported: no `drift` beside a reality, of which the reference tells no states.
+        InvalidValue: no `drift` beside a reality, of which the reference tells no states.
     """
     task = nominal(problem)
     residual: dict[str, float] = {}
@@ -170,7 +170,7 @@ def _along_reference(problem: Problem) -> tuple[dict[str, float], dict[str, floa
     """Drift and rms of the residual f - f^ along the reference, by controlled coordinate."""
     plant = problem.plant
     if problem.reality is not None:
-        raise NotSupported(
+        raise InvalidValue(
             "compare_information: the reference tells no states of a reality; give the drift, drift={'"
             + plant.controlled_names[0]
             + "': ...}, in units of the response per square root of the time's unit"

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import casadi as ca
 
-from fpirhc.errors import CompileError, NotSupported
+from fpirhc.errors import CompileError, NoCode
 from fpirhc.symbolic import driver, flat_code, program
 from fpirhc.symbolic.program import NAME, generate
 
@@ -103,7 +103,7 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
             key, known = _library(generate(function, calls), compiler, flags)
             _remember(note, key)
         return Native(known, True, "")
-    except (NotSupported, CompileError) as error:
+    except (NoCode, CompileError) as error:
         if required and isinstance(error, CompileError):
             raise
         return Native(function, False, str(error))

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-from fpirhc.errors import NotSupported
+from fpirhc.errors import NoCode
 from fpirhc.symbolic.dataflow import Callee
 from fpirhc.symbolic.driver import SIGNATURE, entry_of, file_of, is_driver, of_type, renamed
 from fpirhc.symbolic.flat_code import HEAD, FlatCode
@@ -31,11 +31,11 @@ def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
         calls: number of calls in a row, see `chained`; 0: it is called once.
 
     Raises:
-        NotSupported: a part of it cannot be written as C.
+        NoCode: a part of it cannot be written as C.
     """
     called = function.find_functions()
     if any(f.is_a("External") for f in called):
-        raise NotSupported("it calls a Function that is already compiled; compile the whole instead")
+        raise NoCode("it calls a Function that is already compiled; compile the whole instead")
     leaves = _Leaves()
     flat = FlatCode(leaves.callee)
     inner = flat.callee(function, always=bool(calls))
@@ -82,7 +82,7 @@ class _Leaves:
         """Return how it is called.
 
         Raises:
-            NotSupported: a driver in it needs more numbers than the graph that it replaces.
+            NoCode: a driver in it needs more numbers than the graph that it replaces.
         """
         name = function.name()
         if is_driver(name):
@@ -93,7 +93,7 @@ class _Leaves:
             if is_driver(inner.name()):
                 self._needs(inner.name())
                 if entry_of(inner.name())[1] > inner.sz_w():
-                    raise NotSupported("the work of its loops cannot be laid out")
+                    raise NoCode("the work of its loops cannot be laid out")
         unique = f"{name}_{len(self._leaves)}" if name in (*self._leaves, NAME) else name
         self._leaves[unique] = function if unique == name else renamed(function, unique)
         plain = function.is_a("SXFunction")  # its code has variables of its own
@@ -112,7 +112,7 @@ class _Leaves:
         """Return CasADi's text of the stub and of all leaves, of which only the stub is exported.
 
         Raises:
-            NotSupported: CasADi cannot write one.
+            NoCode: CasADi cannot write one.
         """
         generator = ca.CodeGenerator(NAME, {"with_header": False})
         try:
@@ -123,7 +123,7 @@ class _Leaves:
                     generator.add(leaf)
                 source = str(generator.dump())
         except RuntimeError as error:
-            raise NotSupported(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
+            raise NoCode(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
         _check_self_contained(source)
         self._tokens = dict(_CALLED.findall(source))
         source = _EXPORT.sub(lambda m: m[0] if m[1].startswith(NAME) else "", source)
@@ -197,8 +197,8 @@ _CHAIN = """  casadi_real *w1=w0+{size}, *other;
 def _check_self_contained(source: str) -> None:
     unsupported = re.search(r"^\s*#error (?:Code generation not supported for )?(\w+)", source, re.MULTILINE)
     if unsupported:
-        raise NotSupported(f"it calls '{unsupported[1]}', which CasADi cannot write as C")
+        raise NoCode(f"it calls '{unsupported[1]}', which CasADi cannot write as C")
     # It is not tried even where the header is installed: its library would have to be found and linked too.
     header = re.search(r"^#include <(.+/.+)>", source, re.MULTILINE)
     if header:
-        raise NotSupported(f"it calls a solver that cannot be written as C: its own library is needed ({header[1]})")
+        raise NoCode(f"it calls a solver that cannot be written as C: its own library is needed ({header[1]})")

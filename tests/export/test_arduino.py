@@ -105,7 +105,7 @@ def test_own_functions_in_double_are_refused():
     task = fp.load_problem("two_mass")
     title = "CTC+FPI (eq 6)"
     own = device_of(task.problem, task.controllers[title], title, libm="own", bare=True, cycles=1)
-    with pytest.raises(NotSupported, match="leave --libm out"):
+    with pytest.raises(InvalidValue, match="leave --libm out"):
         target_called("arduino").files(own)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import NotSupported
+from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.export.lab import lab as module
 from fpirhc.export.lab.lab import Lab, make_lab, page
 from fpirhc.symbolic.paths import changed_at
@@ -171,7 +171,7 @@ def test_what_has_no_lab(monkeypatch):
     with pytest.raises(NotSupported, match=r"a lab needs ziglang.*fpirhc\[compiler\]"):
         make_lab("t", "", "two_mass", task.problem, chosen)
     monkeypatch.setattr(module, "package", lambda *_: None)
-    with pytest.raises(NotSupported, match=r"no controller of the lab can have 'deformation.gian' live.*Did you mean"):
+    with pytest.raises(InvalidValue, match=r"no controller of the lab can have 'deformation.gian' live.*Did you mean"):
         make_lab("t", "", "two_mass", task.problem, chosen, ["deformation.gian"])
     outside = fp.ExternalPlant(_Body(), measures=dict(zip(_QUANTITIES, _UNITS, strict=True)))
     with pytest.raises(NotSupported, match="a plant outside Python's equations has none"):

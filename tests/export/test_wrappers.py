@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import NotSupported
+from fpirhc.errors import InvalidValue
 from fpirhc.export.device import Device
 from fpirhc.export.target import device_of, target_called, write
 from fpirhc.symbolic.native import find_compiler
@@ -229,7 +229,7 @@ def test_a_plant_whose_time_is_in_years_has_no_plugin(tmp_path):
     task = fp.load_problem("fishery")
     device = device_of(task.problem, task.controllers["RHC+FPI"], "RHC+FPI", cycles=1)
     with pytest.raises(
-        NotSupported, match=r"ros2_control runs in real time: a period in s, ms, min, h was expected, got one in"
+        InvalidValue, match=r"ros2_control runs in real time: a period in s, ms, min, h was expected, got one in"
     ):
         write(device, target_called("ros2_control"), tmp_path / "out")
 

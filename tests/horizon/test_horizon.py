@@ -11,7 +11,7 @@ import pytest
 from plants import chain, pendulum
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -167,7 +167,7 @@ def test_mistakes_of_a_horizon():
         fp.Horizon(stages=0, step=0.1)
     with pytest.raises(InvalidValue, match=r"Horizon.step: expected a number from"):
         fp.Horizon(stages=3, step=0.0)
-    with pytest.raises(NotSupported, match="RungeKutta4"):
+    with pytest.raises(InvalidValue, match="RungeKutta4"):
         fp.Horizon(stages=3, step=0.1, discretisation=fp.Cvodes())
     with pytest.raises(InvalidProblem, match=r"does not divide the horizon step 0.01 s; use a step of 0.009 s"):
         fp.Problem(

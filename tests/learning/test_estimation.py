@@ -326,7 +326,7 @@ TWO_TASK = fp.Problem(
 @pytest.mark.parametrize(
     ("problem", "estimator", "error", "message"),
     [
-        (TWO_TASK, fp.DisturbanceKalman({"a": 1.0, "b": 1.0}, {"b": 1.0}), NotSupported, "2 disturbances"),
+        (TWO_TASK, fp.DisturbanceKalman({"a": 1.0, "b": 1.0}, {"b": 1.0}), InvalidProblem, "2 disturbances"),
         # What moves only b says nothing about itself in a.
         (
             TWO_TASK,

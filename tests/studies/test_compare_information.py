@@ -10,7 +10,7 @@ import pytest
 from plants import chain, pendulum
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.studies.information import filter_gain_margin
 
 DRIFT, PERIOD = 3.0, 1e-3  # m/s^2.5, s
@@ -118,6 +118,6 @@ def test_wrong_drifts_are_named():
     with pytest.raises(InvalidProblem, match="does not drift"):
         fp.compare_information(problem)
     elsewhere = replace(problem, reality=fp.Reality(problem.plant))
-    with pytest.raises(NotSupported, match="no states of a reality; give the drift"):
+    with pytest.raises(InvalidValue, match="no states of a reality; give the drift"):
         fp.compare_information(elsewhere)
     assert "y''" in str(fp.compare_information(replace(problem, period=2e-3), drift={"y": 1.0}))

@@ -20,13 +20,13 @@ def script(shell: str) -> str:
     """Return the completion script of a shell.
 
     Raises:
-        NotSupported: shtab is not installed, or it does not know the shell.
+        NotInstalled: shtab is not installed, or it does not know the shell.
     """
-    from fpirhc.errors import NotSupported, package
+    from fpirhc.errors import NotInstalled, package
 
     shtab = package("shtab", "completion", "completion")
     if shell not in shtab.SUPPORTED_SHELLS:
-        raise NotSupported(f"this version of shtab has no completion for {shell}; install a newer one")
+        raise NotInstalled(f"this version of shtab has no completion for {shell}; install a newer one")
     return str(shtab.complete(whole_parser(), shell))
 
 

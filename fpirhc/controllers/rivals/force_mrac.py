@@ -14,7 +14,7 @@ from fpirhc.controllers.base import Controller, law_blocks, like
 from fpirhc.controllers.contract import Deforms, PlantModel
 from fpirhc.controllers.reference_states import request_of_commands
 from fpirhc.deformation.base import Deformation, automatic
-from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import Finite
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
@@ -61,8 +61,8 @@ class ForceMRAC(Controller):
                 is then not the one that the response recalculates.
         """
         mirror, late = self.deformation.mirror, any((problem.dead_time.measurement, *problem.dead_time.inputs.values()))
-        if mirror.referenced and (late or not problem.sensing.ideal or not mirror.bare):
-            raise NotSupported(
+        if late or not problem.sensing.ideal or not mirror.bare:
+            mirror.require_last_request(
                 "ForceMRAC cannot use a model-referenced deformation here: it compares the last command with the one recalculated "
                 "from the response, through no estimator, dead time or lag; use the map itself or Increment"
             )

@@ -10,16 +10,18 @@ In terms of a deformation h = r - q'', where r is the response that the present 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip, like
+from fpirhc.controllers.contract import refuse
 from fpirhc.controllers.response_pairs import ResponsePairs
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
+from fpirhc.plant.plant import Plant
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, pair
@@ -64,14 +66,14 @@ class Learning:
             InvalidValue: parameters enter nonlinearly, a first estimate is outside its bounds, or the bounds admit a mass matrix
                 that is not positive definite where the controller inverts it.
         """
-        _check_coordinates(problem)
+        refuse(_against(problem.plant))
         regressor = self.regressor(problem)
         self.rule.check(self.bounds)
         _check_bounds(regressor, self.bounds)
         states = _states(problem)
         resting = states * [name in problem.plant.coordinates for name in problem.plant.state.elements]
         coefficients = _mass_coefficients(regressor, states)
-        _check_mechanical(coefficients, _mass_coefficients(regressor, resting))
+        refuse(_against_masses(coefficients, _mass_coefficients(regressor, resting)))
         if inverts or self.rule.reads_response:
             _check_definite(self.bounds, coefficients)
 
@@ -141,20 +143,22 @@ def equation_function(regressor: Regressor) -> ca.Function:
     return ca.Function("fpirhc_equation", [x, r, u, theta, p], [both[:, :-1], both[:, -1]])
 
 
-def _check_coordinates(problem: Problem) -> None:
-    """Raise unless the coordinates of mechanics, of order 2, are what follows the reference."""
-    plant = problem.plant
+_MECHANICS = "learning inverse dynamics is for mechanics"
+
+
+def _against(plant: Plant) -> Iterator[str]:
+    """Reasons against a plant in which other quantities than coordinates of mechanics, of order 2, follow the reference."""
     if plant.equations.known_by_outputs != tuple(range(plant.state.size)):
-        raise NotSupported(
-            f"learning inverse dynamics is for mechanics in its own coordinates, whose inertia matrix it learns; "
+        yield (
+            f"{_MECHANICS} in its own coordinates, whose inertia matrix it learns; "
             f"{', '.join(plant.controlled_names)} are other functions of the state; use ComputedTorque with a deformation"
         )
-    odd = [f"'{n}' of order {r}" for n, r in zip(problem.plant.names, problem.plant.orders, strict=True) if r != 2]
-    if odd:
-        raise NotSupported(
-            f"learning inverse dynamics is for mechanics, order 2 throughout, but this plant has {odd[0]}; "
-            "use ComputedTorque with a deformation"
-        )
+    for name, order in zip(plant.names, plant.orders, strict=True):
+        if order != 2:
+            yield (
+                f"{_MECHANICS}, order 2 throughout, but this plant has '{name}' of order {order}; "
+                "use ComputedTorque with a deformation"
+            )
 
 
 def _check_bounds(regressor: Regressor, bounds: Bounds) -> None:
@@ -188,13 +192,13 @@ def _mass_coefficients(regressor: Regressor, states: np.ndarray) -> np.ndarray:
     return np.stack([f.T.reshape((-1, n, n)) for f in blocks])
 
 
-def _check_mechanical(coefficients: np.ndarray, resting: np.ndarray) -> None:
+def _against_masses(coefficients: np.ndarray, resting: np.ndarray) -> Iterator[str]:
     skew = np.abs(coefficients - coefficients.transpose(0, 1, 3, 2)).max()
     moving = np.abs(coefficients - resting).max()
     if not max(skew, moving) <= 1e-6 * np.abs(coefficients).max():
         what = "symmetric" if moving <= skew else "independent of q'"
-        raise NotSupported(
-            f"learning inverse dynamics is for mechanics, but the matrix dQ/dq'' of this plant is not {what}; write the "
+        yield (
+            f"{_MECHANICS}, but the matrix dQ/dq'' of this plant is not {what}; write the "
             "response so that input k does work along coordinate k and inertia does not depend on velocity"
         )
 

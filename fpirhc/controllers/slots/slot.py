@@ -14,7 +14,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.check import refuse
+from fpirhc.controllers.contract import refuse
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, nearest

@@ -18,7 +18,6 @@ from fpirhc.controllers.base import Controller, like, reference_block
 from fpirhc.controllers.contract import Deforms, without_deformation
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import Deformation, RequestChange, automatic
-from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
@@ -307,9 +306,8 @@ class Cascade(Controller):
             InvalidValue: see `ThroughModel`.
         """
         self.controller.check(self.inner_problem(problem))
-        require_own_requests(
-            "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself",
-            self.deformation,
+        self.deformation.mirror.require_last_request(
+            "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself"
         )
         if self.deformation.iteration.pairing is not None:
             raise NotSupported(

@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError, NotSupported, package
+from fpirhc.errors import FpirhcError, InvalidValue, package
 from fpirhc.export.binaries import web_module
 from fpirhc.export.device import c_of
 from fpirhc.export.targets.c import template, with_own_math
@@ -241,6 +241,7 @@ def make_lab(
 
     Raises:
         NotSupported: a plant outside, zig is not installed, or a controller that needs a solver's own library.
+        InvalidValue: a path in `live` that no controller can have live.
         InvalidName: a setting that no controller has.
     """
     problem.require_equations(
@@ -255,7 +256,7 @@ def make_lab(
         loops.append(LabLoop(name, ready, _mechanism(ready, pictures, without)))
     lost = [path for path in live if not any(loop.opens(path) for loop in loops)]
     if lost:
-        raise NotSupported(
+        raise InvalidValue(
             f"no controller of the lab can have '{lost[0]}' live: {without.get(lost[0], 'it is not there')}"
         )
     sliders = [

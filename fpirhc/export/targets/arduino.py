@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fpirhc.errors import CompileError, NotSupported
+from fpirhc.errors import CompileError, InvalidValue, NotSupported
 from fpirhc.export.device import Device
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, sources
@@ -61,7 +61,7 @@ class _Size:
 
 def _files(device: Device) -> Mapping[str, str | bytes]:
     if device.libm != "system":
-        raise NotSupported("the target arduino computes in float, and --libm own in double; leave --libm out")
+        raise InvalidValue("the target arduino computes in float, and --libm own in double; leave --libm out")
     own = {file: _NARROW * file.endswith(".c") + _in_float(text) for file, text in sources(device).items()}
     sizes = {board: size_on(own, device.name, board) for board in _BOARDS} if shutil.which("avr-gcc") else {}
     lacking = {board.name: size.lacks(board) for board, size in sizes.items()}

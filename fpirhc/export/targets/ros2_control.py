@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from xml.sax.saxutils import escape
 
-from fpirhc.errors import NotSupported
+from fpirhc.errors import InvalidValue
 from fpirhc.export.device import Device, identifiers
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, sources
@@ -19,7 +19,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     name, own = device.name, sources(device)
     unit = device.problem.plant.time_unit
     if unit not in _SECONDS:
-        raise NotSupported(
+        raise InvalidValue(
             f"ros2_control runs in real time: a period in {', '.join(_SECONDS)} was expected, got one in {unit}"
         )
     states, commands = _states(device), [f"{one}/effort" for one in device.problem.plant.inputs]

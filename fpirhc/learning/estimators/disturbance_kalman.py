@@ -125,8 +125,9 @@ class DisturbanceKalman(ParameterEstimator):
         """Raise if names do not fit the plant, or what is measured does not determine the disturbances.
 
         Raises:
-            InvalidProblem: unknown names.
-            NotSupported: the rank condition is not met, or no stationary gain exists; a measured response that is estimated late.
+            InvalidProblem: unknown names; more disturbances than measured quantities.
+            NoAnswer: the rank condition is not met, or no stationary gain exists.
+            NotSupported: a measured response that is estimated late.
         """
         mistakes = Mistakes("DisturbanceKalman")
         plant = problem.plant
@@ -146,7 +147,7 @@ class DisturbanceKalman(ParameterEstimator):
         """Return the stationary gain [K_x; K_w], shape (nx + nw, ny); `problem.plant` is the model with disturbances.
 
         Raises:
-            NotSupported: the Riccati equation has no stabilising solution.
+            NoAnswer: the Riccati equation has no stabilising solution.
         """
         return _GAINS.of((self, problem), (), lambda: self._gain(problem)).copy()
 
@@ -290,7 +291,7 @@ class DisturbanceKalman(ParameterEstimator):
     def _check_rank(self, problem: Problem) -> None:
         measured, disturbances = ", ".join(self.measured), ", ".join(self.learned())
         if len(self.drift) > len(self.measured):
-            raise NotSupported(
+            raise InvalidProblem(
                 f"DisturbanceKalman: {len(self.drift)} disturbances ({disturbances}) cannot be found from "
                 f"{len(self.measured)} measured quantity(ies) ({measured}): measure as many, or estimate fewer"
             )
@@ -298,7 +299,7 @@ class DisturbanceKalman(ParameterEstimator):
         used = self._corrected(problem, a, c)
         rank = _rank(a[np.ix_(used, used)], c[:, used])
         if rank < used.sum():
-            raise NotSupported(
+            raise NoAnswer(
                 f"DisturbanceKalman: a constant {disturbances} cannot be determined from {measured}: [A - I, B; C, D] has rank "
                 f"{rank} and needs {used.sum()} (Pannocchia and Rawlings 2003); measure another state, or disturb the response "
                 "of a coordinate that acts on a measured state"
@@ -384,8 +385,8 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
     order 2) adds to the response alone, and no state sees it. A name of both a coordinate and an output is the coordinate's.
 
     Raises:
-        InvalidProblem: an unknown name, no name, or a parameter that already has the name.
-        NotSupported: a response that has a disturbance already.
+        InvalidProblem: an unknown name, no name, a parameter that already has the name, or a response that has a disturbance
+            already.
     """
     mistakes = Mistakes("disturbed")
     responses = dict(zip(response_names(plant), plant.controlled_names, strict=True)) if plant.outputs else {}
@@ -474,7 +475,7 @@ def _output(plant: Plant, name: str, one: Output, names: Sequence[str]) -> Outpu
 
     vars(expression)["__signature__"] = inspect.signature(one.expression)
     if own and one.response_disturbance:
-        raise NotSupported(
+        raise InvalidProblem(
             f"disturbed: the response of '{name}' has the disturbance {one.response_disturbance} already"
         )
     return replace(
