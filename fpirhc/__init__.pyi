@@ -32,7 +32,7 @@ from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.horizon import Horizon
 from .learning.estimators.base import Uncertain
-from .learning.estimators.disturbance_kalman import DisturbanceKalman, disturbed
+from .learning.estimators.disturbance_kalman import DisturbanceKalman
 from .learning.estimators.moving_horizon import MovingHorizon
 from .learning.estimators.recursive_least_squares import RecursiveLeastSquares
 from .learning.rules.lyapunov_rule import LyapunovRule
@@ -46,6 +46,7 @@ from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
+from .plant.disturbed import disturbed
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.motion import Algebraic, Output

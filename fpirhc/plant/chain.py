@@ -72,6 +72,11 @@ def measured_signals(plant: Plant) -> tuple[Signal, ...]:
     return tuple(dict.fromkeys((plant.state, plant.output)))
 
 
+def response_names(plant: Plant) -> tuple[str, ...]:
+    """Names of the highest derivatives of the controlled coordinates: "q1''"; of order 0 it is the output's own name."""
+    return tuple(name + "'" * order for name, order in plant.response_orders.items())
+
+
 def response_units(plant: Plant) -> tuple[str, ...]:
     """Return the units of the derivatives that end the chains of all outputs, or coordinates."""
     units, time = followed_units(plant), plant.time_unit

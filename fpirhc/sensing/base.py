@@ -16,6 +16,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.chain import response_names as response_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -92,11 +93,6 @@ class DerivativeEstimator(Checked, ABC):
 def known_by_positions(plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
     """State elements of the coordinates that are measured: their derivatives are estimated."""
     return tuple(e for e in plant.output.elements if e.rstrip("'") in measured)
-
-
-def response_names(plant: Plant) -> tuple[str, ...]:
-    """Names of the highest derivatives of the controlled coordinates: "q1''"; of order 0 it is the output's own name."""
-    return tuple(name + "'" * order for name, order in plant.response_orders.items())
 
 
 def quantities(plant: Plant) -> tuple[str, ...]:

@@ -119,7 +119,7 @@ def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -
     if sensing.observer is None:
         return frozenset((*plant.coordinates, *followed_units(plant)))
     measured = (name.rstrip("'") for name in needed_measurements(plant, sensing))
-    return frozenset((*measured, *(judged or ()), *(plant.outputs or plant.controlled_names)))
+    return frozenset((*measured, *(judged or ()), *plant.controlled_names))
 
 
 def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:

@@ -20,6 +20,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import derivative_unit, disturbed, followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
@@ -312,7 +313,7 @@ class Problem(Checked):
     def _check_derivatives(self, instants: np.ndarray) -> None:
         """Raise if the disturbance of an output does not have the derivatives that are needed."""
         for name, order in self.disturbed_outputs.items():
-            if self.plant.step is not None and order > 1:
+            if response_age(self.plant) * order > 1:
                 raise InvalidValue(
                     f"disturbances: the output '{name}' of a map has relative order {order}, and its differences look ahead to "
                     "disturbances that nobody knows yet; disturb a state or an input, or an output of order 1"
@@ -350,9 +351,7 @@ class Problem(Checked):
 
     @cached_property
     def start_output(self) -> np.ndarray:
-        """First value of the outputs and their derivatives, of the plant that moves; without outputs the first state."""
-        if not self.plant.outputs:
-            return self.start_state
+        """First value of the outputs and their derivatives, of the plant that moves."""
         function, calm = self.truth.function(self.plant.output.elements), np.zeros(len(self.real_plant.names))
         return np.asarray(function(self.real_start, self.inputs_before, self.real_parameters, calm).full()).ravel()
 

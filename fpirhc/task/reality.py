@@ -36,8 +36,8 @@ class Reality(Checked):
         start: first values of states that the model does not have. Those that are not named settle: their rates are zero while
             the model's states and the inputs before the first cycle are held.
         integrator: of its motion; None: the problem's.
-        seen: coordinate of the model -> coordinate of the reality that is measured in its place, such as the output of a slow
-            sensor. Errors are judged at the coordinate of the same name where there is one.
+        seen: coordinate or output of the model -> coordinate of the reality that is measured in its place, such as the output of
+            a slow sensor. Errors are judged at the coordinate of the same name where there is one.
 
     Raises:
         InvalidField: all wrong arguments together. `Problem` checks the reality against the model.
@@ -130,7 +130,7 @@ class Reality(Checked):
         """
         mistakes = Mistakes("reality")
         _check_inputs(self.plant, model, mistakes)
-        mistakes.unknown("seen: coordinate of the model", self.seen, model.coordinates)
+        mistakes.unknown("seen: coordinate of the model", self.seen, {**model.coordinates, **followed_units(model)})
         mistakes.unknown("seen: coordinate of the reality", self.seen.values(), self.plant.coordinates)
         mistakes.unknown("start: state", self.start, self.plant.state.elements)
         if self.plant.time_unit != model.time_unit:
@@ -142,12 +142,8 @@ class Reality(Checked):
                 _check_coordinate(self.plant, self.seen, model, name, mistakes)
             elif self.plant.coordinates.get(name, unit) != unit:
                 mistakes.add(_other_unit(self.plant, name, name, unit))
-        if model.outputs and self.seen:
-            mistakes.add(
-                "seen: what is measured of a model with outputs are the outputs of the same names; write the sensor there"
-            )
         for name in model.outputs:
-            _check_expression(self.plant, model, name, mistakes)
+            _check_expression(self.plant, self.seen, model, name, mistakes)
         mistakes.raise_if_any()
 
     def shown(self, quantities: Sequence[str]) -> tuple[str, ...]:
@@ -348,23 +344,24 @@ def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
     return f"its coordinate '{own}' is {units}; write both in one unit"
 
 
-def _check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes) -> None:
-    """Add what is wrong with the output, or coordinate, of a reality of the name of an output of the model."""
-    unit = followed_units(model)[name]
+def _check_expression(plant: Plant, seen: Mapping[str, str], model: Plant, name: str, mistakes: Mistakes) -> None:
+    """Add what is wrong with the output, or coordinate, of a reality that is judged or measured for an output of the model."""
+    unit, own = followed_units(model)[name], seen.get(name, name)
     units = _quantities_of(plant)
-    if name not in units:
+    if not {own, name} & set(units):
         mistakes.add(
             f"it has no output '{name}', which the model has and which is judged; give its plant this output too. Its coordinates "
             f"and outputs: {', '.join(units)}"
         )
         return
-    if units[name] != unit:
-        mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
+    for one in sorted({own, name} & set(units)):
+        if units[one] != unit:
+            mistakes.add(f"its '{one}' is in {units[one]}, the model's in {unit}; write both in one unit")
     order = model.equations.output_orders[name]
-    at_once = input_reaches_at(plant, name, order - 1) if order else None
+    at_once = input_reaches_at(plant, own, order - 1) if order and own in units else None
     if at_once is not None:
         mistakes.add(
-            f"its derivative {name}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
+            f"its derivative {own}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
             "model; give the model this order, or the reality an actuator"
         )
 

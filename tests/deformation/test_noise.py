@@ -149,6 +149,6 @@ def test_suggest_needs_a_deformation_and_white_noise():
         fp.suggest(noisy(), replace(planning(), deformation=fp.Identity()), chatter=1.0)
     sensing = fp.Sensing({"q1'": fp.Sensor(noise=fp.Noise(1e-3))}, fp.VelocityDifference())
     estimated = replace(noisy(), sensing=sensing)
-    with pytest.raises(NotSupported, match="not white"):
+    with pytest.raises(InvalidValue, match="not white"):
         fp.suggest(estimated, planning(), chatter=1.0)
     assert fp.suggest(estimated, planning(), chatter=1.0, noise={"q1": 1.4, "q2": 1.4}).pole > 0

@@ -20,7 +20,7 @@ from test_outputs import depth_error as rms
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.horizon.consistent_state import consistent_state
-from fpirhc.learning.estimators.disturbance_kalman import disturbed
+from fpirhc.plant.disturbed import disturbed
 from fpirhc.studies.comparison.information import information
 
 LAW = fp.ComputedTorque(fp.Exponential(rate=1.0))

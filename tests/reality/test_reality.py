@@ -158,6 +158,24 @@ def test_slow_sensor_is_seen_and_the_true_coordinate_is_judged():
     assert np.array_equal(result["true_error.y"], result["reference.y"] - y)
 
 
+def test_slow_sensor_is_seen_in_place_of_an_output():
+    """A model of states whose output is y gives the commands of the model of coordinates, to the last bit."""
+    states = fp.Plant.of_states(
+        states={"a": "m", "w": "m/s"},
+        inputs={"u": "N"},
+        parameters=linear(2.0, 1.0).parameters,
+        rates=lambda x, u, p: {"a": x.w, "w": p.b * u.u},
+        outputs={"y": fp.Output("m", lambda x, p: x.a)},
+    )
+    reality = fp.Reality(slow_sensor(), start={"y": 0.1, "y'": 0.0, "s": 0.1}, seen={"y": "s"})
+    shared: dict[str, Any] = {"reality": reality, "horizon": None, "cost": None}
+    believed = fp.Sensing(estimator=fp.PositionDifference(), measured=("y",), observer=fp.ModelStates())
+    one = run(task(**shared, sensing=fp.Sensing(estimator=fp.PositionDifference())))
+    other = run(task(**shared, plant=states, start={"a": 0.1, "w": 0.0}, sensing=believed))
+    for name in ("command", "true_error", "reality_state"):
+        assert np.array_equal(one[name], other[name]), name
+
+
 def test_states_of_its_own_settle_or_are_given():
     """An actuator begins at the input before the first cycle, a sensor at what it measures, and a named state where it is put."""
     actuated = task(reality=fp.Reality(lagged()), input_before={"u": 3.0})
