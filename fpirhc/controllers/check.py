@@ -19,7 +19,6 @@ from fpirhc.contraction.gains import assess_gain, linear_limit
 from fpirhc.contraction.measured import jacobians_along
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.contract import Controller, refuse, resolved
-from fpirhc.controllers.model_inputs import NONE
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import NotContractive, NotSupported
@@ -233,7 +232,7 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
 
 
 def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
-    check_outputs(problem, controller)
+    refuse(_of_outputs(problem))
     ready = resolved(problem, controller)
     if numbers_only and ready.inner is None and ready.planner is not None:
         ready.planner.check_weights(problem)
@@ -255,15 +254,6 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
     return ready
 
 
-def check_outputs(problem: Problem, controller: Controller) -> None:
-    """Raise if the problem's plant has outputs that the deformation does not cover, or of order 0 behind an estimator.
-
-    Raises:
-        NotSupported: with the reason.
-    """
-    refuse(_of_outputs(problem, controller))
-
-
 def check_form(problem: Problem, controller: Controller) -> None:
     """Raise if the controller's deformation has a form that cannot be used.
 
@@ -274,21 +264,13 @@ def check_form(problem: Problem, controller: Controller) -> None:
     refuse(_of_form(problem, nominal(controller.deformation)))
 
 
-def _of_outputs(problem: Problem, controller: Controller) -> Iterator[str]:
+def _of_outputs(problem: Problem) -> Iterator[str]:
     """Reasons against outputs; those of order 0 have a response that is measured."""
-    plant, mirror = problem.plant, nominal(controller.deformation).mirror
-    instant = [name for name, order in plant.response_orders.items() if not order]
+    instant = [name for name, order in problem.plant.response_orders.items() if not order]
     if instant and not problem.sensing.estimator.measures_all:
         yield (
             f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
             "need none; leave the estimator out: Sensing(sensors=...)"
-        )
-    late = mirror.measurement
-    if plant.outputs and (late % 1 > NONE or (plant.step and late)):
-        yield (
-            f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
-            f"({', '.join(plant.chains)}): its twin moves from the state that is given with the samples, and these are late by "
-            f"{late:g} cycles; believe in whole cycles, and for a map in none"
         )
 
 

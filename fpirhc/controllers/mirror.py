@@ -269,7 +269,7 @@ def drift(motion: Signal, time: float) -> np.ndarray:
     return drift
 
 
-_STATE, _OFFSET = "mirror_state", "mirror_offset"
+_STATE, _OFFSET, _ACTED = "mirror_state", "mirror_offset", "mirror_acted"
 
 
 def twin_of_outputs(path: CommandPath) -> Block:
@@ -283,10 +283,13 @@ def twin_of_outputs(path: CommandPath) -> Block:
     After each cycle the offset is moved to where the estimate of the twin is the controller's, and it takes up the difference
     between x^ and the state that is given next, so that the samples stay on one path.
 
+    Behind a fraction phi of a cycle the state that is given is interpolated, and moves as the plant does with the mean of the
+    commands that acted; see `fpirhc.controllers.observed_state.sample_path`.
+
     Args:
-        path: of the commands to the model, without a fraction of a cycle in the measurement.
+        path: of the commands to the model.
     """
-    problem, plant = path.problem, path.problem.plant
+    problem, plant, part = path.problem, path.problem.plant, path.fraction
     names = problem.sensing.estimator.measures(plant)
     estimate = problem.sensing.estimator.block(plant, problem.period, problem.start_output, Signal("_seen", names))
     own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
@@ -297,12 +300,23 @@ def twin_of_outputs(path: CommandPath) -> Block:
         _seen(problem, names, plant.output.elements),
     )
     calm = np.zeros(len(plant.names))
+    acted = Signal(_ACTED, (*(f"{e}.end" for e in plant.input.elements), *(f"{e}.mean" for e in plant.input.elements)))
+    before = (replace(acted, start=tuple(map(float, [*problem.inputs_before] * 2))),) if part else ()
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
         parameters, signals = path.parameters(s)
         waits = path.cycles(s) < path.late + 0.5  # the samples still show the start
-        at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, calm))
+        if part:
+            whole = path.cycles(s) > path.late + 1.5
+            remembered[f"{_ACTED}_next"] = ca.vertcat(end, mean)
+            both = (1 - part) * ca.vertcat(end, mean) + part * getattr(s, _ACTED)
+            end, mean = ca.vertsplit(ca.if_else(whole, both, ca.vertcat(end, mean)), plant.input.size)
+            older = (1 - part) * parameters + part * path.parameters_before(s)
+            parameters = ca.if_else(whole, older, parameters) if signals else parameters
+        later = advance(s.mirror_state, mean, parameters, calm)
+        later = ca.if_else(whole, later, s.mirror_state + (1 - part) * (later - s.mirror_state)) if part else later
+        at = ca.if_else(waits, s.mirror_state, later)
         offset = ca.if_else(waits, s.mirror_offset, ahead @ s.mirror_offset)
         sample = shown(at, end, parameters, offset)
         motion, response, *memories = estimate.function(sample, *(getattr(s, m.name) for m in own))
@@ -316,7 +330,7 @@ def twin_of_outputs(path: CommandPath) -> Block:
             remembered[f"{signal.name}_next"] = value + matrix @ move
         return {"_modelled": response, **remembered}
 
-    memory = Layout((*path.memory, *_starts(problem), *own))
+    memory = Layout((*path.memory, *_starts(problem), *own, *before))
     reads, writes = (
         Layout((measured_state(plant), *path.reads, measured_output(plant))),
         Layout((plant.response_signal("_modelled"),)),

@@ -18,7 +18,7 @@ from test_outputs import arm, circle, hill, planned, sedated
 from test_outputs import depth_error as rms
 
 import fpirhc as fp
-from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
+from fpirhc.errors import FpirhcError, InvalidProblem
 from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.plant.disturbed import disturbed
 from fpirhc.studies.comparison.information import information
@@ -220,7 +220,7 @@ WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
     ),
     "too little": (
         lambda: simulated(sedated(hill(5.5)), fp.Estimating(LAW, fp.DisturbanceKalman({"C": 1.0, "E": 1.0, "depth": 1.0}, STATES))),
-        NotSupported,
+        InvalidProblem,
         "measure as many",
     ),
     "twice": (lambda: disturbed(disturbed(hill(5.5), ("depth''",)), ("depth''",)), InvalidProblem, "rename it"),

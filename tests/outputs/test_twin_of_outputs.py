@@ -10,7 +10,6 @@ import pytest
 from exchange import told
 
 import fpirhc as fp
-from fpirhc.errors import NotSupported
 
 LAW, MAP = fp.Exponential(rate=8.0), fp.Sigmoid(gain=-0.3, scale=60.0)
 PLAIN = fp.ComputedTorque(LAW)
@@ -103,8 +102,37 @@ def test_under_a_prediction_the_twin_sees_what_is_measured():
     np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
 
 
-def test_samples_late_by_a_fraction_are_refused():
-    """They show a mean of two states, from which no model moves."""
-    problem = task(fp.PositionDifference(), dead_time=fp.DeadTime(measurement=1.5e-3))
-    with pytest.raises(NotSupported, match=r"late by 1.5 cycles; believe in whole cycles"):
-        run(problem, referenced(problem))
+@pytest.mark.parametrize("waits", [0.4e-3, 1.5e-3])
+def test_samples_late_by_a_fraction_move_as_the_mean_of_two(waits):
+    """An interpolated state moves with the mean of the commands: exact but for the second order in the cycle."""
+    late = fp.DeadTime(inputs={"u": 1e-3}, measurement=waits)
+    problem = task(fp.PositionDifference(), exact=True, dead_time=late)
+    one, other = run(problem, PLAIN), run(problem, referenced(problem))
+    np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-7)
+    moved = np.abs(other["deformed"] - other["desired"]).max()
+    assert moved < 1e-5 * np.abs(other["desired"]).max()
+
+
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_a_map_is_left_alone_behind_a_late_measurement(cycles):
+    """State and outputs of a map arrive equally late, so the model answers from the state of the same cycle."""
+    step = 5e-3
+    plant = fp.Plant.discrete(
+        states={"x": "m", "z": "m/s"},
+        inputs={"F": "N"},
+        parameters={"k": fp.Parameter(3.0, 3.0, "N/m")},
+        next=lambda x, u, p: {"x": x.x + step * x.z, "z": x.z + step * (u.F - p.k * x.x)},
+        step=step,
+        outputs={"y": fp.Output("m", lambda x, p: x.x)},
+    )
+    problem = fp.Problem(
+        plant,
+        fp.Trajectory(lambda t: {"y": 0.5 * ca.sin(2 * t)}),
+        {"x": 0.1, "z": 0.0},
+        period=step,
+        duration=1.0,
+        dead_time=fp.DeadTime(inputs={"F": step}, measurement=cycles * step),
+    )
+    law = fp.ModelReferenced(fp.Affine(gain=-0.2), cycles=1.0, measurement=float(cycles))
+    result = run(problem, fp.ComputedTorque(fp.Exponential(3.0), law))
+    np.testing.assert_allclose(result["deformed"], result["desired"], atol=1e-9)
