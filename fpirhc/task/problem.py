@@ -351,7 +351,9 @@ class Problem(Checked):
 
     @cached_property
     def start_output(self) -> np.ndarray:
-        """First value of the outputs and their derivatives, of the plant that moves."""
+        """First value of the outputs and their derivatives, of the plant that moves; without outputs the first state."""
+        if not self.plant.outputs:
+            return self.start_state
         function, calm = self.truth.function(self.plant.output.elements), np.zeros(len(self.real_plant.names))
         return np.asarray(function(self.real_start, self.inputs_before, self.real_parameters, calm).full()).ravel()
 
