@@ -106,6 +106,14 @@ function verdict(answers) {
     if (one.cycles < DATA.cycles) return DATA.loops[k].name + " stops at " + short(one.cycles * DATA.period) + " " + DATA.timeUnit;
     return DATA.loops[k].name + " " + specs.map((c) => short(Math.sqrt(one.squares[c.error] / counted)) + " " + c.unit).join(", ");
   });
+  const errors = answers.map((one) => specs.map((c) => (one.cycles < DATA.cycles ? NaN : Math.sqrt(one.squares[c.error] / counted))));
+  if (answers.length === 2 && errors.flat().every((e) => e > 0)) {
+    const [plain, other] = errors, less = plain.map((e, k) => e >= other[k]);
+    const word = less.every((yes) => yes) ? " lowers" : less.some((yes) => yes) ? " changes" : " raises";
+    const how = (k) => (less[k] ? short(+(plain[k] / other[k]).toPrecision(3)) + " times less)" : short(+(other[k] / plain[k]).toPrecision(3)) + " times as much)");
+    return DATA.loops[1].name + word + " the rms error of " +
+      specs.map((c, k) => c.title.slice(9) + " from " + short(plain[k]) + " to " + short(other[k]) + " " + c.unit + " (" + how(k)).join(", ") + " against " + DATA.loops[0].name;
+  }
   return "rms error of " + specs.map((c) => c.title.slice(9)).join(", ") + ": " + texts.join("; ");
 }
 
