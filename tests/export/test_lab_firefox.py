@@ -1,0 +1,111 @@
+"""The lab in Firefox, which WebDriver BiDi drives: the numbers are those of `simulate`, and the console is silent."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.export.lab.lab import make_lab, write_lab
+from fpirhc.symbolic.paths import changed_at
+
+PLACE = "DATA.sliders.findIndex((s) => s.path === 'exact.m1')"
+CURVES = "JSON.stringify(answers.map((a) => a.columns.map((c) => [...c])))"
+
+
+class Firefox:
+    """A page in a browser without a window; `complaints` are the console's."""
+
+    def __init__(self, socket: Any) -> None:
+        self._socket, self._count = socket, 0
+        self.complaints: list[str] = []
+        self.ask("session.new", capabilities={})
+        self.ask("session.subscribe", events=["log.entryAdded"])
+        self._page = self.ask("browsingContext.getTree")["contexts"][0]["context"]
+
+    def ask(self, method: str, **values: Any) -> Any:
+        """The answer to a command; what the console says meanwhile is kept."""
+        self._count += 1
+        self._socket.send(json.dumps({"id": self._count, "method": method, "params": values}))
+        while True:
+            said = json.loads(self._socket.recv(timeout=60))
+            if said.get("method") == "log.entryAdded" and said["params"]["level"] in ("warn", "error"):
+                self.complaints.append(str(said["params"]["text"]))
+            if said.get("id") == self._count:
+                assert said["type"] == "success", said
+                return said["result"]
+
+    def open(self, path: Path) -> None:
+        self.ask("browsingContext.navigate", context=self._page, url=path.as_uri(), wait="complete")
+
+    def move(self, mass: float) -> None:
+        """Move the slider of the first mass, and wait until the page shows the run with it."""
+        began = self.evaluate("window.shownNumber || 0")
+        self.evaluate(f"set({PLACE}, {mass!r})")
+        while self.evaluate("busy || (window.shownNumber || 0)") in (True, began):
+            time.sleep(0.02)
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of an expression that is text, a number or a promise of these."""
+        target = {"context": self._page}
+        said = self.ask("script.evaluate", expression=expression, target=target, awaitPromise=True)
+        assert said["type"] == "success", said
+        return said["result"].get("value")
+
+
+@pytest.fixture
+def firefox(tmp_path: Path) -> Iterator[Firefox]:
+    program = shutil.which("firefox-esr") or shutil.which("firefox")
+    if program is None:
+        pytest.skip("Firefox is not installed")
+    client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
+    profile = tmp_path / "profile"
+    profile.mkdir()
+    started = subprocess.Popen(
+        [program, "--headless", "--no-remote", "--profile", str(profile), "--remote-debugging-port", "0"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert started.stderr
+        found = next(m for text in started.stderr if (m := re.search(r"BiDi listening on (ws://\S+)", text)))
+        with client.connect(f"{found[1]}/session", max_size=None) as socket:
+            yield Firefox(socket)
+    finally:
+        started.terminate()
+        started.wait()
+        assert started.stderr
+        started.stderr.close()
+
+
+@pytest.mark.browser
+def test_firefox_has_the_numbers_of_a_run(firefox, tmp_path):
+    """Every curve to 1e-12 of the largest number, before and after a move; a hundred moves, and the console is silent."""
+    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
+    task = fp.load_problem("two_mass")
+    chosen = {name: task.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")}
+    lab = make_lab(task.name, task.title, "two_mass", task.problem, chosen, pictures=task.pictures)
+    write_lab(lab, tmp_path / "lab.html")
+    firefox.open(tmp_path / "lab.html")
+    for mass in (1.0, 1.7):
+        firefox.move(mass)
+        said = json.loads(firefox.evaluate(CURVES))
+        for loop, columns in zip(lab.loops, said, strict=True):
+            variant = changed_at(loop.ready.problem, "plant.parameters.m1.exact", mass)
+            run = loop.ready.run(seed=0, variant=variant)
+            for name, values in zip(loop.shown, columns, strict=True):
+                wanted = np.ravel(run[name])[:: loop.every]
+                assert np.abs(np.array(values) - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max()), name
+    for k in range(1, 101):
+        firefox.move(0.5 + k / 50)
+    assert "CTC+FPI (eq 6)" in firefox.evaluate("document.getElementById('sentence').textContent")
+    assert firefox.evaluate("document.getElementById('motion').querySelectorAll('canvas').length") == 2
+    assert firefox.complaints == []
