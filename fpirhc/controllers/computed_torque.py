@@ -13,8 +13,8 @@ from fpirhc.controllers.base import Controller, commanding_blocks, like, referen
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.errors import NotInvertible, NotSupported
-from fpirhc.horizon.nominal import known_on_reference, reference_state
+from fpirhc.errors import NotInvertible
+from fpirhc.horizon.nominal import known_on_reference, reference_state, require_reference_of_states
 from fpirhc.members import Example
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
@@ -59,10 +59,11 @@ class FeedforwardOnly(Undeformed):
         if len(plant.controlled_names) != len(plant.inputs):
             raise NotInvertible("FeedforwardOnly needs as many controlled coordinates as inputs")
         slow = ", ".join(name for name, order in plant.response_orders.items() if order)
-        if slow and not known_on_reference(plant):
-            raise NotSupported(
+        if slow:
+            require_reference_of_states(
+                plant,
                 f"FeedforwardOnly does not cover outputs that are expressions of the state ({slow}): without feedback their "
-                "errors would add up; use a controller with a tracking law"
+                "errors would add up; use a controller with a tracking law",
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:

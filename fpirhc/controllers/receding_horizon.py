@@ -27,10 +27,10 @@ from fpirhc.controllers.replanning import (
 )
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.errors import InvalidName, InvalidProblem, NotSupported, nearest
+from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.cost import Cost
-from fpirhc.horizon.nominal import feedforward, known_on_reference
+from fpirhc.horizon.nominal import feedforward, known_on_reference, require_reference_of_states
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import SCALE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -161,10 +161,11 @@ class RecedingHorizon(Controller):
             InvalidProblem: horizon or cost missing.
             NotSupported: the optimiser cannot keep the problem's bounds; references of states are needed that no output gives.
         """
-        if self.on_failure.uses_feedforward and not known_on_reference(problem.plant):
-            raise NotSupported(
+        if self.on_failure.uses_feedforward:
+            require_reference_of_states(
+                problem.plant,
                 f"RecedingHorizon does not cover outputs that are expressions of the state ({', '.join(problem.plant.chains)}): "
-                f"{type(self.on_failure).__name__} needs references of states that no output gives; use HoldPlan"
+                f"{type(self.on_failure).__name__} needs references of states that no output gives; use HoldPlan",
             )
         if problem.horizon is None:
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")

@@ -33,6 +33,16 @@ def known_on_reference(plant: Plant) -> bool:
     return min(plant.equations.known_by_outputs) >= 0
 
 
+def require_reference_of_states(plant: Plant, refusal: str) -> None:
+    """Raise with the refusal where the reference does not give the whole state.
+
+    Raises:
+        NotSupported: the plant has states that no output shows.
+    """
+    if not known_on_reference(plant):
+        raise NotSupported(refusal)
+
+
 def filled(plant: Plant, outputs: np.ndarray) -> np.ndarray:
     """Return states that are known by their outputs, shape (m, nx), from the outputs, shape (m, ny); NaN where they are not."""
     places = np.array(plant.equations.known_by_outputs)
@@ -49,12 +59,12 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
         NotSupported: the plant has states that no output shows.
     """
     hidden = [e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0]
-    if hidden:
-        raise NotSupported(
-            f"the input along the reference needs the states {', '.join(hidden)}, which are no outputs and do not follow from "
-            "them by linear equations, and so have no reference; weigh the rate of the input, Quadratic(rate=...), in place of "
-            "its deviation from a feedforward"
-        )
+    require_reference_of_states(
+        plant,
+        f"the input along the reference needs the states {', '.join(hidden)}, which are no outputs and do not follow from "
+        "them by linear equations, and so have no reference; weigh the rate of the input, Quadratic(rate=...), in place of "
+        "its deviation from a feedforward",
+    )
     return outputs[list(plant.equations.known_by_outputs)]
 
 
