@@ -98,10 +98,12 @@ class Operation(Node):
 
     @property
     def results(self) -> list[Node]:
+        """Itself."""
         return [self]
 
     @property
     def regions(self) -> tuple[Region, ...]:
+        """None."""
         return ()
 
     @property
@@ -135,6 +137,7 @@ class Call:
 
     @property
     def regions(self) -> tuple[Region, ...]:
+        """None."""
         return ()
 
     @property
