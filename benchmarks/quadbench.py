@@ -4,7 +4,7 @@
 .venv/bin/python benchmarks/quadbench.py --regime noise     # with the noise of the published study
 .venv/bin/python benchmarks/quadbench.py --regime motors --late 0.02    # motor speeds 20 ms late; `thrust`: the thrust vector
 .venv/bin/python benchmarks/quadbench.py --circle           # the circle of 2 m in a wind of 3 m/s, with latencies
-Options: --cases 'wind *' 'none [0-3]', --controllers INDI CTC+FPI
+Options: --cases 'wind *' 'none [0-3]', --controllers INDI CTC+FPI, --upwards 1.8 (times the gain of the height)
 
 Error: root mean square of the distance over 5 s from rest with rotors at rest; a trial is flown where it stays below 1 m. INDI and
 SE3 are written here after the benchmark's (controller/indi_adaptive_controller.py, RotorPy's SE3Control). They get what those
@@ -237,8 +237,13 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=["all"], help="patterns of trials")
     parser.add_argument("--controllers", nargs="*", default=["SE3", "INDI", "CTC", "CTC+FPI", "RHC", "RHC+FPI"])
     parser.add_argument("--circle", action="store_true")
+    parser.add_argument("--upwards", type=float, help="weight of the height in the gain of every adaptive controller")
     asked = parser.parse_args()
     task = fp.load_problem(str(FOLDER / "quadbench.py"))
+    if asked.upwards:
+        form = fp.ModelReferenced(fp.Affine(gain=-0.1, weights=(1.0, 1.0, asked.upwards)))
+        adapted = {n: c.with_deformation(form) for n, c in task.controllers.items() if "FPI" in n}
+        task = replace(task, controllers={**task.controllers, **adapted})
     if asked.circle:
         circle(task)
         return

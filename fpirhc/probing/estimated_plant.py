@@ -104,9 +104,10 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
     """The plant without its lags, and the names of its drifts."""
     without = "the estimated plant of a {} has no equations yet"
     require_rates(model, without.format("map"))
-    if model.algebraic is not None or model.equations.inverse_opaque:
+    direct = set(model.controlled_names) == set(model.coordinates)  # else what else the inputs move has to follow
+    if model.algebraic is not None or (model.equations.inverse_opaque and not direct):
         raise NotSupported(
-            without.format("plant with algebraic states, or of a model that is not affine in its inputs,")
+            without.format("plant with algebraic states, or of outputs of a model that is not affine in its inputs,")
         )
     count = len(model.controlled_names)
     signals = tuple(f"drift_{name}" for name in model.controlled_names) if drifts else ()
@@ -121,6 +122,8 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
         answers = model.equations.controlled_response(x, inputs, parameters)
         matrix = ca.blockcat([[p[gain_name(i, j)] for j in range(count)] for i in range(count)])
         wanted = matrix @ answers + (ca.vertcat(*(p[name] for name in signals)) if signals else 0)
+        if direct:
+            return {name: wanted[i] for i, name in enumerate(model.controlled_names)}
         inputs = model.equations.inverse(x, wanted, parameters)
         own = Named(tuple(known), parameters, "parameter")
         return dict(model.response(*derivatives, Named(tuple(model.inputs), inputs, "input"), own))

@@ -31,6 +31,7 @@ from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
 _FEWEST = 40
+_MORE, _AGAIN = 2.5, 2  # factor of the amplitude where a sign is not certain, and how often it is applied
 _CLIPPED = 0.2  # share of the cycles at a limit, from which it is said
 
 
@@ -132,7 +133,8 @@ def probe(
         controller: that keeps it safe.
         cycles: of the excitation, 50 to 500.
         amplitude: of the sequence, in the unit of the response, by controlled quantity or one for all; 0 only listens. None: twice
-            the noise and a tenth of the deviation of the desired response, both in a first run without it.
+            the noise and a tenth of the deviation of the desired response, both in a first run without it; where the sign of a
+            gain is not certain with that, 2.5 times as much, and once more.
         recording: CSV file in place of runs, with the columns "time", every input, and what is measured.
         chatter: largest rms step of the command per cycle, in the input's unit, by input or one for all; None: 1.5 times that of
             the controller alone, or 2 % of the input's range.
@@ -149,12 +151,7 @@ def probe(
             f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least {_FEWEST}, 300 are usual"
         )
     bare = without_deformation(resolved(problem, controller))
-    if recording is not None:
-        record = read_recording(Path(recording), problem)
-    else:
-        record = excited(problem, bare, cycles=cycles, amplitude=amplitude, seed=seed)
-    estimates = Estimates(identify(record.measured, record.modelled, problem.period, record.usable), seed)
-    notes = list(_notes(record))
+    estimates, notes = _recorded(problem, bare, cycles, amplitude, recording, seed)
     estimated, candidates, why = None, {}, estimates.refused
     if not why:
         try:
@@ -184,6 +181,33 @@ def probe(
         why = f"{name}{tests}"
     chosen = None if name is None else candidates[name]
     return _answer(problem, estimates, chosen, why, results, candidates, estimated, notes)
+
+
+def _recorded(
+    problem: Problem,
+    bare: Controller,
+    cycles: int,
+    amplitude: float | Mapping[str, float] | None,
+    recording: str | Path | None,
+    seed: int,
+) -> tuple[Estimates, list[str]]:
+    """What the record says, and what to know beside; excited again where a sign is not certain and the amplitude is free."""
+
+    def estimates(record: Record) -> Estimates:
+        return Estimates(identify(record.measured, record.modelled, problem.period, record.usable), seed)
+
+    if recording is not None:
+        record = read_recording(Path(recording), problem)
+        return estimates(record), _notes(record)
+    names, again = problem.plant.controlled_names, 0
+    record = excited(problem, bare, cycles=cycles, amplitude=amplitude, seed=seed)
+    found = estimates(record)
+    while found.uncertain and amplitude is None and again < _AGAIN:
+        more = dict(zip(names, (_MORE * size for size in record.amplitude), strict=True))
+        record, again = excited(problem, bare, cycles=cycles, amplitude=more, seed=seed), again + 1
+        found = estimates(record)
+    text = f"the sign of a gain was not certain at first; excited again, with {_MORE**again:g} times the amplitude"
+    return found, [*_notes(record), *([text] if again else [])]
 
 
 def _answer(

@@ -1,8 +1,8 @@
 """Which adaptation suits a plant as estimated: candidates are run on it, and keep their margins at the corners of all intervals.
 
-Gains are shares g of the deadbeat gain, 1 / the largest eigenvalue of Lambda. A mirror that is right takes lateness for right and
-leaves it, so mirrors without dead time and without lag are candidates too, and one with a lag three times as long: an estimated lag
-stands for everything slow. Of the safe settings within a tenth of the least error the one with the least steps is the bold one.
+Gains are shares g of the deadbeat gain: 1 / the largest eigenvalue of Lambda, or the inverse of Lambda where responses are coupled.
+A mirror that is right takes lateness for right and leaves it, so mirrors without dead time and lag are candidates too, and one with
+three times the lag, which stands for everything slow. Of the safe settings within a tenth of the least error the calmest is bold.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ class Setting:
         cycles: believed dead time of every input.
         lags: believed lag of every input.
         wrong: cycles by which the dead time may be wrong.
+        weighted: whether the gain is a matrix, a share of the inverse of Lambda.
     """
 
     referenced: bool
@@ -61,14 +62,12 @@ class Setting:
     cycles: tuple[float, ...]
     lags: tuple[float, ...]
     wrong: float
+    weighted: bool = False
 
-    def deformation(self, largest: float) -> Deformation:
-        """Return the deformation, with gains rounded to three digits.
-
-        Args:
-            largest: eigenvalue of Lambda.
-        """
-        chosen: Deformation = Affine(gain=self.gain(largest))
+    def deformation(self, estimates: Estimates) -> Deformation:
+        """Return the deformation, with gains rounded to three digits."""
+        chosen: Deformation = Affine(gain=self.gain(estimates), weights=estimates.weights if self.weighted else None)
+        largest = self._largest(estimates)
         if self.pole:
             chosen = Filtered(chosen, pole=_rounded(self.pole))
         cycles, lag = _one(self.cycles), _one(tuple(_rounded(tau) for tau in self.lags))
@@ -78,9 +77,12 @@ class Setting:
         leak = default_pole(min(max(1 / largest, 1.0), _LARGEST_PRODUCT), self.wrong) if late else None
         return ModelReferenced(chosen, cycles=cycles, lag=lag, pole=None if leak is None else _rounded(float(leak)))
 
-    def gain(self, largest: float) -> float:
+    def gain(self, estimates: Estimates) -> float:
         """Return A_c = -2 a of the map, where a is the share of the inverse of the largest eigenvalue."""
-        return _rounded(-2 * self.share / largest)
+        return _rounded(-2 * self.share / self._largest(estimates))
+
+    def _largest(self, estimates: Estimates) -> float:
+        return estimates.largest_weighted if self.weighted else estimates.largest
 
     @property
     def paths(self) -> tuple[str, str]:
@@ -144,6 +146,9 @@ class Rule:
         # A small gain delays the desired response in the plain form: it is searched whatever its error is there.
         mirrored, plain = ([one for one in forms if one.setting.referenced is kind] for kind in (True, False))
         searched = mirrored[:_FORMS] + plain[:1]
+        if self.estimates.weights is not None:
+            alike = [replace(one[0].setting, weighted=True) for one in (mirrored, plain) if one]
+            searched += [self._predicted(form) for form in alike]
         settings = [self._predicted(s) for one in searched for s in _around(one.setting)]
         calm = sorted((one for one in settings if one.steps <= 1 and one.error < _WORTH), key=lambda one: one.error)
         safe: list[Predicted] = []
@@ -161,10 +166,10 @@ class Rule:
                 ),
                 None,
             ),
-            "mirrored": next(filter(self._safe, _one_filter_each(filter(self._mirrors, calm))), None),
-            "plain": next(
-                filter(self._safe, _one_filter_each(one for one in calm if not one.setting.referenced)), None
-            ),
+            "mirrored": self._first(filter(self._mirrors, calm)),
+            "referenced": self._first(one for one in calm if one.setting.referenced),
+            "plain": self._first(one for one in calm if not one.setting.referenced),
+            "matrix": self._first(one for one in calm if one.setting.weighted),
             "long lag": self._long(),
             "bold": min(safe, key=lambda one: one.steps, default=None),
         }
@@ -173,6 +178,10 @@ class Rule:
             if candidate is not None and all(candidate.deformation != one.deformation for one in different.values()):
                 different[name] = candidate
         return different
+
+    def _first(self, settings: Iterable[Predicted]) -> Predicted | None:
+        """The first safe one."""
+        return next(filter(self._safe, _one_filter_each(settings)), None)
 
     def _safe(self, one: Predicted) -> bool:
         return self._margins.safe(one.deformation)
@@ -208,7 +217,7 @@ class Rule:
         return one if self._safe(one) else None
 
     def _predicted(self, setting: Setting) -> Predicted:
-        deformation = setting.deformation(self.estimates.largest)
+        deformation = setting.deformation(self.estimates)
         nothing = Predicted(setting, deformation, math.inf, math.inf)
         try:
             run = self._run(setting)
@@ -227,10 +236,10 @@ class Rule:
         """The run of a candidate; those of one form share a loop."""
         form = replace(setting, share=_FIRST, pole=0.5)
         if form not in self._simulators:
-            controller = self.bare.with_deformation(form.deformation(self.estimates.largest))
+            controller = self.bare.with_deformation(form.deformation(self.estimates))
             self._simulators[form] = simulator(self.problem, controller, compiled=False, live=form.paths)
         gain, pole = form.paths
-        numbers = {gain: setting.gain(self.estimates.largest), pole: _rounded(setting.pole)}
+        numbers = {gain: setting.gain(self.estimates), pole: _rounded(setting.pole)}
         return self._simulators[form].run(seed=0, settings=numbers)
 
     def _allowed(self, chatter: float | Mapping[str, float] | None) -> np.ndarray:

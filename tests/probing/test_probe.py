@@ -6,6 +6,7 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from bodies import PERIOD, RHC, body_problem
@@ -248,3 +249,39 @@ def test_a_candidate_that_the_loop_refuses_is_not_tried_and_the_others_are():
     outcomes = tried(task.problem, controller, {"fast": fast, "slow": slow}, seed=0)
     assert "use 0 < |gain| < 0.413" in str(outcomes["fast"])
     assert isinstance(outcomes["slow"], Trial)
+
+
+def test_a_sign_that_is_not_certain_is_asked_again_louder(monkeypatch):
+    """An excitation half as large as usual in much noise leaves the sign open; 2.5 times as much settles it, and this is said."""
+    monkeypatch.setattr("fpirhc.probing.excitation._NOISES", 1.0)
+    monkeypatch.setattr(Rule, "shortlist", lambda _: {})
+    problem = body_problem(0.3, 2, 0.05, 2.0)
+    quiet, found = (fp.probe(problem, RHC, cycles=60, seed=1, amplitude=one) for one in (0.0, None))
+    assert quiet.why.startswith("the sign of a gain is not certain")
+    assert quiet.notes == ()
+    assert [note for note in found.notes if note.endswith("excited again, with 2.5 times the amplitude")]
+    assert 0 < found.gain["q"]["q"].low <= 0.3 <= found.gain["q"]["q"].high
+
+
+def test_coupled_bodies_are_offered_a_gain_matrix():
+    """Directions with gains of 1.3 and .2: the matrix is the inverse of the gains, and not behind the best single number."""
+    problem = replace(body_problem([[0.8, 0.6], [0.5, 0.7]], 0, 0.0, 0.02), duration=4.0)
+    found = fp.probe(problem, RHC, cycles=200)
+    weighted = {n: one for n, one in found.candidates.items() if one.iteration.weights is not None}
+    assert weighted
+    for one in weighted.values():
+        product = np.array(one.iteration.weights) @ np.array([[0.8, 0.6], [0.5, 0.7]])
+        assert product == pytest.approx(np.eye(2), abs=0.15)
+    hand = {str(g): fp.ModelReferenced(fp.Affine(gain=-2 * g / 1.3)) for g in (0.15, 0.3, 0.6, 0.9)}
+    single = [one.error for one in tried(problem, RHC, hand, seed=1).values() if isinstance(one, Trial)]
+    assert min(found.trials[name].error for name in weighted) <= min(single)
+
+
+def test_a_model_that_is_not_affine_in_its_input_has_a_choice():
+    """The model is 20 tan(u / 20): no inverse in symbols is needed where all coordinates are controlled."""
+    problem = body_problem(1.6, 0, 0.0, 0.02)
+    bent = replace(problem.plant, response=lambda q, v, u, p: {"q": p.b * 20 * ca.tan(u.u / 20)})
+    task = replace(problem, plant=bent, limits=fp.Limits(inputs={"u": (-15.0, 15.0)}), duration=4.0)
+    found = fp.probe(task, RHC, cycles=150)
+    assert found.deformation is not None
+    assert min(one.error for one in found.trials.values()) < 0.3

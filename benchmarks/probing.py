@@ -1,0 +1,99 @@
+"""What a probe proposes beside a grid of settings by hand: errors over those of the controller alone, on a run of another seed.
+
+.venv/bin/python benchmarks/probing.py                        # plants of other packages, and three shipped ones: five minutes
+.venv/bin/python benchmarks/probing.py two_mass quadrotor
+Option: --late CYCLES, a link before the plant that nobody told; for plants of other packages.
+
+The grid: model-referenced and plain forms with gains from .05 to 1.25, no dead time, and lags of 0, 1 and 3 times the probe's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+import fpirhc as fp
+from fpirhc.deformation.base import Deformation
+from fpirhc.probing.probe import Trial, tried
+from fpirhc.problem_files.shipped import missing, shipped_groups
+
+UNSEEN = ("two_mass", "two_link_arm", "van_der_pol")  # no constant of the rule was chosen on them
+GAINS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.25)
+
+
+class Late:
+    """A body behind a link of some cycles, which holds its first command until then."""
+
+    def __init__(self, body: Any, cycles: int, first: np.ndarray) -> None:
+        self.body, self.cycles, self.first = body, cycles, first
+
+    def reset(self, seed: int) -> object:
+        """Begin anew."""
+        self.way = [self.first] * self.cycles
+        return self.body.reset(seed)
+
+    def step(self, moment: float, command: np.ndarray) -> object:
+        """Pass the command of some cycles before on."""
+        self.way.append(np.array(command))
+        return self.body.step(moment, self.way.pop(0))
+
+
+def late(problem: fp.Problem, cycles: int) -> fp.Problem:
+    """Return the problem with the link before its reality."""
+    outside = problem.reality
+    if not cycles:
+        return problem
+    assert isinstance(outside, fp.ExternalPlant)
+    plant = problem.plant
+    # The commands that keep the plant where it starts, as the link holds them.
+    rest = plant.equations.inverse(problem.start_state, np.zeros(len(plant.controlled_names)), plant.approximate)
+    first = np.asarray(rest).ravel()
+    if outside.make is None:
+        return replace(problem, reality=replace(outside, body=Late(outside.body, cycles, first)))
+    made = outside.make
+    return replace(problem, reality=replace(outside, make=lambda told, seed: Late(made(told, seed), cycles, first)))
+
+
+def by_hand(lags: tuple[float, ...]) -> dict[str, Deformation]:
+    """Return the grid."""
+    forms: dict[str, Deformation] = {f"plain {g}": fp.Affine(gain=-2 * g) for g in GAINS}
+    for factor in (0.0, 1.0, 3.0):
+        lag = tuple(factor * tau for tau in lags)
+        forms |= {f"lag {factor:g}x, {g}": fp.ModelReferenced(fp.Affine(gain=-2 * g), lag=lag) for g in GAINS}
+    return forms
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("problems", nargs="*")
+    parser.add_argument("--late", type=int, default=0)
+    parser.add_argument("--cycles", type=int, default=400)
+    asked = parser.parse_args()
+    outside = {name: path for name, path in shipped_groups()["plants of other packages"].items() if not missing(path)}
+    for name in asked.problems or [*outside, *UNSEEN]:
+        task = fp.load_problem(name)
+        problem = late(task.problem, asked.late)
+        alone = next(c for n, c in task.controllers.items() if n.startswith("RHC"))
+        begun = time.process_time()
+        found = fp.probe(problem, alone, cycles=asked.cycles, seed=3)
+        took = time.process_time() - begun
+        proposed = {} if found.deformation is None else {"probe": found.deformation}
+        lags = tuple(one.value for one in found.lag.values())
+        outcomes = tried(problem, alone, {**by_hand(lags), **proposed}, seed=7)
+        trials = {n: one for n, one in outcomes.items() if isinstance(one, Trial)}
+        probe = trials.pop("probe", Trial(1.0, 1.0))
+        hand = min(trials, key=lambda n: trials[n].error)
+        print(
+            f"{name:13s} probe {probe.error:.4f} (worst coordinate {probe.worst:.3f}), by hand {trials[hand].error:.4f} ({hand}), "
+            f"ratio {probe.error / trials[hand].error:.2f}; {took:.0f} s\n              {found.lines} {found.why}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
