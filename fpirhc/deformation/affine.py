@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Self
 
 import casadi as ca
 import numpy as np
@@ -63,10 +63,11 @@ class Affine(Deformation):
     @property
     def _rows(self) -> tuple[tuple[float, ...], ...]:
         """W by rows."""
-        given: Any = self.weights or ()
-        if given and isinstance(given[0], tuple):
-            return tuple(given)
-        return tuple(tuple(w if j == k else 0.0 for j in range(len(given))) for k, w in enumerate(given))
+        given = self.weights or ()
+        if rows := tuple(one for one in given if isinstance(one, tuple)):
+            return rows
+        numbers = [one for one in given if not isinstance(one, tuple)]
+        return tuple(tuple(w if j == k else 0.0 for j in range(len(numbers))) for k, w in enumerate(numbers))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
