@@ -32,7 +32,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.shipped import shipped_problems
-from fpirhc.review.questions.form import recommended_form
+from fpirhc.review.questions.right_model import recommended_form
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 

@@ -59,10 +59,9 @@ from .problem_files.settings import LogSpan, Span, with_settings
 from .report.html import write_report
 from .review.answer import Answer
 from .review.limits_certificate import certify_limits
-from .review.response_prediction import predict_response
+from .review.questions.noise import suggest
+from .review.response_prediction import predict_response, state_margins, tightened
 from .review.review import review
-from .review.suggest import suggest
-from .review.tightening import state_margins, tightened
 from .sensing import (
     LowPassDifference,
     Measured,

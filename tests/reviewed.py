@@ -11,7 +11,7 @@ from plants import heavy
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.review.grid import review_grid
-from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.prediction import NominalRuns
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
 from fpirhc.review.questions.convergence import CONVERGES
 from fpirhc.review.review import predict

@@ -14,8 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.contraction.gains import assess_gain
-from fpirhc.contraction.spectrum import spectrum_over_run
+from fpirhc.contraction.spectrum import assess_gain, spectrum_over_run
 
 task = fp.load_problem("two_mass")
 tracking = fp.Exponential(rate=6.0)

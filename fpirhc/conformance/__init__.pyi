@@ -2,7 +2,7 @@
 
 from .controller import check_controller
 from .deformation import check_deformation
-from .live import check_live
+from .laws import check_live
 from .observer import check_observer
 from .optimiser import check_optimiser
 from .plant import check_plant

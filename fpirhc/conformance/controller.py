@@ -20,10 +20,10 @@ from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.deformation.base import automatic, with_inner
 from fpirhc.describe import describe
 from fpirhc.plant.chain import measured_signals
-from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
+from fpirhc.simulation.trials import without_warning
 from fpirhc.status import Status
 from fpirhc.task.problem import Problem
 

@@ -20,10 +20,10 @@ from fpirhc.plant.motion import Output
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
-from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
+from fpirhc.simulation.trials import without_warning
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout

@@ -20,11 +20,11 @@ from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, values_of
 from fpirhc.sensing.observability import unobservable
 from fpirhc.sensing.sensing import Sensing, Sensor
-from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
+from fpirhc.simulation.trials import without_warning
 from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout

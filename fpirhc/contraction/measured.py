@@ -6,8 +6,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.contraction.gains import predicted_factor
-from fpirhc.contraction.spectrum import Array, response_jacobians
+from fpirhc.contraction.spectrum import Array, predicted_factor, response_jacobians
 from fpirhc.errors import InvalidShape
 from fpirhc.plant.motion import sampling
 from fpirhc.sensing.base import response_names

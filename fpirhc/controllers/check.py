@@ -15,9 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.contraction.delayed import delayed_limit, leaking_limit
-from fpirhc.contraction.gains import assess_gain, linear_limit
 from fpirhc.contraction.measured import jacobians_along
-from fpirhc.contraction.spectrum import Spectrum
+from fpirhc.contraction.spectrum import Spectrum, assess_gain, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import form_inside

@@ -17,16 +17,13 @@ from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count, Seed
-from fpirhc.probing.estimates import Estimates
-from fpirhc.probing.excitation import Record, excited
-from fpirhc.probing.identification import Interval, identify
-from fpirhc.probing.recording import read_recording
+from fpirhc.probing.identification import Estimates, Interval, identify
+from fpirhc.probing.recording import Record, excited, read_recording
 from fpirhc.probing.rule import Rule, mean_ratio
-from fpirhc.simulation.error_pair import errors_of
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
-from fpirhc.simulation.trials import weighed
+from fpirhc.simulation.trials import errors_of, weighed
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 

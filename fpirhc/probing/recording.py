@@ -1,18 +1,172 @@
-"""A recording of a run: commands and measurements of every cycle, from a CSV file."""
+"""Probing signals, a recording of a run from a CSV file, and its replay by a controller."""
 
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
+import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import any_gain
+from fpirhc.controllers.contract import without_deformation
+from fpirhc.deformation.base import Deformation, Iteration
+from fpirhc.deformation.model_referenced import ModelReferenced
+from fpirhc.errors import InvalidValue, Mistakes, OutputError
+from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import input_columns
-from fpirhc.probing.excitation import Record
 from fpirhc.sensing.base import response_names
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.stepper import Stepper
+from fpirhc.status import Status
+from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
+
+_HOLDS = (1, 2, 4, 8, 16)  # cycles
+_NOISES, _SHARE = 2.0, 0.1  # amplitude: of the noise, and of the deviation of the desired response
+_BEGUN = 3  # cycles after which a response is one of the run
+
+
+@dataclass(frozen=True)
+class Excitation(Deformation):
+    """r_k = d_k + A s_k with a random binary sequence s, independent in every channel.
+
+    Args:
+        amplitude: A of every channel, in the unit of the response; 0 only listens.
+        cycles: length of the sequence; after it the request is the desired response.
+        seed: of the sequence.
+    """
+
+    amplitude: tuple[float, ...]
+    cycles: int
+    seed: int = 0
+
+    @property
+    def iteration(self) -> Iteration:
+        return Iteration(limited=False)
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        del elements
+        return Layout(
+            (*(scalar(f"{name}_before") for pair in self._names for name in pair), scalar("excitation_cycle"))
+        )
+
+    def shown(self) -> Mapping[str, str]:
+        return {name: f"{name}_before" for pair in self._names for name in pair}
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        table = sequence(self.cycles, len(self.amplitude), self.seed) * np.array(self.amplitude)
+        cycle = memory["excitation_cycle"]
+        grid = [np.arange(self.cycles, dtype=float).tolist()]
+        added = [
+            ca.interpolant(f"excitation{k}", "linear", grid, column.tolist())(ca.fmin(cycle, self.cycles - 1))
+            for k, column in enumerate(table.T)
+        ]
+        remembered = {"excitation_cycle": cycle + 1}
+        for k, (model, measured) in enumerate(self._names):
+            remembered |= {f"{model}_before": request[k], f"{measured}_before": response[k]}
+        return desired + ca.vertcat(*added), remembered
+
+    def effective_gain(self) -> float:
+        """Next to nothing; zero would be no adaptation, with which no loop passes its response on."""
+        return 1e-9
+
+    def secant_gain(self) -> float:
+        return self.effective_gain()
+
+    def largest_step(self) -> float:
+        return float("inf")
+
+    def with_effective_gain(self, gain: float) -> Self:
+        del gain
+        return replace(self)
+
+    @property
+    def _names(self) -> list[tuple[str, str]]:
+        return [(f"excitation_model_{k}", f"excitation_response_{k}") for k in range(len(self.amplitude))]
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What was recorded.
+
+    Args:
+        measured: responses, shape (cycles, n).
+        modelled: the model's responses to the commands that acted.
+        usable: which cycles count: those with an answer.
+        amplitude: of the excitation.
+        stop: why the run ended early; empty where it did not.
+        clipped: share of the cycles with a command at a limit.
+    """
+
+    measured: np.ndarray
+    modelled: np.ndarray
+    usable: np.ndarray
+    amplitude: tuple[float, ...] = ()
+    stop: str = ""
+    clipped: float = 0.0
+
+
+def sequence(cycles: int, channels: int, seed: int) -> np.ndarray:
+    """Return +-1, shape (cycles, channels), held for 1 to 16 cycles: power at all frequencies of interest; 0 in the end."""
+    random, signs = np.random.default_rng(seed), np.zeros((cycles, channels))
+    for j in range(channels):
+        k, sign = 0, 1.0
+        while k < cycles:
+            hold = int(random.choice(_HOLDS))
+            sign = float(random.choice([-1.0, 1.0])) if random.random() < 0.5 else -sign
+            signs[k : k + hold, j] = sign
+            k += hold
+    signs[-1] = 0
+    return signs
+
+
+def excited(
+    problem: Problem, controller: Controller, *, cycles: int, amplitude: float | Mapping[str, float] | None, seed: int
+) -> Record:
+    """Return the record of a run under the controller without its deformation, excited.
+
+    Args:
+        problem: whose plant is run.
+        controller: that keeps it safe.
+        cycles: length of the run.
+        amplitude: in the unit of the response, by controlled coordinate or one for all; None: twice the noise of a silent run of
+            the same length and a tenth of the deviation of its desired response.
+        seed: of the sequence and of the run.
+    """
+    names = problem.plant.controlled_names
+    short, bare = replace(problem, duration=cycles * problem.period, measure_from=0.0), without_deformation(controller)
+    if amplitude is None:
+        run, silent = _run(short, bare, (0.0,) * len(names), cycles, seed)
+        noise = np.median(np.abs(np.diff((silent.measured - silent.modelled)[_BEGUN:], axis=0)), axis=0) / 0.6745
+        sizes = _NOISES * noise / np.sqrt(2) + _SHARE * np.std(np.asarray(run["desired"])[_BEGUN:], axis=0)
+        chosen = tuple(map(float, sizes))
+    elif isinstance(amplitude, Mapping):
+        chosen = tuple(float(amplitude.get(name, 0.0)) for name in names)
+    else:
+        chosen = (float(amplitude),) * len(names)
+    return _run(short, bare, chosen, cycles, seed)[1]
+
+
+def _run(
+    problem: Problem, bare: Controller, amplitude: tuple[float, ...], cycles: int, seed: int
+) -> tuple[Run, Record]:
+    excitation = Excitation(amplitude, cycles, seed)
+    with any_gain():  # nothing is iterated, so the sign of the plant's gain does not matter
+        run = simulate(problem, bare.with_deformation(ModelReferenced(excitation)), seed=seed, compiled=False)
+    modelled, measured = (np.column_stack([run[pair[k]] for pair in excitation._names]) for k in (0, 1))
+    held = np.asarray(run["foreign_held"]).ravel() if "foreign_held" in run.layout.names else np.zeros(len(measured))
+    clipped = float(np.mean(np.asarray(run["clipped"]) > 0)) if len(measured) else 0.0
+    return run, Record(measured, modelled, held == 0, amplitude, run.stop or "", clipped)
+
 
 _EVEN = 0.01  # share of the period by which a time may be off
 
@@ -104,3 +258,104 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
             ) from None
     table = np.array(values).reshape(-1, len(head))
     return {name.strip(): column for name, column in zip(head, table.T, strict=True)}
+
+
+_SENT = "_command_before"  # what a controller remembers of its last command
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """The commands of a controller over a recording.
+
+    Args:
+        times: of the cycles, shape (cycles,).
+        inputs: names of the inputs.
+        commands: that the controller would have sent, shape (cycles, inputs).
+        recorded: commands in the recording; None: it has none.
+        statuses: number of cycles by status.
+    """
+
+    times: np.ndarray
+    inputs: tuple[str, ...]
+    commands: np.ndarray
+    recorded: np.ndarray | None
+    statuses: Mapping[str, int]
+
+    def differences(self) -> dict[str, tuple[float, float, float]]:
+        """Return by input: the rms difference from the recorded command, the largest one, and its time; {} without a record."""
+        if self.recorded is None:
+            return {}
+        away = self.commands - self.recorded
+        at = np.nanargmax(np.abs(away), axis=0)
+        rms = np.sqrt(np.nanmean(away**2, axis=0))
+        return {
+            name: (float(rms[k]), float(away[at[k], k]), float(self.times[at[k]])) for k, name in enumerate(self.inputs)
+        }
+
+    def write(self, path: Path) -> None:
+        """Write a table: time and the commands by input.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        try:
+            with path.open("w", newline="", encoding="utf-8") as file:
+                table = csv.writer(file)
+                table.writerow(("time", *self.inputs))
+                table.writerows(np.column_stack([self.times, self.commands]).tolist())
+        except OSError as error:
+            raise OutputError(f"{path} cannot be written: {error.strerror}") from None
+
+
+@checked_call
+def replay(problem: Problem, controller: Controller, recording: Path) -> Replay:
+    """Return what a controller would have commanded over a recording.
+
+    Columns of the CSV file are "time", what the problem's controller is given ("q1", "q1'", "q1''", or what its sensors show), and
+    the inputs that were sent, where they are known. A response ("q1''") without a column is the difference of its lower
+    derivative. An empty entry is a sample that was lost: the cycle is skipped, as it would have been.
+
+    Args:
+        problem: the task.
+        controller: any controller.
+        recording: path of the file.
+
+    Raises:
+        InvalidValue: a file that is no table of numbers.
+        InvalidProblem: missing columns, or times that are not a period apart; all together.
+    """
+    columns = columns_of(recording)
+    stepper = Stepper(problem, controller, compiled=False)
+    inputs = tuple(problem.plant.inputs)
+    measured, recorded = _table(columns, problem, stepper.measures, recording.name)
+    places = stepper.memory.slice(_SENT) if _SENT in stepper.memory else slice(0, 0)
+    memory, commands, statuses = stepper.start(), np.empty((len(measured), len(inputs))), Counter[str]()
+    for k, row in enumerate(measured):
+        command, memory = stepper.step_measured(float(columns["time"][k]), row, memory)
+        commands[k] = command
+        statuses[Status(int(stepper.trace()["status"].item())).name] += 1
+        if recorded is not None and np.isfinite(recorded[k]).all():
+            memory[places] = recorded[k]
+    return Replay(columns["time"], inputs, commands, recorded, dict(statuses))
+
+
+def _table(
+    columns: Mapping[str, np.ndarray], problem: Problem, measures: tuple[str, ...], name: str
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Measurements in the order of the controller, and recorded commands."""
+    mistakes, period, inputs = Mistakes(f"recording {name}"), problem.period, input_columns(problem.plant)
+    values = dict(columns)
+    for one in measures:
+        lower = one.removesuffix("'")
+        if one not in columns and lower in columns:
+            values[one] = np.diff(columns[lower], prepend=columns[lower][:1]) / period
+    lacking(columns, [one for one in measures if one not in values], mistakes, ", which the controller is given")
+    present = [one for one in inputs if one in columns]
+    if present and len(present) < len(inputs):
+        mistakes.add(
+            f"it has the commands of {', '.join(present)} alone; expected those of {', '.join(inputs)}, or of none"
+        )
+    check_times(columns, problem, mistakes)
+    mistakes.raise_if_any()
+    recorded = np.column_stack([columns[one] for one in inputs]) if present else None
+    return np.column_stack([values[one] for one in measures]), recorded

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fpirhc.contraction.gains import ContractionReport
+    from fpirhc.contraction.spectrum import ContractionReport
     from fpirhc.simulation.picture import Drawing
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.comparison import Comparison

@@ -1,21 +1,261 @@
-"""The points of a review: points of the reference, and draws of the exact parameters from their box.
+"""The points of a review: points of the reference, draws of the exact parameters, dead times, and slopes of the plant there.
 
-Theory: docs/theory-questions.md.
+Inner states have no task: they are neither controlled nor judged, and no cost weighs them. What a reference gives for them is an
+invention, so they are simulated while the others are on the reference, z' = f(x^N, z, inverse(x^N, z, r^N; p); p). Where this
+motion runs away and the reference is held, it is the rest there. Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.reference_states import nominal_motion
-from fpirhc.horizon.nominal import filled
+from fpirhc.errors import FpirhcError
+from fpirhc.horizon.nominal import filled, output_feedback
+from fpirhc.horizon.transcription import transcribe
+from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.mismatch import exact_ranges
-from fpirhc.review.inner import inner_motion, inner_places
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.evaluate import require_unsolved
+from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.roots import Equations
+from fpirhc.task.dead_time import MEASUREMENT
+from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
+
+_TOLERANCE = 1e-7
+_STEPS = 100_000
+_DECAYS = 20.0  # times in a run, by which the error of outputs at the start decays
+_FASTEST = 0.1  # of the cycle, the rate of this decay
+_SHORTEST = 2000  # steps of a run at least
+_AWAY = 1e9  # of the start, from which a motion runs away
+_ROUNDING = 1e-9
+_WHOLE = 1e-6  # share of a cycle by which a time may be rounded
+
+
+def inner_places(problem: Problem) -> tuple[int, ...]:
+    """Return the places of the inner states among the states of the plant."""
+    plant = problem.plant
+    if plant.outputs:
+        return tuple(range(plant.state.size))  # all are simulated, while the outputs follow their reference
+    with_task = {*plant.controlled_names, *problem.judged_names}
+    weighed = _weighed(problem)
+    with_task |= {plant.state.elements[k].rstrip("'") for k in weighed}
+    return tuple(k for k, e in enumerate(plant.state.elements) if e.rstrip("'") not in with_task)
+
+
+def inner_motion(
+    problem: Problem, places: Sequence[int], draws: np.ndarray, times: np.ndarray
+) -> list[np.ndarray | None]:
+    """Return the motion of the inner states for every draw of the exact parameters.
+
+    Args:
+        problem: the problem.
+        places: of the inner states, from `inner_places`.
+        draws: parameters, shape (draws, np).
+        times: increasing times from 0 on, shape (m,).
+
+    Returns:
+        For every draw the states, shape (m, len(places)); None where they do not stay finite, and there is no rest.
+    """
+    moved = _moved(problem, places, draws, times)
+    away = [one is None or bool(np.abs(one).max() > _AWAY * max(1.0, np.abs(one[0]).max())) for one in moved]
+    if not problem.plant.outputs or not any(away) or not _held(problem, times):
+        return moved
+    every = zip(moved, away, draws, strict=True)
+    return [_at_rest(problem, places, row, len(times)) if gone else one for one, gone, row in every]
+
+
+def _moved(problem: Problem, places: Sequence[int], draws: np.ndarray, times: np.ndarray) -> list[np.ndarray | None]:
+    start = problem.start_state[list(places)]
+    if problem.plant.step is not None:
+        step = _cycle(problem, list(places))
+        return [_motion_of_map(step, problem.period, start, row, times) for row in draws]
+    steps = _integrator(problem, list(places), times)
+    return [_motion(steps, start, row) for row in draws]
+
+
+def _motion_of_map(
+    step: ca.Function, period: float, start: np.ndarray, parameters: np.ndarray, times: np.ndarray
+) -> np.ndarray | None:
+    """States of the cycle in which every time lies."""
+    cycles = np.floor(times / period + _WHOLE).astype(int)
+    count = max(int(cycles[-1]), 1)
+    starts, held = period * np.arange(count), np.repeat(parameters[:, None], count, axis=1)
+    later = np.asarray(step.mapaccum("fpirhc_inner", count)(start, starts[None, :], held).full()).T
+    rows = np.vstack([start, later])[cycles]
+    return rows if np.isfinite(rows).all() else None
+
+
+def _motion(steps: ca.Function, start: np.ndarray, parameters: np.ndarray) -> np.ndarray | None:
+    try:
+        rows = np.asarray(steps(x0=start, p=parameters)["xf"].full()).T
+    except RuntimeError as error:  # CVODES gives up where the motion leaves every bound
+        require_unsolved(error)
+        return None
+    return np.vstack([start, rows]) if np.isfinite(rows).all() else None
+
+
+def _held(problem: Problem, times: np.ndarray) -> bool:
+    """Whether the reference does not move."""
+    outputs = np.asarray(problem.reference.function(problem.plant).map(len(times))(times[None, :])[0].full())
+    return bool((np.ptp(outputs, axis=1) <= _ROUNDING * np.abs(outputs).max(axis=1)).all())
+
+
+def _at_rest(problem: Problem, places: Sequence[int], parameters: np.ndarray, count: int) -> np.ndarray | None:
+    rest = _rest(problem, parameters)
+    return None if rest is None else np.tile(rest[list(places)], (count, 1))
+
+
+def _rest(problem: Problem, parameters: np.ndarray) -> np.ndarray | None:
+    """The state in which the controlled outputs are on the reference and nothing moves, shape (nx,); None where none is found.
+
+    The search begins at the start of the problem.
+    """
+    plant = problem.plant
+    x, u, p = plant.symbols()
+    calm = np.zeros(len(plant.names))
+    drift = plant.equations.forced_rate(x, u, p, calm)  # of a map its differences
+    wanted = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
+    places = [plant.output.elements.index(name) for name in plant.controlled_names]
+    off = plant.equations.output(x, u, p, calm)[places] - wanted[places]
+    root = Equations(ca.vertcat(x, u), [p], ca.vertcat(drift, off)).root(
+        np.concatenate([problem.start_state, problem.inputs_before]), parameters
+    )
+    return None if root is None else root.at[: plant.state.size]
+
+
+def _cycle(problem: Problem, places: list[int]) -> ca.Function:
+    """Function (inner states, time, parameters) -> inner states of a map one cycle later."""
+    plant = problem.plant
+    t, p, inner, state, command = _on_reference(problem, places)
+    after = plant.equations.next(state, command, p, np.zeros(len(plant.names)))[places]
+    return ca.Function("fpirhc_inner_cycle", [inner, t, p], [ca.densify(after)])
+
+
+def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Function:
+    plant = problem.plant
+    t, p, inner, state, command = _on_reference(problem, places)
+    rate = plant.equations.forced_rate(state, command, p, np.zeros(len(plant.names)))[places]
+    # Friction at a reversal is at rest until it is not: a step must not pass over the whole reversal.
+    longest = max(problem.period, problem.duration / _SHORTEST)
+    options = {
+        "reltol": _TOLERANCE,
+        "abstol": _TOLERANCE * 1e-3,
+        "max_num_steps": _STEPS,
+        "max_step_size": longest,
+        "disable_internal_warnings": True,
+        "show_eval_warnings": False,
+    }
+    system = {"x": inner, "p": p, "t": t, "ode": rate}
+    return ca.integrator("fpirhc_inner", "cvodes", system, float(times[0]), [float(v) for v in times[1:]], options)
+
+
+def _on_reference(problem: Problem, places: list[int]) -> tuple[Expression, ...]:
+    """Symbols of time, parameters and inner states, and the state and the command while the others are on the reference."""
+    plant = problem.plant
+    matrix = kind(problem.reference.opaque or plant.equations.inverse_opaque)
+    t, p, inner = matrix.sym("t"), matrix.sym("p", plant.parameter.size), matrix.sym("z", len(places))
+    nominal, response = problem.reference.function(plant)(t)
+    rows = [nominal[place] if place >= 0 else inner[0] for place in plant.equations.known_by_outputs]
+    for place, entry in zip(places, range(len(places)), strict=True):
+        rows[place] = inner[entry]
+    state = ca.vertcat(*rows)
+    wanted = nominal_responses(plant, nominal, response)
+    decay = min(_DECAYS / problem.duration, _FASTEST / problem.period)
+    wanted = wanted + output_feedback(plant, state, nominal, p, decay)  # of states on the reference there is no error
+    return t, p, inner, state, plant.equations.inverse(state, wanted, p)
+
+
+def _weighed(problem: Problem) -> set[int]:
+    """Places of the states on which the cost of a stage depends."""
+    if problem.horizon is None or problem.cost is None:
+        return set()
+    try:
+        stage = transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, Limits()).stage_cost
+    except FpirhcError:
+        return set(range(problem.plant.state.size))
+    pattern = np.asarray(ca.DM(stage.jac_sparsity(0, 0), 1).full())
+    return {k for k in range(problem.plant.state.size) if pattern[0, k]}
+
+
+_WHOLE_CYCLE = 1e-9  # of a cycle
+
+
+def scaled(problem: Problem, percent: float) -> Problem:
+    """Return the problem with all dead times longer by so many percent, rounded away from the true one to whole cycles.
+
+    A fraction of a cycle is interpolated between two commands, which damps requests that alternate.
+    """
+    rounded: Callable[[float], int] = math.ceil if percent > 0 else math.floor
+    sign = _WHOLE_CYCLE if percent > 0 else -_WHOLE_CYCLE
+
+    def changed(time: float) -> float:
+        return rounded(time / problem.period * (1 + percent / 100) - sign) * problem.period
+
+    times = problem.dead_time
+    inputs = {name: changed(time) for name, time in times.inputs.items()}
+    return replace(problem, dead_time=replace(times, inputs=inputs, measurement=changed(times.measurement)))
+
+
+def roomy(problem: Problem, percent: float) -> Problem:
+    """Return the problem with queues for dead times that are longer by so many percent, as `scaled` makes them."""
+    times, most = problem.dead_time, scaled(problem, percent).dead_time
+    longest = {**most.inputs, MEASUREMENT: most.measurement}
+    stated = {n: max(t, times.longest.get(n, 0.0)) for n, t in longest.items() if n in times.queued}
+    return replace(problem, dead_time=replace(times, longest={**times.longest, **stated}))
+
+
+def live_paths(problem: Problem) -> tuple[str, ...]:
+    """Return the paths of the dead times of a problem with queues for other ones."""
+    times = problem.dead_time
+    inputs = tuple(f"dead_time.inputs.{name}" for name in times.inputs if name in times.longest)
+    return (*inputs, "dead_time.measurement") if MEASUREMENT in times.longest else inputs
+
+
+def is_late(problem: Problem) -> bool:
+    """Whether there is a dead time."""
+    return bool(problem.dead_time.measurement or any(problem.dead_time.inputs.values()))
+
+
+class StateSlopes(NamedTuple):
+    """A (nx, nx), B (nx, nu), C (n, nx), D (n, nu), Y (sum of relative orders, nx), of the controlled coordinates or outputs."""
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    y: np.ndarray
+
+
+def state_slopes(plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.ndarray) -> StateSlopes:
+    """Return the slopes at a point; those of a map are of its divided differences."""
+    return StateSlopes(*(np.asarray(m.full()) for m in _function(plant)(state, command, parameters)))
+
+
+def below_responses(plant: Plant) -> list[int]:
+    """Return the places in `output` of controlled quantities and of their derivatives below the response; none of order 0."""
+    orders = plant.response_orders
+    return [k for k, e in enumerate(plant.output.elements) if orders.get(e.rstrip("'"), 0)]
+
+
+@lru_cache(maxsize=8)  # several questions of a review need it
+def _function(plant: Plant) -> ca.Function:
+    x, u, p = plant.symbols()
+    rates, responses = plant.equations.rate(x, u, p), plant.equations.controlled_response(x, u, p)
+    shown = plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
+    chain = ca.vertcat(ca.SX(0, 1), *(shown[k] for k in below_responses(plant)))
+    pairs = ((rates, x), (rates, u), (responses, x), (responses, u), (chain, x))
+    return ca.Function("fpirhc_state_slopes", [x, u, p], [ca.densify(ca.jacobian(one, by)) for one, by in pairs])
+
 
 _POINTS = 41
 _DRAWS = 64

@@ -22,12 +22,9 @@ from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.members import within
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.loops import Loops, LoopsByGain, loops_along, loops_by_gain
-from fpirhc.review.nominal_runs import NominalRuns
-from fpirhc.review.prediction import NominalRun
-from fpirhc.review.spectra import spectrum_near
-from fpirhc.simulation.error_pair import ErrorPair
-from fpirhc.simulation.trials import harm_in
+from fpirhc.review.loops import Loops, LoopsByGain, loops_along, loops_by_gain, spectrum_near
+from fpirhc.review.prediction import NominalRun, NominalRuns
+from fpirhc.simulation.trials import ErrorPair, harm_in
 from fpirhc.task.problem import Problem
 
 GROUP = "fpirhc.questions"  # of entry points

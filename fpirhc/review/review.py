@@ -14,7 +14,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.review.answer import Answer, Review, Verdict, decided
 from fpirhc.review.grid import ReviewGrid, review_grid
-from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.prediction import NominalRuns
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, asked, known_questions
 from fpirhc.review.questions.convergence import CONVERGES
 from fpirhc.simulation.model_as_plant import behind_stated_lag

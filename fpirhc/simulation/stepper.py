@@ -21,11 +21,11 @@ from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import Checked, missing
 from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.simulation.clock import Clock, Deadline, missed_cycles, most_missed
-from fpirhc.simulation.harm_warning import warn_of_harm, with_recommended_gain
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, measures, refuse_unbounded
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
 from fpirhc.simulation.step_arguments import NOT_WRITTEN, NOTHING, NumbersNow, SetpointsNow, StepArguments
+from fpirhc.simulation.trials import warn_of_harm, with_recommended_gain
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native

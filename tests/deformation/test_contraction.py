@@ -12,9 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fpirhc import RFPT, Affine, RFPTVector, Rotation, Sigmoid
-from fpirhc.contraction.gains import assess_gain, check_gain, linear_limit, predicted_factor
 from fpirhc.contraction.measured import identified_factor
-from fpirhc.contraction.spectrum import Spectrum, response_jacobian, spectrum_over_box, spectrum_over_run
+from fpirhc.contraction.spectrum import (
+    Spectrum,
+    assess_gain,
+    check_gain,
+    linear_limit,
+    predicted_factor,
+    response_jacobian,
+    spectrum_over_box,
+    spectrum_over_run,
+)
 from fpirhc.deformation import Deformation, Identity
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive
 from fpirhc.plant.plant import Parameter, Plant

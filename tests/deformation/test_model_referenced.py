@@ -18,7 +18,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
 from fpirhc.problem_files.shipped import shipped_problems
-from fpirhc.review.questions.form import recommended_form, right_form
+from fpirhc.review.questions.right_model import recommended_form, right_form
 from fpirhc.symbolic.block import Block
 
 LAW = fp.Exponential(rate=6.0)

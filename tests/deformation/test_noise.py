@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive, NotSupported
-from fpirhc.review.suggest import Suggestion, noise_spread
+from fpirhc.review.questions.noise import Suggestion, noise_spread
 
 SETTINGS = [(0.198, 0.0, 1.5), (0.5, 0.0, 1.0), (0.59, 0.78, 1.5), (0.97, 0.91, 1.5), (1.9, 0.8, 1.0)]
 BUDGET = {"Q1": 0.32, "Q2": 0.555}  # N; what the plain gain -0.5 makes of a noise of 1 m/s^2

@@ -14,7 +14,7 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.review.tightening import _reached
+from fpirhc.review.response_prediction import _reached
 
 LIMIT = 0.8
 

@@ -414,9 +414,9 @@ GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/
 # Values that generic code builds for itself; it asks nobody whether he is one.
 BUILDS = {
     "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map
-    "review/questions/form.py": {"Increment", "ModelReferenced"},  # the forms that are compared
+    "review/questions/right_model.py": {"Increment", "ModelReferenced"},  # the forms that are compared
     "review/prediction.py": {"Identity"},  # no adaptation
-    "review/suggest.py": {"Filtered"},  # the suggested deformation
+    "review/questions/noise.py": {"Filtered"},  # the suggested deformation
     "studies/comparison/caveats.py": {"HeldInput"},  # the plant with nobody at it
     "simulation/linearise/asked_loop.py": {"Jump"},  # the entry of signals at the inputs
     "studies/operating_limits.py": {"Noise"},  # the noise of the sensors at which a controller fails is sought

@@ -10,7 +10,7 @@ import pytest
 from on_problem import named, on_problem
 
 import fpirhc as fp
-from fpirhc.conformance.live import check_live, number_paths
+from fpirhc.conformance.laws import check_live, number_paths
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance.live import check_live
+from fpirhc.conformance.laws import check_live
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.receding_horizon import StopRun
 from fpirhc.symbolic.functions import nan_where

@@ -13,7 +13,7 @@ from scipy.signal import cont2discrete, ss2tf
 import fpirhc as fp
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.questions.zero_dynamics import zero_dynamics_rate
+from fpirhc.review.questions.convergence import zero_dynamics_rate
 
 T = 10.0  # s, one step
 ITERATION = fp.ModelReferenced(fp.Affine(gain=-1.0))

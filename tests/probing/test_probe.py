@@ -13,9 +13,9 @@ from bodies import PERIOD, RHC, body_problem
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
-from fpirhc.probing.excitation import excited, sequence
 from fpirhc.probing.identification import Channel, identify
 from fpirhc.probing.probe import Trial, best, tried
+from fpirhc.probing.recording import excited, sequence
 from fpirhc.probing.rule import Rule
 
 KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
@@ -253,7 +253,7 @@ def test_a_candidate_that_the_loop_refuses_is_not_tried_and_the_others_are():
 
 def test_a_sign_that_is_not_certain_is_asked_again_louder(monkeypatch):
     """An excitation half as large as usual in much noise leaves the sign open; 2.5 times as much settles it, and this is said."""
-    monkeypatch.setattr("fpirhc.probing.excitation._NOISES", 1.0)
+    monkeypatch.setattr("fpirhc.probing.recording._NOISES", 1.0)
     monkeypatch.setattr(Rule, "shortlist", lambda _: {})
     problem = body_problem(0.3, 2, 0.05, 2.0)
     quiet, found = (fp.probe(problem, RHC, cycles=60, seed=1, amplitude=one) for one in (0.0, None))

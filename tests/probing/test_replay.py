@@ -11,7 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
-from fpirhc.probing.replay import replay
+from fpirhc.probing.recording import replay
 
 TASK = fp.load_problem("two_mass")
 

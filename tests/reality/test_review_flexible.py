@@ -13,8 +13,7 @@ import fpirhc as fp
 from fpirhc.deformation.base import Iteration
 from fpirhc.errors import InvalidProblem
 from fpirhc.review.grid import review_grid
-from fpirhc.review.questions.reality import LOOP, RESONANCE
-from fpirhc.review.true_plant_loop import extra_modes, real_loops, real_points
+from fpirhc.review.questions.reality import LOOP, RESONANCE, extra_modes, real_loops, real_points
 
 K, R, L, MOTOR, LOAD, C, B = 0.05, 1.0, 5e-4, 5e-4, 5e-4, 20.0, 5e-3  # N m/A, ohm, H, kg m^2 twice, N m/rad, N m s
 NAMES = ("motor", "motor_speed", "angle", "load_speed", "current")

@@ -16,9 +16,8 @@ from fpirhc.deformation.base import Iteration
 from fpirhc.report.html import chart_data
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.nominal_runs import null_problem, null_runs
-from fpirhc.review.questions.reality import LAG, LOOP, RESONANCE
-from fpirhc.review.true_plant_loop import extra_modes, real_loops, real_points
+from fpirhc.review.prediction import null_problem, null_runs
+from fpirhc.review.questions.reality import LAG, LOOP, RESONANCE, extra_modes, real_loops, real_points
 
 TAU, FREQUENCY = 0.02, 300.0  # s, rad/s
 

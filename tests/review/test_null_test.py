@@ -14,7 +14,7 @@ from test_review_laws import moving
 import fpirhc as fp
 from fpirhc.deformation import Deformation
 from fpirhc.review.answer import Verdict
-from fpirhc.review.questions.form import forms_of, map_inside
+from fpirhc.review.questions.right_model import forms_of, map_inside
 
 POLE = 86.7  # 1/s
 MAP = fp.Affine(gain=-1.0)

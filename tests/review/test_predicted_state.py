@@ -12,7 +12,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.wrappers.predicted import Predictor
 from fpirhc.deformation import Deformation
-from fpirhc.review.questions.predicted_state import KNOWS
+from fpirhc.review.questions.dead_time import KNOWS
 from fpirhc.review.review import review
 
 RATE, PERIOD, FORCE = 3.0, 0.01, 1.0  # 1/s, s, m/s^2

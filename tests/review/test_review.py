@@ -20,9 +20,9 @@ from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along, own_loops
-from fpirhc.review.questions.form import forms_of
 from fpirhc.review.questions.horizon import plan_gain
 from fpirhc.review.questions.margins import margins
+from fpirhc.review.questions.right_model import forms_of
 from fpirhc.review.review import predict
 
 

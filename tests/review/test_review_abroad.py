@@ -14,7 +14,7 @@ from abroad import load
 from reviewed import answer
 
 import fpirhc as fp
-from fpirhc.review.questions.form import forms_of
+from fpirhc.review.questions.right_model import forms_of
 
 
 @cache

@@ -15,19 +15,26 @@ from reviewed import answer as asked
 from reviewed import linear
 
 import fpirhc as fp
-from fpirhc.contraction.gains import assess_gain
-from fpirhc.contraction.spectrum import Spectrum
+from fpirhc.contraction.spectrum import Spectrum, assess_gain
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Verdict, duration, per_cycle
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
-from fpirhc.review.questions.commands import commands_inside, inverse_exists
 from fpirhc.review.questions.convergence import _NEAR, _without, box_converges, converges
-from fpirhc.review.questions.gain import _converging, _gain, _sign, gain_admissible, gain_of_target
+from fpirhc.review.questions.gain import (
+    FAR,
+    Recommended,
+    _converging,
+    _gain,
+    _sign,
+    gain_admissible,
+    gain_of_target,
+    recommended_gain,
+)
 from fpirhc.review.questions.margins import LEAST_PHASE, MARGINS, margins_enough
+from fpirhc.review.questions.reference import commands_inside, inverse_exists
 from fpirhc.review.questions.right_model import _no_gain
 from fpirhc.review.questions.slew import _start_deviation, effect, range_enough, slew_enough
-from fpirhc.review.recommended_gain import FAR, Recommended, recommended_gain
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 PERIOD, CYCLES = 0.1, 100
@@ -451,7 +458,7 @@ NAN = float("nan")
 def test_an_inverse_exists_where_the_gains_stay_regular(monkeypatch, grid, plant, drawn, verdict, said):
     """Condition and smallest share of diag(1, s) are 1 / s and s; doubts begin at 1e4 and 0.01, the end is at 1e8 and at zero."""
     gains = np.stack([regular(*plant), regular(*drawn)])
-    monkeypatch.setattr("fpirhc.review.questions.commands._gains", lambda _: gains)
+    monkeypatch.setattr("fpirhc.review.questions.reference._gains", lambda _: gains)
     one = inverse_exists(grid)
     assert (one.verdict, bool(one.change)) == (verdict, verdict != "yes")
     assert one.evidence.endswith(said)

@@ -13,10 +13,9 @@ from plants import heavy
 from reviewed import answer
 
 import fpirhc as fp
-from fpirhc.review.grid import review_grid
-from fpirhc.review.inner import inner_motion, inner_places
+from fpirhc.review.grid import inner_motion, inner_places, review_grid
+from fpirhc.review.questions.convergence import zero_dynamics
 from fpirhc.review.questions.margins import SLOWER
-from fpirhc.review.questions.zero_dynamics import zero_dynamics
 from fpirhc.review.review import review
 
 PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-3))

@@ -3,7 +3,7 @@
 import fpirhc as fp
 from fpirhc.controllers import replanning
 from fpirhc.describe import describe, identity
-from fpirhc.review.nominal_runs import null_problem
+from fpirhc.review.prediction import null_problem
 from fpirhc.simulation import loop
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.slopes import Step

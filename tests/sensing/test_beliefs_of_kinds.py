@@ -12,7 +12,7 @@ from filters import extended_filter
 from plants import linear
 
 import fpirhc as fp
-from fpirhc.conformance.live import check_live
+from fpirhc.conformance.laws import check_live
 from fpirhc.errors import NotSupported
 from fpirhc.sensing.base import StateObserver
 

@@ -13,7 +13,7 @@ from plants import linear
 
 import fpirhc as fp
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.simulation import harm_warning
+from fpirhc.simulation import trials as harm_warning
 from fpirhc.studies.comparison.timing import stepper_to_time
 
 PROBLEM = fp.Problem(

@@ -12,8 +12,8 @@ import fpirhc as fp
 from fpirhc.review import review as reviewing
 from fpirhc.review.answer import Verdict
 from fpirhc.review.question import known_questions
-from fpirhc.review.questions.commands import COMMANDS
 from fpirhc.review.questions.gain import GAIN
+from fpirhc.review.questions.reference import COMMANDS
 from fpirhc.simulation import run_signals
 from fpirhc.studies.comparison import compare as comparing
 from fpirhc.studies.comparison import pairwise

@@ -28,7 +28,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.review.dead_time_variants import is_late, scaled
+from fpirhc.review.grid import is_late, scaled
 from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger, Records

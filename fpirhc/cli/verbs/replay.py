@@ -22,7 +22,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
-    from fpirhc.probing.replay import replay
+    from fpirhc.probing.recording import replay
     from fpirhc.report.terminal import say, show_table
     from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.view import to_json

@@ -120,8 +120,8 @@ def _simulated(
     from fpirhc.controllers.live_settings import live_settings
     from fpirhc.errors import NotSupported
     from fpirhc.problem_files.settings import is_whole, with_settings
-    from fpirhc.simulation.harm_warning import with_recommended_gain
     from fpirhc.simulation.simulate import simulate
+    from fpirhc.simulation.trials import with_recommended_gain
 
     run["setpoints"] = setpoints
     if not settings:

@@ -14,8 +14,7 @@ import casadi as ca
 import numpy as np
 import scipy.linalg
 
-from fpirhc.contraction.gains import assess_gain
-from fpirhc.contraction.spectrum import Spectrum
+from fpirhc.contraction.spectrum import Spectrum, assess_gain
 from fpirhc.controllers.base import Controller, Response, clip, command_before, deform_block, error_signal, like
 from fpirhc.controllers.reference_states import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.schedules import Schedule, linear_modes

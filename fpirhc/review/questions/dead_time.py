@@ -12,15 +12,16 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
+from fpirhc.controllers.wrappers.predicted import other_predictions
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.dead_time_variants import is_late, scaled
-from fpirhc.review.nominal_runs import CYCLES
+from fpirhc.review.grid import is_late, scaled
+from fpirhc.review.prediction import CYCLES
 from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
 from fpirhc.review.questions.margins import margins
-from fpirhc.simulation.error_pair import ErrorPair, errors_of
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.trials import ErrorPair, errors_of
 from fpirhc.task.problem import Problem
 
 WRONG_DEAD_TIME = "Does it bear a dead time that is wrong by a cycle?"
@@ -189,8 +190,42 @@ def _numbers(one: ErrorPair) -> dict[str, float]:
     return {"without": one.without[one.worst], "with": one.adapted[one.worst]}
 
 
+KNOWS = "Does the prediction know what the model lacks?"
+_LESS = 0.5  # of the error, below which another prediction is named
+
+
+def prediction_knows(case: Case) -> Answer | None:
+    """Return the errors with the model's prediction and with others; None where another one is in use."""
+    problem = case.grid.real or case.problem
+    others = other_predictions(case.controller)
+    if not others:
+        return None
+    short, names = shortened(problem, CYCLES), {}
+    try:
+        own = simulate(short, case.controller, seed=0, compiled=False)
+    except FpirhcError as error:
+        return Answer(KNOWS, Verdict.UNKNOWN, f"no run: {error}")
+    for name, other in others.items():
+        try:
+            names[name] = errors_of(short, (own, simulate(short, other, seed=0, compiled=False)))
+        except FpirhcError:  # a plant that this prediction does not serve
+            continue
+    if not names:
+        return Answer(KNOWS, Verdict.UNKNOWN, "no other prediction serves this plant")
+    sizes = {name: max(pair.adapted[n] / pair.ranges[n] for n in pair.adapted) for name, pair in names.items()}
+    pair = next(iter(names.values()))
+    size = max(pair.without[n] / pair.ranges[n] for n in pair.without)
+    best = min(sizes, key=lambda name: sizes[name])
+    text = f"rms error {size:.3g} of the range with the model's prediction, {sizes[best]:.3g} with {best}"
+    numbers = {"error": size, **{f"error with {name}": value for name, value in sizes.items() if math.isfinite(value)}}
+    if sizes[best] > _LESS * size:
+        return Answer(KNOWS, Verdict.YES, text, "", numbers)
+    return Answer(KNOWS, Verdict.UNKNOWN, text, f"Predict with what acts: Predicted(..., by={best}).", numbers)
+
+
 QUESTIONS = (
     ControllerQuestion(bears_wrong_dead_time, WRONG_DEAD_TIME, order=50, of_targets=True),
     ControllerQuestion(bears_latency, UNSTATED, order=52),
     ControllerQuestion(pays_when_late, PAYS_LATE, order=51, of_targets=True),
+    ControllerQuestion(prediction_knows, KNOWS, order=53, adaptive=False),
 )

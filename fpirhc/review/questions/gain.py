@@ -1,30 +1,270 @@
-"""Is the gain admissible? The map's own gain against the limits of the map and of its whole loop, and the recommended gain."""
+"""Is the gain admissible? The map's own gain against the limits of the map and of its whole loop, and the recommended gain.
+
+Half of the smallest limit of the whole loop is recommended, and every command that names a gain takes it from here. Theory:
+docs/theory-questions.md.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
-from fpirhc.contraction.gains import ContractionReport, assess_gain
-from fpirhc.contraction.large_errors import two_cycle_amplitudes
-from fpirhc.contraction.spectrum import Spectrum
+import numpy as np
+
+from fpirhc.broken import attempted
+from fpirhc.contraction.large_errors import two_cycle_amplitudes, two_cycle_limit
+from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, innermost
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import LoopsByGain, largest_product
+from fpirhc.review.prediction import NominalRuns
 from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
-from fpirhc.review.questions.right_model import RIGHT_MODEL
-from fpirhc.review.questions.speed import gain_times
-from fpirhc.review.recommended_gain import (
-    FAR,
-    MARGIN,
-    OUTSIDE,
-    Recommended,
-    gain_advice,
-    least_gain,
-    limit_of_loop,
-    secant_limit,
-)
-from fpirhc.review.spectra import largest_product
+from fpirhc.review.questions.margins import keeps_margins
+from fpirhc.review.questions.right_model import RIGHT_MODEL, leaves_right_model_alone
+from fpirhc.review.questions.speed import fast_enough, gain_times, plan_keeps_up
+from fpirhc.task.problem import Problem
+
+MARGIN = 2.0
+SECANT, TWO_CYCLE = "the map's steepest secant", "a two-cycle of the whole loop"
+POLES, MARGINS = "the poles of the whole loop", "the margins of the whole loop"
+_ALONG, _DRAWN = 9, 8  # loops that are looked at
+FAR = 10.0  # times a map's own gain, up to which a limit on targets is sought
+_LEAST = 1e-3  # of the smallest other limit, down to which a stable gain is sought
+_STEPS, _BISECTIONS = 24, 12
+OUTSIDE = "the model knows no lag and no latency of the plant outside"
+
+
+@dataclass(frozen=True)
+class Recommended:
+    """A gain, and what sets it.
+
+    Args:
+        value: of the map's own gain; NaN where none is recommended.
+        limit: of the map's own gain, the smallest one.
+        sets: which limit that is.
+        why_not: why none is recommended; empty where one is.
+        lowered: whether it is less than half of the limit, so that the loop keeps its margins.
+        exceeded: whether the gain in use is beyond the limit.
+    """
+
+    value: float
+    limit: float
+    sets: str
+    why_not: str = ""
+    lowered: bool = False
+    exceeded: bool = False
+
+    @property
+    def text(self) -> str:
+        """Limit and recommendation as the end of a sentence."""
+        limit = f"the smallest limit is {self.limit:.3g}, set by {self.sets}; "
+        if self.why_not:
+            return f"{limit if math.isfinite(self.limit) else ''}no gain is recommended, because {self.why_not}"
+        if self.lowered:
+            return f"{limit}recommended {self.value:.3g}, with which {MARGINS} suffice"
+        return f"{limit}recommended {self.value:.3g}, half of it"
+
+
+def recommended_gain(
+    deformation: Deformation, boxed: ContractionReport, share: float, loops: LoopsByGain | None
+) -> Recommended:
+    """Return the recommended gain of a map.
+
+    Args:
+        deformation: the map.
+        boxed: its report over the box of parameters.
+        share: limit of gain times eigenvalue as a share of 2, below 1 behind a delay, an estimator or a filter.
+        loops: its loops for every gain; None where no linear loop is known.
+    """
+    largest = share * max(map(abs, boxed.sector_limit))
+    if not largest:
+        return Recommended(math.nan, math.nan, "", "no gain converges all over the box")
+    sign = math.copysign(1.0, sum(boxed.sector_limit))
+    own = _own_per_effective(deformation)
+    limits = {SECANT: largest, **(_limits_of_loop(deformation, loops, largest, sign) if loops else {})}
+    sets = min(limits, key=lambda name: limits[name])
+    gain = limits[sets] / MARGIN
+    if loops and not _stable(loops, sign * gain):
+        why = f"with {sign * gain * own:.3g}, half of it, the loop does not converge"
+        return Recommended(math.nan, sign * limits[sets] * own, sets, why)
+    size = gain if loops is None else _with_margins(loops, sign * gain)
+    return Recommended(sign * size * own, sign * limits[sets] * own, sets, lowered=size < gain)
+
+
+def secant_limit(loops: LoopsByGain) -> float | None:
+    """Return the smallest secant gain with which the loop has a two-cycle along the reference; None where it is not known.
+
+    Between plans a loop alternates from cycle to cycle, so plans are held.
+    """
+    try:
+        return min(two_cycle_limit(low.dynamics, own.dynamics, loops.gains) for low, own in loops.held(_ALONG))
+    except (FpirhcError, np.linalg.LinAlgError):
+        return None
+
+
+def limit_of_loop(deformation: Deformation, loops: LoopsByGain) -> tuple[float, str]:
+    """Return the smallest effective gain that is a limit of the whole loop, up to `FAR` times the map's own, and what sets it.
+
+    Infinite where there is none; NaN where no gain down to a hundredth of the map's own converges.
+    """
+    own = deformation.effective_gain()
+    size, sign = abs(own), math.copysign(1.0, own)
+    limits = dict(_limits_of_loop(deformation, loops, FAR * size, sign))
+    if not limits and not _stable(loops, sign * FAR * size):
+        return math.nan, ""
+    sets = min(limits, key=lambda name: limits[name], default="")
+    limit = limits[sets] if sets else math.inf
+    return (sign * limit, sets) if limit <= FAR * size else (math.inf, "")
+
+
+def least_gain(loops: LoopsByGain, limit: float) -> float | None:
+    """Return the smallest effective gain with which the loop converges along the reference, where that of the map is too small.
+
+    None where the loop converges with the map's gain, or with none between it and the limit.
+
+    Args:
+        loops: of the map.
+        limit: effective gain up to which one is sought.
+    """
+    own, along = loops.gains[1], loops.along(_ALONG)
+    if loops.all_stable(own, along) or not abs(own) < abs(limit):
+        return None
+    gains = math.copysign(1.0, own) * np.geomspace(abs(own), abs(limit), _STEPS)
+    first = next((k for k, gain in enumerate(gains) if loops.all_stable(float(gain), along)), None)
+    if first is None:
+        return None
+    low, high = float(gains[first - 1]), float(gains[first])
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if loops.all_stable(middle, along) else (middle, high)
+    return high
+
+
+def _limits_of_loop(deformation: Deformation, loops: LoopsByGain, most: float, sign: float) -> Mapping[str, float]:
+    limits = {}
+    secant = secant_limit(loops)
+    if secant is not None and math.isfinite(secant):
+        right = deformation.with_effective_gain(sign * most)
+        limits[TWO_CYCLE] = secant * most / abs(right.secant_gain())
+    poles = _pole_limit(loops, sign, min([most, *limits.values()]))
+    return limits if poles is None else {**limits, POLES: poles}
+
+
+def _pole_limit(loops: LoopsByGain, sign: float, most: float) -> float | None:
+    """Largest stable gain below the other limits; None where the poles set none below them."""
+    if _stable(loops, sign * most):
+        return None
+    gains = most * np.geomspace(1.0, _LEAST, _STEPS)
+    first = next((k for k, gain in enumerate(gains) if _stable(loops, sign * float(gain))), None)
+    if first is None:
+        return None  # nothing converges, which half of the other limits shows
+    low, high = float(gains[first]), float(gains[first - 1])
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _stable(loops, sign * middle) else (low, middle)
+    return low
+
+
+def _stable(loops: LoopsByGain, gain: float) -> bool:
+    return loops.all_stable(gain, (*loops.along(_ALONG), *loops.over_box(_DRAWN)))
+
+
+def _with_margins(loops: LoopsByGain, gain: float) -> float:
+    """The size of the gain, or of the largest smaller one that keeps the margins; itself where smaller ones do not help."""
+    pair = max(loops.along(_ALONG), key=lambda pair: loops.at(gain, pair).radius)
+    for share in np.geomspace(1.0, 1 / MARGIN**2, 8):
+        loop = loops.at(float(share) * gain, pair)
+        if all(keeps_margins(loop, i) for i in range(loop.cycles[0].entry.shape[1])):
+            return abs(gain) * float(share)
+    return abs(gain)
+
+
+def _own_per_effective(deformation: Deformation) -> float:
+    own = getattr(deformation, deformation.gain_name, None)
+    return 1.0 if own is None else float(own) / deformation.effective_gain()
+
+
+def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended:
+    """Return the recommended gain of a controller; none where it fails the null test, where a run with that gain
+    does harm, and for a plant outside.
+
+    Where its own gain is beyond the limits, the null test of a gain within them counts.
+
+    Args:
+        case: of the controller.
+        boxed: eigenvalues of the response Jacobian over the box of parameters.
+        null: the answer whether adaptation leaves a right model alone.
+    """
+    deformation = case.controller.deformation
+    report = assess_gain(deformation, boxed)
+    share = largest_product(case.problem, deformation, boxed.eigenvalues) / 2
+    low, high = (share * end for end in report.sector_limit)
+    if low < high and not low < deformation.effective_gain() < high:
+        safe = _case_with(case, 0.5 * (low + high))
+        return replace(gain_advice(safe, boxed, leaves_right_model_alone(safe)), exceeded=True)
+    advice = recommended_gain(deformation, report, share, case.by_gain)
+    if advice.why_not:
+        return advice
+    size, limit = (value / _own_per_effective(deformation) for value in (advice.value, advice.limit))
+    if null is not None and null.verdict == Verdict.NO and abs(deformation.effective_gain()) >= abs(limit):
+        null = leaves_right_model_alone(_case_with(case, size))
+    if null is not None and null.verdict == Verdict.NO:
+        against = "adaptation does not leave a right model alone"
+    elif case.grid.outside:
+        against = OUTSIDE
+    else:
+        harm = case.harm(deformation.with_effective_gain(size))
+        against = f"with {advice.value:.3g}, half of it, {harm}" if harm else ""
+    return replace(advice, value=math.nan, why_not=against) if against else advice
+
+
+def recommended_for(problem: Problem, controller: Controller) -> Recommended | None:
+    """Return the gain that a review of a controller recommends, also where its own gain is refused; None where it has no answer."""
+    try:
+        grid = review_grid(problem, 0.0, 0)
+        ready = resolved(grid.problem, controller)
+        case = Case(grid, ready, NominalRuns(grid.problem))
+        return gain_advice(case, case.spectrum(grid.draws), leaves_right_model_alone(case))
+    except FpirhcError:
+        return None
+
+
+def _case_with(case: Case, gain: float) -> Case:
+    """The case of the controller with another effective gain."""
+    deformation = case.controller.deformation.with_effective_gain(gain)
+    controller = resolved(case.problem, case.controller.with_deformation(deformation))
+    return Case(case.grid, controller, case.runs)
+
+
+def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> str:
+    """Return what a review says of the gain: the recommended one where errors grow, else whether it is too small, else nothing.
+
+    Args:
+        problem: of the run.
+        controller: resolved.
+        grows: whether the iteration is no contraction along the run.
+    """
+    if controller.deforms == "target" or not controller.deformation.adapts:
+        return ""
+    if grows:
+        advice = recommended_for(problem, controller)
+        return "" if advice is None else f"Its gain{' is too large' if advice.exceeded else ''}: {advice.text}."
+    answer = attempted("the speed of the iteration", _speed, problem, controller, broken=[])
+    if answer is None or answer.verdict is not Verdict.NO:
+        return ""
+    return f"Its gain is too small: {answer.evidence}. {answer.change}"
+
+
+def _speed(problem: Problem, controller: Controller) -> Answer | None:
+    grid = review_grid(problem, 0.0, 0)
+    case = Case(grid, controller, NominalRuns(grid.problem))
+    return fast_enough(case) or plan_keeps_up(case)
+
 
 GAIN = "Is the map's gain admissible?"
 NO_GAIN = "Use another form, or leave the deformation out."

@@ -23,11 +23,10 @@ from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.maps import growth_of, step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.nominal_runs import null_problem
+from fpirhc.review.grid import ReviewGrid, state_slopes
+from fpirhc.review.prediction import null_problem
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion
-from fpirhc.review.stages import stiff_advice
-from fpirhc.review.state_slopes import state_slopes
+from fpirhc.review.questions.integration import stiff_advice
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate

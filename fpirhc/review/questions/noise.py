@@ -1,27 +1,371 @@
 """What does the noise of sensors do? The chatter of the commands, and the gain and filter that it asks for.
 
-The pair is that of `suggest`: the largest gain with which noise alone moves no input by more than its budget per cycle. The
-budget is 1 % of the range between the limits of an input. Where no input has limits it is the chatter of the deformation in use,
-so that the pair adapts as fast as it can at the same price.
+`suggest` seeks the largest gain with which noise alone moves no input by more than its budget per cycle, at any of some points of
+the reference; the filter's pole follows the gain, so that the iteration keeps its damping. A review's budget is 1 % of the range
+between the limits of an input, or the chatter of the deformation in use where no input has limits.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.errors import FpirhcError
+from fpirhc.by_name import FoundByName
+from fpirhc.contraction.spectrum import Array, response_jacobians
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import refuse_without, resolved, without_deformation
+from fpirhc.deformation.base import Deformation, with_inner
+from fpirhc.deformation.wrappers.filtered import Filtered
+from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, NotContractive, nearest
+from fpirhc.fields.checked import checked_call
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.loops import points_of, thinned
+from fpirhc.review.grid import ReviewGrid, review_grid
+from fpirhc.review.loops import loops_along, points_of, thinned
+from fpirhc.review.prediction import TRIED
 from fpirhc.review.question import Case, ControllerQuestion
-from fpirhc.review.suggest import chatter_of, within_budget
+from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.simulation.trials import Trials, harm_in
+from fpirhc.summary import line, number, table
+from fpirhc.task.problem import Problem
+
+RINGING = 6.0  # kappa: damping 0.2, between 4 and 8, beyond which tracking gains nothing
+_BISECTIONS = 50
+_SMALLEST = 1e-6  # of the deadbeat gain
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestion(FoundByName):
+    """Gain and pole, and what noise does with them.
+
+    Parameters:
+        deformation: the controller's own with gain and pole; put it in with `dataclasses.replace`.
+        effective_gain, pole: of it. gain: the map's own gain, `gain_name` its field.
+        chatter: by input, predicted rms of the command's step per cycle that noise causes, in the input's unit.
+        floor: by controlled coordinate, predicted rms tracking error that noise causes, in the coordinate's unit; NaN where no
+            linear loop is known.
+        harm: what runs on the plant and on the controller's own model show against it, beside no adaptation; empty without harm.
+    """
+
+    deformation: Deformation
+    effective_gain: float
+    pole: float
+    gain_name: str
+    gain: float
+    chatter: Mapping[str, float]
+    floor: Mapping[str, float]
+    harm: str = ""
+
+    def __repr__(self) -> str:
+        return line(self, *(f"{name} {value}" for name, value in self._facts()))
+
+    def _repr_html_(self) -> str:
+        """Gain, pole and predictions as a table, for notebooks."""
+        return table("Suggested gain", ("", "value"), self._facts(), [])
+
+    def _facts(self) -> list[tuple[str, str]]:
+        own = [(self.gain_name, number(self.gain)), ("pole", number(self.pole))]
+        steps = [(f"step of {i} per cycle", number(v)) for i, v in self.chatter.items()]
+        against = [("against it", self.harm)] if self.harm else []
+        return [*own, *steps, *((f"rms error of {c} from noise", number(v)) for c, v in self.floor.items()), *against]
+
+
+@checked_call
+def suggest(
+    problem: Problem,
+    controller: Controller,
+    *,
+    chatter: float | Mapping[str, float],
+    noise: Mapping[str, float] | None = None,
+    ringing: float = RINGING,
+) -> Suggestion:
+    """Return the largest gain, with the pole of a filter of its error, whose chatter is within a budget.
+
+    The gain ends at the deadbeat one, the inverse of the largest eigenvalue of the response Jacobian along the reference. The
+    wrappers of the deformation stay, a `Filtered` among them is replaced. It is run on the plant and on the controller's model, for
+    1000 cycles at most: where no adaptation does better, `harm` says so.
+
+    Parameters: `chatter`: rms step of the command per cycle that noise may cause, in the input's unit, by input or one for all;
+    `noise`: standard deviation of the measured response by controlled coordinate, by default that of the problem's sensors;
+    `ringing` kappa = a lambda / (1 - p), 0 for no filter.
+
+    Raises:
+        InvalidValue: a budget that is not positive, a negative noise or ringing, no noise, as of a response that is estimated,
+        whose noise must be given. InvalidName: unknown input or coordinate. NotSupported: a controller without adaptation.
+        NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
+    """
+    found = within_budget(problem, controller, chatter=chatter, noise=noise, ringing=ringing)
+    return replace(found, harm=_harm(problem, controller, found.deformation))
+
+
+def within_budget(
+    problem: Problem,
+    controller: Controller,
+    *,
+    chatter: float | Mapping[str, float],
+    noise: Mapping[str, float] | None = None,
+    ringing: float = RINGING,
+) -> Suggestion:
+    """Return what `suggest` does, before it is run."""
+    ready = resolved(problem, controller)
+    _check(ready, ringing)
+    budget = _allowed(problem, chatter)
+    grid = review_grid(problem, 0.0, 0)
+    noisy = noisy_points(grid, ready, noise)
+    sign, largest = _largest_eigenvalue(noisy.jacobians)
+
+    def fits(size: float) -> bool:
+        return bool((noisy.steps(sign * size, filter_pole(size * largest, ringing)) <= budget).all())
+
+    size = _largest_within(fits, 1 / largest)
+    pole = filter_pole(size * largest, ringing)
+    deformation = _with(ready.deformation, sign * size, pole)
+    own = getattr(deformation, deformation.gain_name, None)
+    name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
+    predicted = dict(zip(problem.plant.inputs, map(float, noisy.steps(sign * size, pole)), strict=True))
+    floor = _floor(loops_along(grid, ready).ideal, noisy, problem)
+    return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
+
+
+def _harm(problem: Problem, controller: Controller, deformation: Deformation) -> str:
+    try:
+        trials = Trials(problem, without_deformation(controller), cycles=TRIED)
+        return harm_in(*trials.errors(controller.with_deformation(deformation)))
+    except FpirhcError as error:
+        return f"it cannot be tried ({error})"
+
+
+def _check(controller: Controller, ringing: float) -> None:
+    if controller.deformation.effective_gain() == 0:
+        refuse_without(controller, "deformation to choose a gain for; give it Sigmoid(gain=...)")
+    if not (math.isfinite(ringing) and ringing >= 0):
+        raise InvalidValue(
+            f"suggest(ringing={ringing!r}): expected a number of at least 0; 4 to 8 is usual, 0 is no filter"
+        )
+
+
+def _allowed(problem: Problem, chatter: float | Mapping[str, float]) -> np.ndarray:
+    inputs = tuple(problem.plant.inputs)
+    budgets = chatter if isinstance(chatter, Mapping) else dict.fromkeys(inputs, chatter)
+    for name, value in budgets.items():
+        if name not in inputs:
+            raise InvalidName(f"suggest(chatter=...): input '{name}' is unknown.{nearest(name, inputs)}")
+        if not value > 0:
+            raise InvalidValue(
+                f"suggest(chatter=...): {value!r} for '{name}'; expected a positive rms step per cycle, in the unit of the input"
+            )
+    return np.array([float(budgets.get(name, math.inf)) for name in inputs])
+
+
+def _largest_eigenvalue(jacobians: np.ndarray) -> tuple[float, float]:
+    """Sign of the gain, and the inverse of the deadbeat gain: the largest |lambda|^2 / |Re lambda|."""
+    values = np.linalg.eigvals(jacobians).ravel()
+    if values.real.min() * values.real.max() <= 0:
+        raise NotContractive(
+            f"the response Jacobian has eigenvalues with real parts from {values.real.min():.4g} to {values.real.max():.4g} along "
+            "the reference: no gain converges"
+        )
+    return float(np.sign(values.real[0])), float((np.abs(values) ** 2 / np.abs(values.real)).max())
+
+
+def _largest_within(fits: Callable[[float], bool], most: float) -> float:
+    low, high = _SMALLEST * most, most
+    if fits(high):
+        return high
+    for _ in range(_BISECTIONS):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def _with(deformation: Deformation, gain: float, pole: float) -> Deformation:
+    """The deformation with that gain, its error filtered inside all other wrappers."""
+    inner = deformation.inner
+    if inner is None:
+        changed = deformation.with_effective_gain(gain)
+        return Filtered(changed, pole=pole) if pole else changed
+    if deformation.iteration.error_pole != inner.iteration.error_pole:  # a filter, which the new one replaces
+        return _with(inner, gain, pole)
+    return with_inner(deformation, _with(inner, gain, pole))
+
+
+def _floor(ideal: LinearLoop | None, noisy: Noisy, problem: Problem) -> dict[str, float]:
+    """Rms of the coordinates in the loop with the right model, with noise at the response."""
+    plant = problem.plant
+    if ideal is None or ideal.radius >= 1:
+        return dict.fromkeys(plant.controlled_names, math.nan)
+    spread = ideal.spread(noisy.inverses[0] @ noisy.covariance @ noisy.inverses[0].T)
+    sizes = np.sqrt(np.diag(ideal.errors @ spread @ ideal.errors.T))
+    judged = dict(zip(problem.judged_names, map(float, sizes), strict=True))
+    return {c: judged.get(c, math.nan) for c in plant.controlled_names}
+
+
+_JACOBIANS = 9  # points of the reference
+_DRAWN = 20_000  # values of a noise, whose spread is its deviation
+
+
+@dataclass(frozen=True, eq=False)
+class Noisy:
+    """Points of the reference; build it with `noisy_points`.
+
+    Parameters: jacobians J W (points, n, n), inverses B: the model's inputs per unit of response (points, nu, n),
+    covariance (n, n) of the noise, moved: B W, the inputs per unit of a step of the map (points, nu, n).
+    """
+
+    jacobians: np.ndarray
+    inverses: np.ndarray
+    covariance: np.ndarray
+    moved: np.ndarray
+
+    def steps(self, gain: float, pole: float) -> np.ndarray:
+        """Return the rms step of every input (nu,), the largest of all points.
+
+        Raises:
+            NotContractive: gain and pole with which noise grows.
+        """
+        spreads = [noise_spread(j, self.covariance, gain, pole).step for j in self.jacobians]
+        covariances = [b @ s @ b.T for b, s in zip(self.moved, spreads, strict=True)]
+        return np.asarray(np.sqrt(np.max([np.diag(m) for m in covariances], axis=0)))
+
+
+def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, float] | None) -> Noisy:
+    """Return the points with the noise of the problem's sensors, or the given one.
+
+    Parameters: `controller`, resolved; `noise`: standard deviation of the measured response by controlled coordinate.
+
+    Raises:
+        InvalidValue: no noise, as of a response that is estimated, or a negative one. InvalidName: an unknown coordinate.
+        NotContractive: no finite response Jacobian.
+    """
+    jacobians, inverses = _along_the_reference(
+        grid, controller.plant_model(grid.problem).parameters(grid.problem.plant)
+    )
+    covariance, iteration = np.diag(_deviations(grid.problem, noise) ** 2), controller.deformation.iteration
+    return Noisy(iteration.weighted(jacobians), inverses, covariance, iteration.weighted(inverses))
+
+
+def chatter_of(grid: ReviewGrid, controller: Controller, gain: float, pole: float) -> dict[str, float]:
+    """Return, by input, the rms step of the command per cycle that the noise of the problem's sensors causes.
+
+    Parameters: `controller`, resolved; effective `gain` and `pole` of the filter of its error.
+
+    Raises:
+        InvalidValue, NotContractive: as `noisy_points`.
+    """
+    noisy = noisy_points(grid, controller, None)
+    return dict(zip(grid.problem.plant.inputs, map(float, noisy.steps(gain, pole)), strict=True))
+
+
+def _deviations(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarray:
+    """Standard deviation of every controlled coordinate's measured response."""
+    names = problem.plant.controlled_names
+    spreads = _of_sensors(problem) if noise is None else noise
+    for name, value in spreads.items():
+        if name not in names:
+            raise InvalidName(f"suggest(noise=...): coordinate '{name}' is not controlled.{nearest(name, names)}")
+        if not 0 <= value < math.inf:
+            raise InvalidValue(
+                f"suggest(noise=...): {value!r} for '{name}'; expected a standard deviation of at least 0"
+            )
+    levels = np.array([float(spreads.get(name, 0.0)) for name in names])
+    if not levels.any():
+        raise InvalidValue(
+            "suggest: no response has noise, so no gain chatters; give noise={'"
+            + names[0]
+            + "': ...}, the standard deviation of "
+            "the measured response"
+        )
+    return levels
+
+
+def _of_sensors(problem: Problem) -> dict[str, float]:
+    """Deviation of the noise of the sensors that measure responses."""
+    plant, sensing = problem.plant, problem.sensing
+    measured = dict(zip(response_names(plant), plant.controlled_names, strict=True))
+    if sensing.sensors and not set(measured) & set(sensing.measures(plant)):
+        raise InvalidValue(
+            f"suggest: the response is estimated by {type(sensing.estimator).__name__}, whose noise is not white; give "
+            "noise={coordinate: standard deviation of the estimated response}"
+        )
+    times = problem.period * np.arange(_DRAWN)
+    noises = {measured[name]: sensor.noise for name, sensor in sensing.sensors.items() if name in measured}
+    random = np.random.default_rng(0)
+    return {c: float(np.std(n.values(times, random))) for c, n in noises.items() if n is not None}
+
+
+def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Response Jacobians (points, n, n), and the model's inputs per unit of response (points, nu, n), where all are finite."""
+    plant = grid.problem.plant
+    places = np.unique(np.linspace(0, len(grid.times) - 1, _JACOBIANS).astype(int))
+    exact = np.tile(grid.draws[0], (len(places), 1))
+    jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
+    gains = [
+        np.asarray(plant.equations.input_gain(grid.states[k], grid.commands[0, k], believed).full()) for k in places
+    ]
+    usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
+    if not usable:
+        raise NotContractive(
+            "the response Jacobian is finite nowhere along the reference; see whether the problem is well posed"
+        )
+    return jacobians[usable], np.array([np.linalg.inv(gains[k]) for k in usable])
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSpread:
+    """Covariances of the request and of its step per cycle.
+
+    Args:
+        request: covariance of r, shape (n, n), in the unit of the response squared.
+        step: covariance of r_k - r_{k-1}, shape (n, n), in the same unit.
+    """
+
+    request: Array
+    step: Array
+
+
+def noise_spread(jacobian: Array, noise: Array, gain: float, pole: float) -> NoiseSpread:
+    """Return the stationary covariances of g_k = p g_{k-1} + (1 - p)(J r_{k-1} + n_k), r_k = r_{k-1} - a g_k.
+
+    Args:
+        jacobian: J, shape (n, n), dimensionless.
+        noise: covariance of the noise of the response, shape (n, n), in the unit of the response squared.
+        gain: effective gain a.
+        pole: p of the filter of the error, in [0, 1).
+
+    Raises:
+        InvalidShape: matrices that do not fit.
+        NotContractive: a loop that is not stable.
+    """
+    j, covariance = np.atleast_2d(jacobian), np.atleast_2d(noise)
+    if j.shape != covariance.shape or j.shape[0] != j.shape[1]:
+        raise InvalidShape(f"jacobian {j.shape} and noise {covariance.shape}: expected two square matrices of one size")
+    one, share = np.eye(len(j)), 1 - pole
+    loop = np.block([[one - gain * share * j, -gain * pole * one], [share * j, pole * one]])
+    radius = float(np.abs(np.linalg.eigvals(loop)).max())
+    if not radius < 1:
+        raise NotContractive(
+            f"gain {gain:.4g} with the filter's pole {pole:.4g}: an error changes by {radius:.4g} per cycle, so noise grows; lower "
+            "the gain"
+        )
+    entry = share * np.vstack([-gain * one, one])
+    from scipy.linalg import solve_discrete_lyapunov  # it takes longer to import than a problem to load
+
+    spread = solve_discrete_lyapunov(loop, entry @ covariance @ entry.T)
+    n = len(j)
+    return NoiseSpread(spread[:n, :n], gain**2 * spread[n:, n:])
+
+
+def filter_pole(product: float, ringing: float) -> float:
+    """Return p with a lambda / (1 - p) = ringing; 0 where the product exceeds the ringing, and where the ringing is 0."""
+    return max(0.0, 1 - product / ringing) if ringing else 0.0
+
 
 CHATTER = "Is the chatter from measured responses small?"
 SMALL = 0.01  # of the range between an input's limits
 _POINTS = 3  # of the reference, whose loops are asked
-_DRAWN = 20_000
 _WHITE = 0.03  # correlation of a drawn series with itself one cycle later, below which it is white
 
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.grid import ReviewGrid, each
-from fpirhc.review.inner import inner_places
+from fpirhc.review.grid import ReviewGrid, each, inner_places
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.task.problem import Problem
 
@@ -95,7 +94,7 @@ def _missed(names: list[str], idle: list[str]) -> list[str]:
 
 
 def _without_task(plant: Plant, inner: Sequence[int], names: list[str]) -> list[str]:
-    """Those of the parameters that are in the responses of simulated states alone, see `fpirhc.review.inner`."""
+    """Those of the parameters that are in the responses of simulated states alone, see `fpirhc.review.grid`."""
     pattern = np.asarray(ca.DM(plant.equations.response.jac_sparsity(0, 2), 1).full()) != 0
     simulated = {plant.state.elements[k].rstrip("'") for k in inner}
     of = {

@@ -17,12 +17,11 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.motion import controlled_places
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.grid import ReviewGrid, below_responses, state_slopes
 from fpirhc.review.loops import is_planned
 from fpirhc.review.prediction import errors_without_adaptation, response_errors
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.speed import law_of
-from fpirhc.review.state_slopes import below_responses, state_slopes
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.task.disturbance import disturbed_place
 

@@ -13,7 +13,7 @@ from fpirhc.plant.maps import response_age
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.question import Case, ControllerQuestion
-from fpirhc.review.questions.form import INCREMENT, REFERENCED, forms_of
+from fpirhc.review.questions.right_model import INCREMENT, REFERENCED, forms_of
 
 FAST = "Does the iteration keep up with its tracking law?"
 LAG = "Does it bear a small lag that is not in the model?"

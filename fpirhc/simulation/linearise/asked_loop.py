@@ -1,7 +1,8 @@
 """A closed loop that is asked: it runs from a point of its task, and is linearised at points along this run.
 
 The step is the one that simulates, with disturbances and noise at zero and sensors without their quantum. Both parameter sets are
-part of its memory, so other plants and other models need no other build.
+part of its memory, so other plants and models need no other build. A map is the one that it is near its fixed point,
+r+ = r - a (f - d), with the gain a in its memory: the loop for every gain is one loop with other memories, affine in a.
 """
 
 from __future__ import annotations
@@ -12,21 +13,85 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import resolved
-from fpirhc.errors import NoAnswer, NotSupported
+from fpirhc.deformation.base import Deformation, Iteration, with_inner
+from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
-from fpirhc.simulation.linearise.linear_map import GAIN
 from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
+from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.disturbance import Step as Jump
 from fpirhc.task.problem import Problem
+
+GAIN = "map_gain"  # in the memory
+
+
+@dataclass(frozen=True)
+class LinearMap(Deformation):
+    """r+ = r - a W (f - d).
+
+    Args:
+        gain: a at the start.
+        weights: W by rows; None: the one matrix.
+    """
+
+    gain: float
+    weights: tuple[tuple[float, ...], ...] | None = None
+
+    @property
+    def iteration(self) -> Iteration:
+        """Of no limit, because a gain that a run refuses has poles too."""
+        return Iteration(limited=False, weights=self.weights)
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        del elements
+        return Layout((scalar(GAIN, start=self.gain),))
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        error = response - desired
+        weighted = error if self.weights is None else ca.DM(self.weights) @ error
+        return request - memory[GAIN] * weighted, {GAIN: memory[GAIN]}
+
+    def effective_gain(self) -> float:
+        return self.gain
+
+    def secant_gain(self) -> float:
+        return self.gain
+
+    def largest_step(self) -> float:
+        return float("inf")
+
+    def with_effective_gain(self, gain: float) -> Self:
+        return replace(self, gain=gain)
+
+
+def near_fixed_point(controller: Controller) -> Controller:
+    """Return the controller with its map as it is near the fixed point; itself where the map changes on line, or does not adapt."""
+    deformation = controller.deformation
+    if not deformation.adapts or not deformation.iteration.constant:
+        return controller
+    try:
+        return controller.with_deformation(_linear(deformation))
+    except FpirhcError:  # a controller whose map cannot be replaced
+        return controller
+
+
+def _linear(deformation: Deformation) -> Deformation:
+    if deformation.inner is None:
+        return LinearMap(deformation.effective_gain(), deformation.iteration.weights)
+    return with_inner(deformation, _linear(deformation.inner))
+
 
 # Columns of the memory that jump or are only recorded: counts, and what the line search of a plan remembers.
 _COUNTS = re.compile(r"^cycle$|(^|\.)plan_\w+$|plan_held_solve|_phase$|warm_up$")

@@ -9,7 +9,7 @@ from functools import partial
 from typing import cast
 
 from fpirhc.broken import attempted
-from fpirhc.contraction.gains import assess_gain
+from fpirhc.contraction.spectrum import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import resolved, without_deformation
@@ -19,7 +19,7 @@ from fpirhc.errors import FpirhcError, Mistakes, NotContractive, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.review.recommended_gain import recommended_for
+from fpirhc.review.questions.gain import recommended_for
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.contraction.gains import ContractionReport
-from fpirhc.contraction.spectrum import Spectrum
+from fpirhc.contraction.spectrum import ContractionReport, Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Verdict

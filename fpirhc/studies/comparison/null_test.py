@@ -14,13 +14,13 @@ import numpy as np
 
 from fpirhc.by_name import FoundByName
 from fpirhc.plant.motion import followed_units, with_space
-from fpirhc.simulation.error_pair import MOSTLY, SLIGHT
 from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.metrics.base import by_name
 from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
+from fpirhc.simulation.trials import MOSTLY, SLIGHT
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import in_percent, numbers_written_out

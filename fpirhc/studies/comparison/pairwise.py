@@ -13,8 +13,8 @@ import numpy as np
 
 from fpirhc.broken import attempted
 from fpirhc.controllers.base import Controller
+from fpirhc.review.questions.gain import reviewed_gain
 from fpirhc.review.questions.reached_parameters import not_reached
-from fpirhc.review.recommended_gain import reviewed_gain
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.stepper import Stepper

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
+from fpirhc.simulation.trials import without_warning
 from fpirhc.task.problem import Problem, cycles_per_plan
 
 REPLAYED = 2000  # cycles of the run that are stepped again, one by one

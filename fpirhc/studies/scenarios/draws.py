@@ -17,7 +17,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
-from fpirhc.review.dead_time_variants import is_late, live_paths, roomy, scaled
+from fpirhc.review.grid import is_late, live_paths, roomy, scaled
 from fpirhc.task.cases import Cases
 from fpirhc.task.problem import Problem
 

@@ -9,9 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fpirhc.contraction.gains import predicted_factor
 from fpirhc.contraction.measured import identified_factor, jacobians_along
-from fpirhc.contraction.spectrum import Spectrum
+from fpirhc.contraction.spectrum import Spectrum, predicted_factor
 from fpirhc.simulation.metrics.base import Metric, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
