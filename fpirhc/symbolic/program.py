@@ -95,9 +95,10 @@ class _Leaves:
                 if entry_of(inner.name())[1] > inner.sz_w():
                     raise NoCode("the work of its loops cannot be laid out")
         unique = f"{name}_{len(self._leaves)}" if name in (*self._leaves, NAME) else name
+        # a renamed one may need more than the Function itself
         leaf = self._leaves[unique] = function if unique == name else renamed(function, unique)
         plain = leaf.is_a("SXFunction")  # its code has variables of its own
-        pointers = (leaf.n_in(), leaf.n_out()) if plain else (leaf.sz_arg(), leaf.sz_res())  # a renamed one may need more
+        pointers = (leaf.n_in(), leaf.n_out()) if plain else (leaf.sz_arg(), leaf.sz_res())
         return Callee(f"leaf_{unique}", pointers, 0 if plain else leaf.sz_w())
 
     def _needs(self, name: str) -> None:
