@@ -77,13 +77,13 @@ def table_writer(form: str | None) -> Callable[[DataFrame, Path], None]:
     """Return a function that writes a table to a path whose suffix becomes that of the form; it writes nothing without a form.
 
     Raises:
-        NotSupported: pyarrow is missing, which is said before a study runs.
+        NotInstalled: pyarrow is missing, which is said before a study runs.
     """
-    from fpirhc.errors import NotSupported
+    from fpirhc.errors import NotInstalled
     from fpirhc.whole_file import write_whole
 
     if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise NotSupported("--format parquet needs pyarrow, which is not installed: pip install pyarrow")
+        raise NotInstalled("--format parquet needs pyarrow, which is not installed: pip install 'fpirhc[parquet]'")
 
     def write(table: DataFrame, path: Path) -> None:
         if form is not None:
