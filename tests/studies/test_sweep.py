@@ -176,7 +176,10 @@ def test_parquet_without_pyarrow_is_refused_before_a_run(
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: pytest.fail(name) if name != "pyarrow" else None)
     assert main([*command.split(), "--format", "parquet", "--out", str(tmp_path)]) == 2
-    assert "--format parquet needs pyarrow, which is not installed: pip install 'fpirhc[parquet]'" in capsys.readouterr().err
+    assert (
+        "--format parquet needs pyarrow, which is not installed: pip install 'fpirhc[parquet]'"
+        in capsys.readouterr().err
+    )
     assert not list(tmp_path.iterdir())
 
 
