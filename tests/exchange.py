@@ -25,7 +25,7 @@ def with_exact_model(problem: fp.Problem) -> fp.Problem:
     sensors = {n: replace(s, noise=None, dropout=0.0) for n, s in problem.sensing.sensors.items()}
     plant, sensing = replace(problem.plant, parameters=known), replace(problem.sensing, sensors=sensors)
     signals = really_known(problem.signals)
-    return replace(problem, plant=plant, disturbances={}, sensing=sensing, signals=signals)
+    return replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
 
 
 def told(problem: fp.Problem) -> dict[str, Any]:

@@ -110,7 +110,11 @@ def render(comparison: Comparison) -> str:
     return render_page(
         "comparison.html",
         comparison.view,
-        (asset("uPlot.iife.min.js"), planar.script(), f"const DATA={data};\n{asset('report.js')}"),
+        (
+            asset("uPlot.iife.min.js"),
+            *([planar.script()] if motions else []),
+            f"const DATA={data};\n{asset('report.js')}",
+        ),
         predicted=any(e.prediction is not None and e.prediction.tube is not None for e in entries),
         slots=_slots(comparison),
         bands=BANDS,
