@@ -340,6 +340,10 @@ def _one_step(motion: Motion, step: Callable[..., Mapping[str, Expression]], x: 
     return ca.densify(ca.vertcat(*(ca.SX(entry) for entry in entries)))
 
 
+SECONDS = {"s": 1.0, "us": 1e-6, "ms": 1e-3, "min": 60.0, "h": 3600.0, "day": 86400.0}
+"""By unit of time, where a clock on the wall is asked too."""
+
+
 def derivative_unit(unit: str, derivative: int, time: str = "s") -> str:
     """Return the unit of a time derivative, with the unit of time: 'm' -> 'm/s' -> 'm/s^2'."""
     if derivative == 0:

@@ -229,7 +229,8 @@ def test_a_plant_whose_time_is_in_years_has_no_plugin(tmp_path):
     task = fp.load_problem("fishery")
     device = device_of(task.problem, task.controllers["RHC+FPI"], "RHC+FPI", cycles=1)
     with pytest.raises(
-        InvalidValue, match=r"ros2_control runs in real time: a period in s, ms, min, h was expected, got one in"
+        InvalidValue,
+        match=r"ros2_control runs in real time: a period in s, us, ms, min, h, day was expected, got one in",
     ):
         write(device, target_called("ros2_control"), tmp_path / "out")
 

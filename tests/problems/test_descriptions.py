@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 
 import fpirhc as fp
+from fpirhc.controllers.contract import innermost
 from fpirhc.plant.motion import followed_units
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.shipped import missing
+from fpirhc.studies.comparison.entry import plan_every
 
 ROOT = Path(__file__).parents[2] / "problems"
 FILES = sorted([*ROOT.glob("*.py"), *(ROOT / "gallery").glob("*.py"), *(ROOT / "outside").glob("*.py")])
@@ -72,6 +74,16 @@ def test_a_table_is_what_runs_give(path):
     for controller, *numbers in table[1:]:
         for name, number in zip(names, numbers, strict=True):
             assert float(number) == pytest.approx(errors(path, controller)[name], rel=0.05), (controller, name)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+def test_what_is_compared_first_plans_at_one_rate(path):
+    """Both of the pair plan or neither does, and as often, so that no rate of plans is taken for an effect of adaptation."""
+    task = loaded(path)
+    assert task.headline
+    pair = [task.controllers[name] for name in task.headline]
+    assert len({innermost(one).planner is None for one in pair}) == 1
+    assert len({plan_every(task.problem, one) for one in pair}) == 1
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import numpy as np
 import pytest
 from plants import linear
 
@@ -15,7 +17,9 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
+from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.comparison import Comparison
+from fpirhc.studies.comparison.timing import CycleTime
 from fpirhc.studies.view import to_json
 
 PLAN = fp.FixedPoint(iterations=1, tolerance=1e-3)
@@ -30,6 +34,7 @@ CONTROLLERS: dict[str, Controller] = {
     "offset-free": fp.Estimating(fp.RecedingHorizon(PLAN), FILTER),
     "offset-free, at once": fp.Estimating(fp.RecedingHorizon(PLAN), SEES_RESPONSE, at_once=True),
 }
+MINUTES = replace(linear(1.0, 0.8), time_unit="min")
 EXPECTED = {
     "CTC": (("y", "y'"), "in every cycle"),
     "CTC+FPI": (("y", "y'", "y''"), "in every cycle"),
@@ -46,7 +51,7 @@ EXPECTED = {
 }
 
 
-def compared(names: list[str], **changes: Any) -> Comparison:
+def compared(names: list[str], controllers: dict[str, Controller] = CONTROLLERS, **changes: Any) -> Comparison:
     settings: dict[str, Any] = {
         "plant": linear(1.0, 0.8),
         "reference": fp.Trajectory(lambda t: {"y": 0.3 * ca.sin(2 * t)}),
@@ -57,7 +62,7 @@ def compared(names: list[str], **changes: Any) -> Comparison:
         "cost": fp.Quadratic(states={"y": 1e2, "y'": 1.0}, deviation={"u": 0.1}),
     }
     problem = fp.Problem(**(settings | changes))
-    task = Task("line", Path("line.py"), "A line", "", problem, {n: CONTROLLERS[n] for n in names})
+    task = Task("line", Path("line.py"), "A line", "", problem, {n: controllers[n] for n in names})
     return fp.compare(task, seed=0, compiled=False)
 
 
@@ -88,6 +93,36 @@ def test_lines_stand_in_every_form_of_a_comparison(everything):
     assert "in every cycle of <span class='number'>0.01 s</span>" in page
     assert "between plans its deformation acts in every cycle" in page
     assert "all controllers are given" in everything._repr_html_()
+
+
+def test_every_form_says_when_a_controller_plans_and_what_share_of_a_period_that_takes(everything, capsys):
+    """A plan every fifth cycle; the share is the time of a cycle with a plan over the period."""
+    entry = replace(everything["RHC"], cycle=CycleTime(20.0, 70.0, 80.0, 90.0, 50.0))
+    told = replace(everything, entries=(everything["CTC"], entry))
+    sentence = "RHC plans every 5 cycles, every 0.05 s; a cycle that plans takes 50 us, 0.5 % of a period"
+    assert told.planning == (sentence,)
+    show(told.view, Path("report.html"))
+    assert sentence in " ".join(capsys.readouterr().out.split())
+    assert "<h3>When they plan</h3>" in render(told)
+    assert sentence in re.sub("<.*?>", "", render(told))
+    facts = json.loads(to_json(told.view.facts))["controllers"]
+    assert facts["RHC"]["plans"] == {"cycles": 5, "share_of_period": pytest.approx(0.005)}
+    assert facts["CTC"]["plans"] is None
+    slow, [minutes] = replace(entry, cycle=replace(entry.cycle, planning=2e4)), compared(["RHC"], plant=MINUTES).entries
+    assert replace(told, entries=(slow,)).planning[0].endswith("200 % of a period: plans are late on this machine")
+    assert (
+        replace(told, entries=(replace(entry, cycle=None),)).planning[0].endswith("the run is too short to time a plan")
+    )
+    assert replace(told, entries=(replace(minutes, cycle=entry.cycle),)).planning[0].endswith("0.00833 % of a period")
+
+
+@pytest.mark.parametrize("name", ["RHC", "RHC+FPI", "Cascade"])
+def test_the_rate_of_plans_is_that_of_the_run(name):
+    """The planned input changes with a new plan and never between two, also behind a wrapper that hides how plans are made."""
+    cascade = fp.Cascade(CONTROLLERS["RHC"], fp.Affine(gain=-0.1), fp.ThroughModel(lag=0.1))
+    [entry] = compared([name], {**CONTROLLERS, "Cascade": cascade}).entries
+    changes = 1 + np.flatnonzero(np.diff(entry.run["planned"].ravel()))
+    assert set(np.diff(changes)) == {entry.plan_every} == {5}
 
 
 def test_equal_controllers_share_one_line():

@@ -10,17 +10,17 @@ from fpirhc.errors import InvalidValue
 from fpirhc.export.device import Device, identifiers
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, sources
+from fpirhc.plant.motion import SECONDS
 
 _DERIVATIVES = ("position", "velocity", "acceleration", "jerk")
-_SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 
 
 def _files(device: Device) -> Mapping[str, str | bytes]:
     name, own = device.name, sources(device)
     unit = device.problem.plant.time_unit
-    if unit not in _SECONDS:
+    if unit not in SECONDS:
         raise InvalidValue(
-            f"ros2_control runs in real time: a period in {', '.join(_SECONDS)} was expected, got one in {unit}"
+            f"ros2_control runs in real time: a period in {', '.join(SECONDS)} was expected, got one in {unit}"
         )
     states, commands = _states(device), [f"{one}/effort" for one in device.problem.plant.inputs]
     controller = filled(
@@ -32,7 +32,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         set=_set(device),
         given=str(len(states)),
         sent=str(len(commands)),
-        seconds=repr(_SECONDS[unit]),
+        seconds=repr(SECONDS[unit]),
     )
     words = {"sources": " ".join(file for file in own if file.endswith(".c")), "text": escape(device.title)}
     return {

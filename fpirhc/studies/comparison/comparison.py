@@ -8,6 +8,7 @@ from typing import Any
 
 from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
+from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.metrics import Metric, Metrics
 from fpirhc.simulation.metrics.measuring import Column as Number
 from fpirhc.simulation.metrics.measuring import columns, in_report
@@ -17,7 +18,7 @@ from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import gap
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.view import Study, View, status_shares
-from fpirhc.summary import Column, Table, line, numbers_written_out, written_out
+from fpirhc.summary import Column, Table, in_percent, line, numbers_written_out, written_out
 
 _SOLVES = "solve."  # metrics of plans, which have a table of their own
 
@@ -59,6 +60,11 @@ class Comparison(Study, FoundByName):
     def outcome(self) -> Outcome:
         """What the first sentence states."""
         return self.findings[0].outcome or Outcome.NOT_COMPARABLE
+
+    @property
+    def planning(self) -> tuple[str, ...]:
+        """A sentence for every controller that plans: at which rate, and which share of a period the plan takes."""
+        return tuple(_planning(e) for e in self.entries if e.metrics.solve)
 
     @property
     def null(self) -> NullTest | None:
@@ -104,6 +110,7 @@ def _view(comparison: Comparison) -> View:
             for head, texts in (
                 ("Ended early", ended),
                 ("What they measure, and how often", comparison.information),
+                ("When they plan", comparison.planning),
                 ("Notes", notes),
             )
         },
@@ -171,6 +178,27 @@ def _plans(comparison: Comparison) -> Table:
     return table.filled
 
 
+def _planning(entry: Entry) -> str:
+    """At which rate a controller plans, and which share of the period a cycle that plans takes."""
+    run, every = entry.run, entry.plan_every
+    rate = "in every cycle" if every == 1 else f"every {every} cycles"
+    text = f"{entry.name} plans {rate}, every {every * run.period:.4g} {run.time_unit}"
+    if entry.cycle is None:
+        return f"{text}; the run is too short to time a plan"
+    share = _share(entry)
+    text = f"{text}; a cycle that plans takes {_micro(entry.cycle.planning)} us"
+    if share is None:
+        return text
+    late = ": plans are late on this machine" if share > 1 else ""
+    return f"{text}, {in_percent(share)} of a period{late}"
+
+
+def _share(entry: Entry) -> float | None:
+    """Share of the period that a cycle with a plan takes; None where it was not timed, or the unit of time is no clock's."""
+    second = SECONDS.get(entry.run.time_unit)
+    return 1e-6 * entry.cycle.planning / (second * entry.run.period) if entry.cycle and second else None
+
+
 def _of_plans(metric: Metric) -> bool:
     return metric.name.startswith(_SOLVES) and (metric.report or bool(metric.short))
 
@@ -223,6 +251,7 @@ def _entry(entry: Entry) -> dict[str, Any]:
         **_numbers(entry.metrics),
         "cycle_us": _fields(entry.cycle, times),
         "statuses": dict(entry.metrics.statuses),
+        "plans": {"cycles": entry.plan_every, "share_of_period": _share(entry)} if entry.metrics.solve else None,
         "optimality": _fields(entry.optimality, ("median", "worst", "plans", "stuck")),
         "price_us": _fields(entry.price, ("beside", "difference", "noise")),
         "notes": entry.notes,

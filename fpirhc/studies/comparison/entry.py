@@ -8,6 +8,7 @@ import numpy as np
 
 from fpirhc.contraction.spectrum import ContractionReport, Spectrum
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import innermost
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Verdict
 from fpirhc.review.grid import review_grid
@@ -100,8 +101,8 @@ _MUCH = 1e-2  # relative cost above the optimum
 
 
 def plan_every(problem: Problem, controller: Controller) -> int:
-    """Return the number of cycles from plan to plan; 1 for a controller that does not plan."""
-    if controller.planner is None or problem.horizon is None:
+    """Return the number of cycles from plan to plan; 1 where neither the controller nor what it wraps plans."""
+    if innermost(controller).planner is None or problem.horizon is None:
         return 1
     return cycles_per_plan(problem.horizon, problem.period)
 
