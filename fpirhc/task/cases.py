@@ -12,6 +12,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Se
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from types import MappingProxyType
 from typing import cast
 
 import numpy as np
@@ -78,7 +79,13 @@ class Cases(Checked):
         return line(self, f"{len(self.names)} cases", *([f"groups {', '.join(groups)}"] if groups else []))
 
     @classmethod
-    def from_csv(cls, path: str | Path) -> Cases:
+    def from_csv(
+        cls,
+        path: str | Path,
+        *,
+        needed: Sequence[str] = (),
+        words: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
+    ) -> Cases:
         """Return the cases of a table: a row each, named in the column 'case', with a path as the head of every other column.
 
         Cells hold numbers; where one is empty, the case leaves the problem as it is. There may be columns 'group' and 'seed'. A
@@ -86,12 +93,14 @@ class Cases(Checked):
 
         Args:
             path: of the file; a relative one begins at the folder of the file that calls this.
+            needed: heads of columns that must be there, with a number in every row.
+            words: by head of a column, the words of its cells and the number that each means: {"exact.sex": {"m": 0, "f": 1}}.
 
         Raises:
             InvalidProblem: the file cannot be read, or all mistakes in its form together, each with row and column.
         """
         place = Path(path)
-        return _read(cls, place if place.is_absolute() else users_folder() / place)
+        return _read(cls, place if place.is_absolute() else users_folder() / place, needed, words)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -342,7 +351,9 @@ def _check_number(value: object, bounds: tuple[float, float] | None = None, unit
         raise InvalidValue(f"expected {low:g} to {high:g}{f' {unit}' if unit not in ('', '1') else ''}, got {value:g}")
 
 
-def _read(make: Callable[..., Cases], path: Path) -> Cases:
+def _read(
+    make: Callable[..., Cases], path: Path, needed: Sequence[str], words: Mapping[str, Mapping[str, float]]
+) -> Cases:
     """The cases of a file; places of mistakes are its rows and columns, counted from 1."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -352,7 +363,7 @@ def _read(make: Callable[..., Cases], path: Path) -> Cases:
     mistakes = Mistakes(path.name)
     first, cells_of_head = lines[0] if lines else (1, [])
     head = [cell.strip() for cell in cells_of_head]
-    _check_head(f"row {first}", head, mistakes)
+    _check_head(f"row {first}", head, needed, mistakes)
     changes: dict[str, dict[str, object]] = {}
     places: dict[str, str] = {}
     for number, row in lines[1:]:
@@ -368,17 +379,20 @@ def _read(make: Callable[..., Cases], path: Path) -> Cases:
             changes[name], places[name] = {}, f"{path.name}, row {number}"
             for column, cell in cells.items():
                 try:
-                    changes[name] |= {column: _cell(column, cell)} if cell else {}
+                    filled = cell or column in needed
+                    changes[name] |= {column: _cell(column, cell, words.get(column))} if filled else {}
                 except ValueError as error:
                     mistakes.add(f"row {number} ({name}), column '{column}': {error}")
     mistakes.raise_if_any()
     return make(changes, places=places)
 
 
-def _check_head(row: str, head: Sequence[str], mistakes: Mistakes) -> None:
+def _check_head(row: str, head: Sequence[str], needed: Sequence[str], mistakes: Mistakes) -> None:
     if _CASE not in head:
         apart = "; columns are separated by commas" if head and ";" in head[0] else ""
         mistakes.add(f"{row}: there is no column '{_CASE}' with the names of the cases{apart}.{nearest(_CASE, head)}")
+    for column in (c for c in needed if c not in head):
+        mistakes.add(f"{row}: there is no column '{column}', which every case needs.{nearest(column, head)}")
     for column in dict.fromkeys(head):
         if not column or head.count(column) > 1:
             mistakes.add(
@@ -389,9 +403,15 @@ def _check_head(row: str, head: Sequence[str], mistakes: Mistakes) -> None:
     mistakes.raise_if_any()
 
 
-def _cell(column: str, cell: str) -> object:
+def _cell(column: str, cell: str, words: Mapping[str, float] | None) -> object:
     if column == _GROUP:
         return cell
+    if words is not None:
+        if cell not in words:
+            raise ValueError(f"expected {' or '.join(map(repr, words))}, got '{cell}'")
+        return words[cell]
+    if not cell:  # of a column that is needed
+        raise ValueError("it is empty; expected a number, such as 3.5")
     try:
         return int(cell) if column == _SEED else float(cell)
     except ValueError:

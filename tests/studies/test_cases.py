@@ -164,6 +164,19 @@ def test_a_table_lies_beside_the_problem_file(task, tmp_path, monkeypatch):
     assert cases.names == ("weak", "stiff")
 
 
+def test_a_table_may_have_words_and_columns_that_every_case_needs(task):
+    """A word is its number; what is missing, empty or unknown is named by row and column, with what is expected."""
+    cases = {"needed": ("exact.b", "exact.k"), "words": {"exact.k": {"soft": 5.0, "stiff": 8.0}}}
+    read = fp.Cases.from_csv(written("case,exact.b,exact.k\none,0.9,stiff\n").resolve(), **cases)
+    assert read.changes == {"one": {"exact.b": 0.9, "exact.k": 8.0}}
+    with pytest.raises(InvalidProblem) as wrong:
+        fp.Cases.from_csv(written("case,exact.b,exact.k\none,0.9,hard\ntwo,,soft\n").resolve(), **cases)
+    assert "row 2 (one), column 'exact.k': expected 'soft' or 'stiff', got 'hard'" in str(wrong.value)
+    assert "row 3 (two), column 'exact.b': it is empty; expected a number, such as 3.5" in str(wrong.value)
+    with pytest.raises(InvalidProblem, match=r"row 1: there is no column 'exact\.k', which every case needs\."):
+        fp.Cases.from_csv(written("case,exact.b\none,0.9\n").resolve(), **cases)
+
+
 # --- Comparisons ------------------------------------------------------------------------------------------------------
 
 
