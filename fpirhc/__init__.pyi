@@ -9,7 +9,7 @@ from .controllers.rivals.pid import PID
 from .controllers.slots.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
 from .controllers.slots.slot import Slot
 from .controllers.slots.slotted import Slotted
-from .controllers.wrappers.cascade import Cascade, ThroughModel
+from .controllers.wrappers.cascade import Cascade, TargetUnit, ThroughModel
 from .controllers.wrappers.estimating import Estimating
 from .controllers.wrappers.exact_model import ExactModel
 from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
@@ -233,6 +233,7 @@ __all__ = [
     "Stepper",
     "StopRun",
     "Table",
+    "TargetUnit",
     "ThroughModel",
     "Trajectory",
     "Tuned",

@@ -11,7 +11,7 @@ import pytest
 from test_outputs import OPTIMISER, hill, planned, sedated
 
 import fpirhc as fp
-from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive, NotSupported
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.task.set_point import Setpoint
 
@@ -311,3 +311,108 @@ def test_a_wrong_model_that_asks_for_too_much_is_led_back_from_the_limit(
     assert run["clipped"][1] == 1
     assert run["command.u"][-1] == pytest.approx(command, abs=1e-6)
     assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-6)
+
+
+# --- The unit of the target -------------------------------------------------------------------------------------------
+
+
+def effect(drug: Any, p: Any) -> Any:
+    """A curve that saturates: from 90 without drug down to nothing, 45 at the dose C50."""
+    return 90 / (1 + (ca.fmax(drug, 1e-6) / p.half) ** 2)
+
+
+def dose_of(value: Any, p: Any) -> Any:
+    return p.half * ca.sqrt(90 / ca.fmin(ca.fmax(value, 1.0), 89.9) - 1)
+
+
+def saturating(half: float, target: float, **changes: Any) -> fp.Problem:
+    """Depth y' = (effect(u) - y) / 5 s; the model takes the dose C50 for one."""
+    plant = fp.Plant(
+        coordinates={"y": "1"},
+        inputs={"u": "mg/l"},
+        order=1,
+        response=lambda q, u, p: {"y": (effect(u.u, p) - q.y) / 5.0},
+        inverse=lambda q, r, p: {"u": dose_of(q.y + 5.0 * r.y, p)},
+        parameters={"half": fp.Parameter(approximate=1.0, exact=half, unit="mg/l")},
+    )
+    values = {
+        "plant": plant,
+        "reference": fp.Trajectory(lambda t: {"y": target + 0 * t}),
+        "start": {"y": 89.0},
+        "period": 1.0,
+        "duration": 200.0,
+        "input_before": {"u": 0.5},
+        "limits": fp.Limits(inputs={"u": (0.0, 50.0)}),
+    }
+    return fp.Problem(**{**values, **changes})
+
+
+DOSE = fp.TargetUnit(dose_of, effect)
+
+
+def in_doses(gain: float, unit: fp.TargetUnit = DOSE) -> fp.Cascade:
+    return fp.Cascade(STATIC, affine(gain), units={"y": unit})
+
+
+def cycles_to_settle(problem: fp.Problem, controller: Any) -> int:
+    """Cycles until the dose has gone nine tenths of the way from the model's dose to the one it ends at."""
+    run = fp.simulate(problem, controller, seed=1, compiled=False)
+    doses = run["command"][:, 0]
+    assert run["error"][-1] == pytest.approx(0.0, abs=1e-2)
+    return int(np.argmax(np.abs(doses - doses[-1]) < 0.1 * abs(doses[0] - doses[-1])))
+
+
+def test_in_the_unit_of_the_dose_the_gain_is_the_same_at_every_target():
+    """With C50 wrong by a factor the converted output is that factor times the dose, where the output's own slope changes."""
+    own, doses = fp.Cascade(STATIC, affine(0.3)), in_doses(0.3)
+    cycles = {c: [cycles_to_settle(saturating(2.0, target), c) for target in (20.0, 45.0, 70.0)] for c in (own, doses)}
+    assert max(cycles[doses]) < 1.2 * min(cycles[doses])  # the lag is that of the output, and not of the dose
+    assert max(cycles[own]) > 4 * min(cycles[own])
+
+
+def test_the_shift_of_a_unit_is_that_of_the_recursion_by_hand():
+    """Logged outputs through the formulas in numpy, in doses, with the target inside its bounds."""
+    unit = replace(DOSE, bounds=(0.5, 1.5))
+    problem = saturating(3.0, 45.0, dead_time=fp.DeadTime(inputs={"u": 2.0}))
+    run = fp.simulate(problem, in_doses(0.4, unit), seed=1, compiled=False)
+    z = np.sqrt(90 / np.clip(run["state.y"], 1.0, 89.9) - 1)
+    wanted, decay, shift, shifts = 1.0, np.exp(-1 / 5), 0.0, [0.0] * 3
+    in_force = z[0] - wanted
+    for k in range(150):
+        if k:
+            shift = shift - 0.4 * (z[k] - (wanted + in_force) + shift)
+        shift = np.clip(wanted + shift, 0.5, 1.5) - wanted
+        assert run["shift.y"][k] == pytest.approx(90 / (1 + (wanted + shift) ** 2) - 45.0, abs=1e-9)
+        shifts = [shift, *shifts[:2]]
+        in_force = decay * in_force + (1 - decay) * shifts[2]
+    assert run["command"][-1, 0] == pytest.approx(1.5)  # the plant needs 3
+
+
+def test_the_unit_of_the_output_itself_changes_nothing():
+    same = fp.TargetUnit(lambda y, _: y + 0, lambda z, _: z + 0)
+    runs = [
+        fp.simulate(saturating(2.0, 45.0), c, seed=1, compiled=False)
+        for c in (fp.Cascade(STATIC, affine(0.3)), in_doses(0.3, same))
+    ]
+    np.testing.assert_allclose(runs[0]["command"], runs[1]["command"], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("units", "message"),
+    [
+        ({"dose": DOSE}, r"units: controlled coordinate 'dose' is unknown\. .*y"),
+        (
+            {"y": fp.TargetUnit(dose_of, lambda z, p: z + p.half)},
+            r"units\['y'\]: to\(45\) is 1, and back of it 2; expected 45",
+        ),
+        ({"y": fp.TargetUnit(dose_of, lambda z, p: (z, p))}, r"units\['y'\]\.back must be one scalar expression"),
+    ],
+)
+def test_a_wrong_unit_is_named(units, message):
+    with pytest.raises(InvalidProblem, match=message):
+        fp.simulate(saturating(2.0, 45.0), fp.Cascade(STATIC, affine(0.3), units=units), seed=1, compiled=False)
+
+
+def test_bounds_are_in_order():
+    with pytest.raises(InvalidValue, match="write lower < upper"):
+        fp.TargetUnit(dose_of, effect, bounds=(2.0, 1.0))

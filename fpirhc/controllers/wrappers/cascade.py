@@ -2,13 +2,15 @@
 
     target = reference + shift,        command = inner controller(target)
 
+The shift may act in another unit, z = to(y): target = back(to(reference) + shift).
+
 Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -18,9 +20,10 @@ from fpirhc.controllers.base import Controller, like, reference_block
 from fpirhc.controllers.contract import Deforms, without_deformation
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import Deformation, RequestChange, automatic
-from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.errors import InvalidValue, Mistakes, NotContractive, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
+from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.maps import growth_of
@@ -29,7 +32,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay
 from fpirhc.symbolic.expression import Signals, expression, is_finite, kind
 from fpirhc.symbolic.functions import largest
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Named, Signal, scalar
 from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import MOST, Queue, every
 from fpirhc.task.dead_time import DeadTime
@@ -189,12 +192,14 @@ class ThroughModel(Checked):
             raise InvalidValue(f"{self!r}: {now:g} cycles of dead time, more than {MOST}")
         return Queue.up_to(cycles, self._late(nominal(late).at_longest) / problem.period)
 
-    def memory(self, problem: Problem) -> tuple[Signal, ...]:
-        """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start."""
-        plant, names = problem.plant, problem.plant.controlled_names
-        places = [plant.output.elements.index(n) for n in names]
-        first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()[places]
-        away, length = problem.start_output[places] - first, self.queue(problem).length
+    def memory(self, problem: Problem, first: np.ndarray, away: np.ndarray) -> tuple[Signal, ...]:
+        """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start.
+
+        Args:
+            first: reference at the start, one per controlled coordinate.
+            away: distance of the start from it.
+        """
+        names, length = problem.plant.controlled_names, self.queue(problem).length
         queued = tuple(f"{n}@{k}" for k in range(1, length + 1) for n in names)
         return (
             Signal("references_sent", queued, start=tuple(map(float, first)) * length),
@@ -216,6 +221,13 @@ class ThroughModel(Checked):
             "shifts_sent_next": shifts,
             "shift_in_force_next": rho * s.shift_in_force + (1 - rho) * queue.delayed(shifts, shift.numel()),
         }
+
+
+def _first_reference(problem: Problem) -> np.ndarray:
+    """The controlled coordinates' reference at the start, (n,)."""
+    plant = problem.plant
+    first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
+    return first[[plant.output.elements.index(n) for n in plant.controlled_names]]
 
 
 def _own_lags(problem: Problem) -> float | tuple[float, ...]:
@@ -241,6 +253,35 @@ def _slowest(problem: Problem) -> float:
     return float(1 / rates.min())
 
 
+Converted = Callable[[Expression, Named], Expression]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetUnit(Checked):
+    """The unit in which targets are deformed: a monotonic function of a coordinate, by the model's curve, and its inverse.
+
+    Where the settled output is y = h(u) with a curve that saturates, an iteration on y has another gain at every target. On
+    z = to(y), with `back` of z the model's h, a right model has the gain one everywhere.
+
+    Args:
+        to: function of (y, p) that returns z; finite for every measured y, so keep y inside the range of the curve.
+        back: function of (z, p) that returns y.
+        bounds: (lower, upper) of the target, in z.
+    """
+
+    to: Converted
+    back: Converted
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+
+    def __post_init__(self) -> None:
+        if not self.bounds[0] < self.bounds[1]:
+            raise InvalidValue(f"TargetUnit: bounds are {self.bounds!r}; write lower < upper")
+
+
+_SAME = TargetUnit(lambda y, _: y, lambda z, _: z)
+_AGREE = 1e-6  # of `to` and `back`, as a share of the coordinate
+
+
 _RENAMED = {"reference": "target", "error": "target_error"}  # what the inner controller calls these
 _COMMANDS = {"_unclipped_last": "command_unclipped", "_command_last": "command"}
 _SAMPLES = 200
@@ -254,11 +295,17 @@ class Cascade(Controller):
         controller: the inner one: `FeedforwardOnly()`, or any that follows the reference.
         deformation: the map on targets; a scale is in units of the output.
         paired: which target an output belongs to; None: that of the last cycle.
+        units: by controlled coordinate, the unit in which its target is deformed; a scale of the map is in it. The coordinate's own
+            where not named.
+
+    Raises:
+        InvalidProblem: a unit of what is not controlled, or one whose functions are not each other's inverse at the start.
     """
 
     controller: Controller
     deformation: Deformation
     paired: ThroughModel | None = field(default_factory=ThroughModel)
+    units: Mapping[str, TargetUnit] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def inner(self) -> Controller:
@@ -294,17 +341,65 @@ class Cascade(Controller):
         motion = np.array([np.asarray(function(t)[0].full()).ravel() for t in times])
         places = [plant.output.elements.index(n) for n in plant.controlled_names]
         outputs = np.vstack([problem.start_output[places], motion[:, places]])
+        outputs = np.array([self._numbers(problem.plant, one, "to") for one in outputs])
         return RequestChange(float(np.linalg.norm(np.ptp(outputs, axis=0))), sudden=True)
+
+    def _units(self, plant: Plant, values: Expression, parameters: Expression, way: str) -> Expression:
+        """Values of the controlled coordinates, each by the function `way` of its unit: "to" or "back"."""
+        if not self.units:
+            return values
+        named = Named(plant.parameter.elements, parameters, "parameter")
+        converted = []
+        for k, name in enumerate(plant.controlled_names):
+            function = getattr(self.units.get(name, _SAME), way)
+            what = f"Cascade: units['{name}'].{way}"
+            converted.append(scalar_expression(what, called(what, function, values[k], named), of=function))
+        return ca.vertcat(*converted)
+
+    def _numbers(self, plant: Plant, values: np.ndarray, way: str) -> np.ndarray:
+        """The same of numbers (n,), with the model's parameters."""
+        converted = self._units(plant, ca.SX(values), ca.SX(plant.approximate), way)
+        return np.asarray(ca.evalf(converted).full()).ravel()
+
+    def _steepness(self, plant: Plant) -> ca.Function | None:
+        """Function (controlled outputs, parameters) -> dz/dy of every one; None without units."""
+        if not self.units:
+            return None
+        y, p = ca.SX.sym("y", len(plant.controlled_names)), ca.SX.sym("p", plant.parameter.size)
+        slopes = ca.jacobian(self._units(plant, y, p, "to"), y)
+        return ca.Function("fpirhc_steepness", [y, p], [ca.densify(ca.diag(slopes))])
+
+    def _check_units(self, problem: Problem) -> None:
+        """Raise where a unit is of nothing, or its functions are not each other's inverse at the reference's start.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        plant, mistakes = problem.plant, Mistakes("Cascade")
+        mistakes.unknown("units: controlled coordinate", self.units, plant.controlled_names)
+        mistakes.raise_if_any()
+        first = _first_reference(problem)
+        there = self._numbers(plant, first, "to")
+        again = self._numbers(plant, there, "back")
+        for k, name in enumerate(plant.controlled_names):
+            if not abs(again[k] - first[k]) <= _AGREE * max(1.0, abs(first[k])):
+                mistakes.add(
+                    f"units['{name}']: to({first[k]:g}) is {there[k]:g}, and back of it {again[k]:g}; expected {first[k]:g}, the "
+                    "reference at the start: give functions that are each other's inverse, and a reference inside their range"
+                )
+        mistakes.raise_if_any()
 
     def check(self, problem: Problem) -> None:
         """Raise if the inner controller, the map or the pairing does not fit the problem.
 
         Raises:
+            InvalidProblem: a unit of what is not controlled, or one whose functions are not each other's inverse.
             NotContractive: a gain of the wrong sign.
             NotSupported: a model-referenced map, or one with a pairing of its own; a controller that predicts over the dead time
                 inside.
             InvalidValue: see `ThroughModel`.
         """
+        self._check_units(problem)
         self.controller.check(self.inner_problem(problem))
         self.deformation.mirror.require_last_request(
             "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself"
@@ -338,14 +433,17 @@ class Cascade(Controller):
         plant, names = problem.plant, problem.plant.controlled_names
         seen, pairing = plant.output, self.paired
         places, units = [seen.elements.index(n) for n in names], tuple(followed_units(plant)[n] for n in names)
-        start = tuple(map(float, problem.start_output[places]))
-        own = self.deformation.memory(names)
-        last = Signal("shift_last", names, units), Signal("target_last", names, units, start), scalar("shift_cycles")
-        response = plant.equations.controlled_response
-        memory = Layout((*last, *(pairing.memory(problem) if pairing else ()))) + own
+        begun = self._numbers(plant, problem.start_output[places], "to")
+        first = self._numbers(plant, _first_reference(problem), "to")
+        start, own = tuple(map(float, begun)), self.deformation.memory(names)
+        lower, upper = (ca.DM([self.units.get(n, _SAME).bounds[end] for n in names]) for end in (0, 1))
+        last = Signal("shift_last", names), Signal("target_last", names, start=start), scalar("shift_cycles")
+        response, steepness = plant.equations.controlled_response, self._steepness(plant)
+        memory = Layout((*last, *(pairing.memory(problem, first, begun - first) if pairing else ()))) + own
 
         def step(s: Signals) -> dict[str, Expression]:
-            wanted, output, before = s.reference[places], getattr(s, seen.name)[places], s.shift_last
+            shown, before = getattr(s, seen.name)[places], s.shift_last
+            wanted, output = (self._units(plant, one, s.parameters, "to") for one in (s.reference[places], shown))
             in_force = pairing.in_force(problem, s, wanted) if pairing else s.target_last
             undeformed = in_force - before if pairing else wanted
             remembered = {m: getattr(s, m) for m in own.names}
@@ -353,15 +451,20 @@ class Cascade(Controller):
             change = request - undeformed
             running = ca.logic_and(s.shift_cycles > problem.warm_up_cycles - 0.5, is_finite(change))
             beyond, sent = (response(s.state, getattr(s, u), s.parameters) for u in _COMMANDS)
-            onwards = ca.logic_not(ca.dot(change - before, beyond - sent) < 0)  # NaN is no way back
+            away = beyond - sent if steepness is None else steepness(shown, s.parameters) * (beyond - sent)
+            onwards = ca.logic_not(ca.dot(change - before, away) < 0)  # NaN is no way back
             grows = ca.logic_and(ca.logic_and(s.clipped_last > 0.5, onwards), ca.fabs(change) > ca.fabs(before))
             shift = ca.if_else(running, ca.if_else(grows, before, change), before)
-            target = wanted + shift
+            target, own_shift = wanted + shift, shift
+            if self.units:
+                target = ca.fmin(ca.fmax(target, lower), upper)
+                shift = target - wanted
+                own_shift = self._units(plant, target, s.parameters, "back") - s.reference[places]
             paired = pairing.remembered(problem, s, wanted, shift) if pairing else {}
             counted = {"shift_cycles_next": ca.fmin(s.shift_cycles + 1, problem.warm_up_cycles)}
             own_next = {f"{m}_next": ca.if_else(running, after[m], remembered[m]) for m in own.names}
             held = {"shift_last_next": shift, "target_last_next": target, **counted}
-            return {SHIFT: shift, "shift": shift, **held, **paired, **own_next}
+            return {SHIFT: own_shift, "shift": own_shift, **held, **paired, **own_next}
 
         commands = (like(plant.input, name) for name in _COMMANDS)
         measured = (*measured_signals(plant), plant.parameter)
