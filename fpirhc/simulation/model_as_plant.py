@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Mapping, Sequence
-from copy import copy
-from dataclasses import replace
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import fields, replace
 
 import casadi as ca
+import numpy as np
 
+from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation, Mirror
+from fpirhc.describe import identity
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.run import Run
@@ -18,7 +20,7 @@ from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
-from fpirhc.task.exogenous import as_known
+from fpirhc.task.exogenous import Exogenous, as_known
 from fpirhc.task.problem import Problem
 from fpirhc.task.reality import Reality
 
@@ -70,38 +72,66 @@ def _each(value: float | tuple[float, ...], count: int) -> tuple[float, ...]:
 
 
 class ModelAsPlant:
-    """The approximate model as plant of loops that are ready, without disturbances; every loop runs once."""
+    """Models of controllers as the plant of their loops, without disturbances; every loop runs once on every model."""
 
     def __init__(self, problem: Problem, *, seed: int) -> None:
         """Take the problem of the loops, and the seed of the sensors' noise."""
-        own = problem.of_model
-        self._own = replace(own, signals=as_known(own.plant, own.signals)) if own.signals else own
-        # The loops have the real plant and signals.
-        self._foreign = problem.reality is not None or bool(problem.signals)
-        self._seed = seed
-        self._runs: dict[Simulator, Run] = {}
-        self._behind: dict[Mirror | None, ModelAsPlant] = {}
-        plant, longest = self._own.plant, self._own.measure_from + CYCLES * self._own.period
-        own = replace(self._own, plant=with_exact_parameters(plant, plant.approximate))
-        self.problem = replace(own, duration=min(own.duration, longest))
+        self._problem, self._seed = problem, seed
+        self._models: dict[Hashable, Problem] = {}
+        self._runs: dict[tuple[Simulator, int], Run] = {}
 
-    def behind(self, deformation: Deformation) -> ModelAsPlant:
-        """Return the model behind the lag and the dead time that a deformation believes; itself where it believes none."""
-        way = with_believed_way(self.problem, deformation)
-        if way is self.problem:
-            return self
-        if deformation.mirror not in self._behind:
-            other = self._behind[deformation.mirror] = copy(self)
-            other._own = other.problem = way
-            other._foreign, other._runs = True, {}
-        return self._behind[deformation.mirror]
+    def of(self, controller: Controller) -> Problem:
+        """Return the problem whose plant is the model of a resolved controller, behind the lag and the dead time that it believes.
 
-    def run(self, loop: Simulator) -> Run:
-        """Return the run of a loop on the model."""
-        if loop not in self._runs:
-            own = simulator(self._own, loop.controller, compiled=False) if self._foreign else loop
-            self._runs[loop] = own.run(seed=self._seed, variant=self.problem, disturbed=False)
-        return self._runs[loop]
+        It is the same one for controllers that know the same. Signals are what the model believes of them.
+        """
+        known, mirror = controller.plant_model(self._problem), controller.deformation.mirror
+        parameters = known.parameters(self._problem.plant)
+        name = parameters.tobytes(), identity(known.signals), mirror
+        if name not in self._models:
+            self._models[name] = self._made(parameters, known.signals, controller.deformation)
+        return self._models[name]
+
+    def _made(self, parameters: np.ndarray, signals: Mapping[str, Exogenous], deformation: Deformation) -> Problem:
+        own = self._problem.of_model
+        plant, longest = with_exact_parameters(own.plant, parameters), own.measure_from + CYCLES * own.period
+        told, duration = as_known(own.plant, signals), min(own.duration, longest)
+        return with_believed_way(replace(own, plant=plant, signals=told, duration=duration), deformation)
+
+    def pair(self, loops: tuple[Simulator, Simulator]) -> tuple[Problem, tuple[Run, Run]]:
+        """Return the problem of the second loop's model, and the runs of both loops on it."""
+        model = self.of(loops[1].controller)
+        return model, (self.run(loops[0], model), self.run(loops[1], model))
+
+    def run(self, loop: Simulator, model: Problem) -> Run:
+        """Return the run of a loop, of the problem, on one of the models."""
+        name = loop, id(model)
+        if name not in self._runs:
+            own = self._behind(model, loop)
+            self._runs[name] = own.run(seed=self._seed, variant=model, disturbed=False)
+        return self._runs[name]
+
+    def _behind(self, model: Problem, loop: Simulator) -> Simulator:
+        """The loop itself where it moves a plant of the model's kind; else the one that does, whose plans are built already."""
+        own = loop.problem
+        told = identity(own.signals) == identity(model.signals)
+        if own.reality is None and model.reality is None and told and model.dead_time is own.dead_time:
+            return loop
+        kept = model if model.reality is not None else replace(model, plant=own.plant)
+        return loop_of(kept, loop.controller)
+
+
+def loop_of(problem: Problem, controller: Controller) -> Simulator:
+    """Return the closed loop for runs of any duration; it is the same one for problems that differ in their times alone."""
+    values = [getattr(problem, field.name) for field in fields(Problem) if field.name not in _TIMES]
+    same = tuple(None if isinstance(value, Mapping) and not value else value for value in values)
+    build = lambda: simulator(problem, controller, compiled=False)  # noqa: E731
+    loop = _LOOPS.of(same, (identity(controller),), build)
+    return build() if loop.remembers else loop
+
+
+_LOOPS: Latest[Simulator] = Latest(8)
+_TIMES = {"duration", "measure_from"}  # of a problem, which are no part of its loop
 
 
 def shortened(problem: Problem, cycles: int) -> Problem:

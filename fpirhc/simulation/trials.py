@@ -10,7 +10,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
 
@@ -18,16 +18,15 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task, without_deformation
-from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, HarmfulAdaptation, NotContractive
 from fpirhc.fields.user_code import users_level
 from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.simulation.log import judged_motion
-from fpirhc.simulation.metrics.base import measured_errors
+from fpirhc.simulation.metrics.base import by_name
+from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.metrics.entries.errors import rms_error
-from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
+from fpirhc.simulation.model_as_plant import ModelAsPlant, loop_of, shortened
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.summary import beside
 from fpirhc.symbolic.latest import Latest
 from fpirhc.task.problem import Problem
@@ -45,7 +44,7 @@ class ErrorPair:
     Args:
         without: rms tracking error by judged coordinate without adaptation, in the unit of the coordinate.
         adapted: the same with the deformation; infinite where the run ended early.
-        ranges: range of the reference, or the largest error without adaptation where that is larger, by coordinate.
+        ranges: range of the reference, or the largest error of the run without adaptation where that is larger, by coordinate.
         units: of the coordinates.
         at_limit: share of the cycles in which a command stands at a limit, of the run where it is smaller.
     """
@@ -95,7 +94,7 @@ class ErrorPair:
     @property
     def stuck(self) -> str:
         """Why the pair shows nothing: commands stand at a limit in both runs; empty where it shows something."""
-        if self.at_limit < MOSTLY:
+        if not self.at_limit >= MOSTLY:  # no number where a run ended before errors count
             return ""
         share = f"{100 * self.at_limit:.3g} %"
         return f"not informative: the command stands at a limit in {share} of the cycles, where no adaptation can act"
@@ -135,17 +134,19 @@ def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | Non
         }
         for run in runs
     )
-    return ErrorPair(before, after, _ranges(problem, runs[0]), followed_units(problem.plant))
+    stuck = min(at_limit(problem, run) for run in runs)
+    return ErrorPair(before, after, _ranges(problem, runs[0]), followed_units(problem.plant), stuck)
 
 
 def _ranges(problem: Problem, run: Run) -> dict[str, float]:
-    """Range of the reference, or the largest error where that is larger."""
+    """Range of the reference, or the largest error of the whole run where that is larger; its size where both are rounding."""
     errors, motion = run["true_error"], run[judged_motion(run.layout)]
     places = [problem.plant.output.elements.index(name) for name in problem.judged_names]
-    spans = np.ptp(errors + motion[:, places], axis=0)
-    largest = np.abs(measured_errors(problem, run)).max(axis=0)
-    rounding = _ROUNDING * np.abs(motion[:, places]).max(axis=0)  # of a set-point that is held without an error
-    return {n: float(max(sizes)) for n, *sizes in zip(problem.judged_names, spans, largest, rounding, strict=True)}
+    reference = errors + motion[:, places]
+    sizes = np.fmax(np.ptp(reference, axis=0), np.abs(errors).max(axis=0))
+    largest = np.abs(reference).max(axis=0)
+    sizes = np.where(sizes > _ROUNDING * largest, sizes, largest)
+    return by_name(problem.judged_names, np.where(np.isfinite(sizes), sizes, 0.0))
 
 
 def weighed(problem: Problem, controller: Controller) -> frozenset[str] | None:
@@ -169,19 +170,6 @@ def harm_in(real: ErrorPair | None, null: ErrorPair) -> str:
     if not null.passes and (real is None or null.adapted[null.worst] > real.without[null.worst]):
         return f"with a right model {null.sentence}"
     return ""
-
-
-def loop_of(problem: Problem, controller: Controller) -> Simulator:
-    """Return the closed loop for runs of any duration; it is the same one for problems that differ in their times alone."""
-    values = [getattr(problem, field.name) for field in fields(Problem) if field.name not in _TIMES]
-    same = tuple(None if isinstance(value, Mapping) and not value else value for value in values)
-    build = lambda: simulator(problem, controller, compiled=False)  # noqa: E731
-    loop = _LOOPS.of(same, (identity(controller),), build)
-    return build() if loop.remembers else loop
-
-
-_LOOPS: Latest[Simulator] = Latest(8)
-_TIMES = {"duration", "measure_from"}  # of a problem, which are no part of its loop
 
 
 class Trials:
@@ -223,8 +211,7 @@ class Trials:
         """
         loop = loop_of(self.problem, controller)
         names = weighed(self.problem, loop.controller)
-        model = self._model.behind(loop.controller.deformation)
-        null = errors_of(model.problem, (model.run(self._bare), model.run(loop)), names)
+        null = errors_of(*self._model.pair((self._bare, loop)), names)
         if self.problem.foreign is not None:
             return None, null
         real = errors_of(self.problem, (self._plain, loop.run(seed=0, variant=self.problem)), names)

@@ -16,7 +16,7 @@ from fpirhc.deformation.base import Iteration
 from fpirhc.report.html import chart_data
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.prediction import null_problem, null_runs
+from fpirhc.review.prediction import NominalRuns
 from fpirhc.review.questions.reality import LAG, LOOP, RESONANCE, extra_modes, real_loops, real_points
 
 TAU, FREQUENCY = 0.02, 300.0  # s, rad/s
@@ -191,8 +191,9 @@ def test_null_runs_are_those_of_the_model():
     """Adaptation has nothing to do on the right model, whatever the reality is: the model-referenced form adds nothing."""
     controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.ModelReferenced(fp.Affine(gain=-0.5)))
     problem = task(reality=fp.Reality(lagged()), cost=None, horizon=None)
-    assert null_problem(problem, controller).reality is None
-    runs = null_runs(problem, controller)
+    models = NominalRuns(problem)
+    assert models.model.of(controller).reality is None
+    runs = models.null(controller)
     assert runs.adapted["y"] == pytest.approx(runs.without["y"], rel=1e-9)
 
 

@@ -145,7 +145,7 @@ def test_a_null_test_of_commands_at_a_limit_shows_nothing():
     one = answer(task.problem, task.controllers["static map+FPI"], "right model alone")
     assert one.verdict == "unknown"
     assert one.evidence == (
-        "run on its own model, rms error of emission 278 kg/h without adaptation and with it; not informative: the command "
+        "run on its own model, rms error of emission 128 kg/h without adaptation and with it; not informative: the command "
         "stands at a limit in 100 % of the cycles, where no adaptation can act"
     )
     assert one.change == "Run it where the commands are free."

@@ -3,7 +3,7 @@
 import fpirhc as fp
 from fpirhc.controllers import replanning
 from fpirhc.describe import describe, identity
-from fpirhc.review.prediction import null_problem
+from fpirhc.review.prediction import NominalRuns
 from fpirhc.simulation import loop
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.slopes import Step
@@ -53,8 +53,9 @@ def test_what_differs_in_nothing_is_the_same_problem():
     task = fp.load_problem("two_mass")
     problem, controller = task.problem, task.controllers["RHC+FPI"]
     assert shortened(problem, 100) is shortened(problem, 100)
-    assert null_problem(problem, controller) is null_problem(problem, controller)
-    assert null_problem(problem, task.controllers["RHC"]) is not null_problem(problem, controller)
+    models = NominalRuns(problem).model
+    assert models.of(controller) is models.of(task.controllers["RHC"])
+    assert models.of(fp.ExactModel(controller)) is not models.of(controller)
 
 
 def test_plants_from_the_box_are_asked_of_controllers_that_adapt_alone(monkeypatch):

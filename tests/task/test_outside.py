@@ -327,10 +327,10 @@ def test_scenarios_do_not_draw_signals():
 
 def test_a_null_test_has_the_weather_that_the_model_believes():
     """Unknown weather must not count as harm of the deformation: the null world is the model's."""
-    from fpirhc.review.prediction import null_runs
+    from fpirhc.review.prediction import NominalRuns
 
     problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Unknown(FRONT)})
-    runs = null_runs(problem, CONTROLLERS["CTC+model-referenced"])
+    runs = NominalRuns(problem).null(CONTROLLERS["CTC+model-referenced"])
     assert runs.adapted["air"] == pytest.approx(runs.without["air"], rel=1e-9)
 
 

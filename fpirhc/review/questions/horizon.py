@@ -24,7 +24,6 @@ from fpirhc.plant.maps import growth_of, step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, state_slopes
-from fpirhc.review.prediction import null_problem
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion
 from fpirhc.review.questions.integration import stiff_advice
 from fpirhc.simulation.model_as_plant import shortened
@@ -211,7 +210,7 @@ def iterations_suffice(case: Case) -> Answer | None:
         return None
     try:
         bare = without_deformation(case.controller)
-        model = shortened(null_problem(case.problem, bare), _PLANS * cycles_per_plan(horizon, case.problem.period))
+        model = shortened(case.runs.model.of(bare), _PLANS * cycles_per_plan(horizon, case.problem.period))
         share, later = unsolved(case.runs.bare(bare), model.cycles)
     except FpirhcError as error:
         return Answer(ITERATIONS, Verdict.UNKNOWN, f"no run of the model: {error}")

@@ -22,14 +22,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.prediction import (
-    TRIED,
-    NominalRun,
-    ResponseErrors,
-    errors_without_adaptation,
-    null_runs,
-    response_errors,
-)
+from fpirhc.review.prediction import TRIED, NominalRun, ResponseErrors, errors_without_adaptation, response_errors
 from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
 from fpirhc.simulation.model_as_plant import with_believed_way
 from fpirhc.simulation.trials import SLIGHT, ErrorPair
@@ -219,7 +212,7 @@ def leaves_right_model_alone(case: Case) -> Answer:
         text += "the loop with the right model does not converge without adaptation"
         return Answer(NULL_TEST, Verdict.UNKNOWN, text, "See the rates.", numbers)
     try:
-        runs = null_runs(case.problem, case.controller, case.runs)
+        runs = case.runs.null(case.controller)
     except FpirhcError as error:
         return Answer(NULL_TEST, Verdict.UNKNOWN, f"{text}no run of the model: {error}", "", numbers)
     worst = runs.worst

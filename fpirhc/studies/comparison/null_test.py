@@ -10,17 +10,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from fpirhc.by_name import FoundByName
 from fpirhc.plant.motion import followed_units, with_space
-from fpirhc.simulation.log import judged_motion
-from fpirhc.simulation.metrics.base import by_name
 from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.model_as_plant import ModelAsPlant
-from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
-from fpirhc.simulation.trials import MOSTLY, SLIGHT
+from fpirhc.simulation.trials import MOSTLY, SLIGHT, errors_of
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import in_percent, numbers_written_out
@@ -82,11 +77,11 @@ def null_test(
         weighed: coordinates that are judged; None: all.
         cured: rms error on the plant itself without adaptation, by judged coordinate.
     """
-    model = model.behind(loops[1].controller.deformation)
-    begin, null = time.perf_counter(), model.problem
-    runs = tuple(model.run(loop) for loop in loops)
-    before, after = (_errors(run, null) for run in runs)
-    slight = {name: SLIGHT * size for name, size in _ranges(runs[0], null).items()}
+    begin = time.perf_counter()
+    null, runs = model.pair(loops)
+    pair = errors_of(null, runs)
+    before, after = (_or_nan(errors) for errors in (pair.without, pair.adapted))
+    slight = {name: SLIGHT * size for name, size in pair.ranges.items()}
     stuck = {n: at_limit(null, run) for n, run in zip(names, runs, strict=True)}
     if stuck[names[0]] >= MOSTLY:
         text = _not_informative(stuck)
@@ -110,19 +105,9 @@ def _not_informative(stuck: Mapping[str, float]) -> str:
     return f"Null test: not informative, the command stands at a limit in most cycles ({names}), where no adaptation can act."
 
 
-def _errors(run: Run, null: Problem) -> dict[str, float]:
-    """Rms error of the plant's own state, or outputs, over the measured cycles."""
-    states = run[judged_motion(run.layout)]
-    names = null.judged_names
-    measured = run.time >= null.measure_from - 0.5 * null.period
-    if run.stop is not None or not measured.any():
-        return dict.fromkeys(names, math.nan)
-    places = [null.plant.output.elements.index(name) for name in names]
-    nominal = null.reference.function(null.plant).map(int(measured.sum()))(run.time[measured][None, :])[0]
-    errors = np.asarray(nominal.full()).T[:, places] - states[measured][:, places]
-    with np.errstate(over="ignore"):
-        sizes = np.sqrt(np.mean(errors**2, axis=0))
-    return by_name(names, np.where(np.isfinite(sizes), sizes, np.nan))  # squares overflow where a run has diverged
+def _or_nan(errors: Mapping[str, float]) -> dict[str, float]:
+    """Errors by coordinate, NaN where a run ended early or has diverged."""
+    return {name: size if math.isfinite(size) else math.nan for name, size in errors.items()}
 
 
 def _outcome(changes: Mapping[str, Change]) -> Outcome:
@@ -140,19 +125,6 @@ def _harmful(
         return False
     worse = [c for c in major(changes).values() if c.outcome is Outcome.WORSE] or changes.values()
     return any(not (c.after <= cured[c.name] or c.after - c.before <= slight.get(c.name, 0.0)) for c in worse)
-
-
-def _ranges(run: Run, null: Problem) -> dict[str, float]:
-    """Range of the reference of a whole run, or its largest error where that is larger."""
-    names, states = null.judged_names, run[judged_motion(run.layout)]
-    if not len(states):
-        return dict.fromkeys(names, 0.0)
-    places = [null.plant.output.elements.index(name) for name in names]
-    reference = np.asarray(null.reference.function(null.plant).map(len(states))(run.time[None, :])[0].full()).T[
-        :, places
-    ]
-    sizes = np.fmax(np.ptp(reference, axis=0), np.abs(reference - states[:, places]).max(axis=0))
-    return by_name(names, np.where(np.isfinite(sizes), sizes, 0.0))
 
 
 def _smallness(plain: str, null: Problem, cured: Mapping[str, float], larger: bool) -> str:
