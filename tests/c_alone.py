@@ -11,7 +11,7 @@ from tempfile import mkdtemp
 import numpy as np
 
 import fpirhc.optimisers
-from fpirhc.symbolic.driver import OF_TYPE
+from fpirhc.symbolic.driver import OF_TYPE, WORDS
 from fpirhc.symbolic.native import find_compiler
 
 FOLDER = Path(fpirhc.optimisers.__file__).parent
@@ -41,7 +41,7 @@ def library(
     parts = [(FOLDER / f"{name}.c").read_text(encoding="utf-8") for name in texts]
     folder = Path(mkdtemp())
     source, built = folder / "alone.c", folder / "alone.so"
-    source.write_text("\n".join([_BEFORE, OF_TYPE, *definitions, *stubs, *parts, own]), encoding="utf-8")
+    source.write_text("\n".join([_BEFORE, OF_TYPE, WORDS, *definitions, *stubs, *parts, own]), encoding="utf-8")
     compiler = find_compiler()
     assert compiler is not None
     command = [compiler, "-shared", "-fPIC", "-O1", "-w", "-ffp-contract=off", str(source), "-o", str(built), "-lm"]

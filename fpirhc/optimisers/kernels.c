@@ -1,11 +1,5 @@
 /* What the loops of the optimisers share: small matrix products and tests of numbers. Matrices are column-major. */
 
-#if defined(__GNUC__)
-#define INLINE static inline __attribute__((always_inline)) /* so that sizes are constants in every loop */
-#else
-#define INLINE static inline
-#endif
-
 #ifdef PORTABLE
 #define WIDE 0
 #else /* PORTABLE */
@@ -22,21 +16,21 @@
 typedef const casadi_real* In;
 typedef casadi_real* Out;
 
-INLINE int all_finite(In v, int n) {
+INLINE Truth all_finite(In v, int n) {
   int i;
-  long long ok = 1; /* as wide as a number, so that the loop uses wide registers */
+  Mask ok = YES; /* as wide as a number, so that the loop uses wide registers */
   for (i = 0; i < n; ++i) ok &= fabs(v[i]) <= FINITE; /* false for NaN */
-  return (int)ok;
+  return (Truth)ok;
 }
 
 /* fmax and fmin without calls of the library: where one is not a number, the other. */
-INLINE casadi_real larger(casadi_real a, casadi_real b) { return a > b || b != b ? a : b; }
-INLINE casadi_real smaller(casadi_real a, casadi_real b) { return a < b || b != b ? a : b; }
+INLINE casadi_real larger(casadi_real a, casadi_real b) { return EITHER((a > b) | (b != b), a, b); }
+INLINE casadi_real smaller(casadi_real a, casadi_real b) { return EITHER((a < b) | (b != b), a, b); }
 
 /* fmin(fmax(v, low), high) without calls of the library: a v that is not a number becomes low there and here. */
 INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
-  casadi_real above = v > low ? v : low;
-  return above < high ? above : high;
+  casadi_real above = EITHER(v > low, v, low);
+  return EITHER(above < high, above, high);
 }
 
 /* c (rows, columns) += a (rows, inner) b (inner, columns) */
@@ -70,8 +64,8 @@ INLINE void transpose(Out restrict to, In restrict from, int rows, int columns) 
 INLINE void condense(Out q, Out cross, Out r, In p, In a, In b, Out turned) {
   casadi_real ahead[NS * NS], along[NS * NU], flat[NU * NS];
   int j;
-  for (j = 0; j < NS * NS; ++j) ahead[j] = 0;
-  for (j = 0; j < NS * NU; ++j) along[j] = 0;
+  for (j = 0; j < NS * NS; ++j) ahead[j] = ALL(0);
+  for (j = 0; j < NS * NU; ++j) along[j] = ALL(0);
   multiply(ahead, p, a, NS, NS, NS);
   multiply(along, p, b, NS, NS, NU);
   transpose(turned, a, NS, NS);
@@ -81,8 +75,9 @@ INLINE void condense(Out q, Out cross, Out r, In p, In a, In b, Out turned) {
   multiply(r, flat, along, NU, NS, NU);
 }
 
-INLINE int sane(In s0, In data, In lower, In upper) {
-  int l, ok = all_finite(s0, NS) && all_finite(data, (N + 1) * NT);
-  for (l = 0; l < NU; ++l) ok &= lower[l] <= upper[l] && lower[l] <= FINITE && upper[l] >= -FINITE;
+INLINE Truth sane(In s0, In data, In lower, In upper) {
+  int l;
+  Truth ok = all_finite(s0, NS) & all_finite(data, (N + 1) * NT);
+  for (l = 0; l < NU; ++l) ok &= (lower[l] <= upper[l]) & (lower[l] <= FINITE) & (upper[l] >= -FINITE);
   return ok;
 }

@@ -71,7 +71,9 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     texts.insert(1, linearise)
     sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
     constants = {**sizes, **_constants(settings, measures)}
-    return Driver("\n".join(texts), leaves, constants, _room(ocp, measures), in_place=(4, 2))  # the memory
+    return Driver(
+        "\n".join(texts), leaves, constants, _room(ocp, measures), in_place=(4, 2), side_by_side=False
+    )  # the memory
 
 
 def _room(ocp: OptimalControl, measures: Scales) -> int:

@@ -289,7 +289,7 @@ def tangent_code(rule: ChainRule, name: str, slopes: str, blocks: tuple[int, int
                 units.append(f"t[{row[n]}][{place}] += {factor};")
             else:
                 terms.append(f"{factor} * t[{row[place]}][j]" if factor != "1" else f"t[{row[place]}][j]")
-        lines.append(f"for (j = 0; j < {width}; ++j) t[{row[n]}][j] = {' + '.join(terms) or '0'};")
+        lines.append(f"for (j = 0; j < {width}; ++j) t[{row[n]}][j] = {' + '.join(terms) or 'ALL(0)'};")
         lines += units
     first = len(graph.between)
     return _TEXT.format(

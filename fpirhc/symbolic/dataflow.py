@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
@@ -26,8 +26,8 @@ _ONE = {
     ca.OP_INV: "(1./{0})", ca.OP_FABS: "fabs({0})", ca.OP_SQRT: "sqrt({0})",
 }  # fmt: skip
 _OF_ALL = {
-    ca.OP_MMIN: ("fmin({0},{1})", "INFINITY"), ca.OP_MMAX: ("fmax({0},{1})", "-INFINITY"),
-    ca.OP_NORMINF: ("fmax({0},fabs({1}))", "0"),
+    ca.OP_MMIN: ("fmin({0},{1})", math.inf), ca.OP_MMAX: ("fmax({0},{1})", -math.inf),
+    ca.OP_NORMINF: ("fmax({0},fabs({1}))", 0.0),
 }  # fmt: skip
 _NAMED = ("exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "log1p",
           "expm1", "floor", "ceil", "pow", "atan2", "hypot", "fmod", "copysign", "erf")  # fmt: skip
@@ -36,12 +36,43 @@ SCALAR = {
     **{getattr(ca, f"OP_{name.upper()}"): f"{name}({{0}}{',{1}' * (name in ('pow', 'atan2', 'hypot', 'fmod', 'copysign'))})"
        for name in _NAMED},
 }  # fmt: skip
+_SIDE_BY_SIDE = {
+    ca.OP_LT: "truth({0}<{1})", ca.OP_LE: "truth({0}<={1})", ca.OP_EQ: "truth({0}=={1})", ca.OP_NE: "truth({0}!={1})",
+    ca.OP_AND: "truth(({0}!=0)&({1}!=0))", ca.OP_OR: "truth(({0}!=0)|({1}!=0))", ca.OP_IF_ELSE_ZERO: "where({0}!=0,{1})",
+    ca.OP_NOT: "truth({0}==0)", ca.OP_SIGN: "either({0}<0, ALL(-1), either({0}>0, ALL(1), {0}))",
+}  # fmt: skip
+_ENDS = "(-INFINITY)", "INFINITY"
 _MOST = 4000  # instructions of scalar code that is written into its caller
 _SPLITS = (ca.OP_VERTSPLIT, ca.OP_HORZSPLIT)
 
 
 class Unwritten(Exception):
     """An operation that only CasADi writes."""
+
+
+class Words(NamedTuple):
+    """How C says operations and constants.
+
+    Args:
+        operations: by CasADi's number of them; `{0}` and `{1}` are the operands.
+        side_by_side: whether a value is a row of numbers, of loops side by side, as `lanes.c` says.
+    """
+
+    operations: Mapping[int, str]
+    side_by_side: bool
+
+    def constant(self, number: float) -> str:
+        """Return a number of an expression."""
+        text = f"{number:.16e}" if math.isfinite(number) else "NAN" if math.isnan(number) else _ENDS[number > 0]
+        return f"ALL({text})" if self.side_by_side else text
+
+    def entry(self, number: float) -> str:
+        """Return a number of a table."""
+        return f"ROW({number:.16e})" if self.side_by_side else f"{number:.16e}"
+
+
+ONE = Words(SCALAR, side_by_side=False)
+SIDE_BY_SIDE = Words({**SCALAR, **_SIDE_BY_SIDE}, side_by_side=True)
 
 
 class Callee(NamedTuple):
@@ -220,11 +251,13 @@ class Dataflow:
     Args:
         callee: returns how a Function is called that is not read into its caller.
         sites: in how many places of the whole program every Function is called, by its hash; see `call_sites`.
+        words: of the operations.
         tables: C text of constants, without their names.
     """
 
     callee: Callable[[ca.Function], Callee]
     sites: Counter[int]
+    words: Words
     tables: list[str] = field(default_factory=list)
 
     def region(self, function: ca.Function, inputs: Sequence[Value]) -> Region:
@@ -284,9 +317,9 @@ class Dataflow:
             return whole(self._constant([float(v) for v in made.to_DM().nonzeros()]))
         if code in _OF_ALL:
             text, start = _OF_ALL[code]
-            node = Operation(1, code=text, operands=(operands[0],), start=start)
+            node = Operation(1, code=text, operands=(operands[0],), start=self.words.constant(start))
         elif {length(value) for value in operands} <= {1, made.nnz()} and (code in _TWO or code in _ONE):
-            node = Operation(made.nnz(), code=_TWO.get(code) or _ONE[code], operands=tuple(operands))
+            node = Operation(made.nnz(), code=self.words.operations[code], operands=tuple(operands))
         else:
             raise Unwritten
         node.region = region
@@ -296,10 +329,9 @@ class Dataflow:
     def _constant(self, values: list[float]) -> Node:
         if not all(map(math.isfinite, values)):
             raise Unwritten
-        texts = [f"{value:.16e}" for value in values]
         if len(values) == 1:
-            return Node(1, f"=({texts[0]})")
-        table = f"[{len(values)}] = {{{', '.join(texts)}}};"
+            return Node(1, f"=({self.words.constant(values[0])})")
+        table = f"[{len(values)}] = {{{', '.join(map(self.words.entry, values))}}};"
         if table not in self.tables:
             self.tables.append(table)
         return Node(len(values), f"flat_table_{self.tables.index(table)}")

@@ -32,9 +32,25 @@ OF_TYPE = """#include <float.h>
 #define FINITE (OF_TYPE(DBL_MAX, FLT_MAX) / 134217728)
 #define TINY (OF_TYPE(DBL_MIN, FLT_MIN) * 67108864)
 """
+# The words with which loops are written once for one number at a time and for numbers side by side (`lanes.c` has those).
+WORDS = """#if defined(__GNUC__)
+#define INLINE static inline __attribute__((always_inline)) /* so that sizes are constants in every loop */
+#else
+#define INLINE static inline
+#endif
+typedef int Truth;
+typedef long long Mask; /* a truth as wide as a number */
+typedef casadi_real Number; /* of a table */
+#define YES 1
+#define NO 0
+#define NOT(m) (!(m))
+#define ANY(m) (m)
+#define EVERY(m) (m)
+#define EITHER(m, a, b) ((m) ? (a) : (b))
+#define ALL(a) (a)
+"""
 _LARGE_OR_SMALL = re.compile(r"(?<![\w.])\d\.\d{16}e[+-](?:[3-9]\d|\d{3})\b")
-_drivers: dict[str, str] = {}
-_needs: dict[str, tuple[int, tuple[int, int] | None]] = {}
+_drivers: dict[str, tuple[Driver, str]] = {}
 _LATEST: Latest[ca.Function] = Latest(16)
 
 
@@ -45,10 +61,12 @@ class Driver:
     Args:
         text: C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys.
             ROOM is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw.
+            Truths are written by `WORDS`, so that the same text computes numbers side by side.
         leaves: generated Functions by key.
         constants: preprocessor definitions by name.
         room: numbers that the driver needs in w.
         in_place: (argument, result) that may lie at one place: the argument is not read after the result is begun.
+        side_by_side: whether the text keeps to `WORDS`.
     """
 
     text: str
@@ -56,6 +74,7 @@ class Driver:
     constants: Mapping[str, object]
     room: int = 0
     in_place: tuple[int, int] | None = None
+    side_by_side: bool = True
 
     def source(self) -> str:
         """Return the whole C file, in which the entry is called ENTRY."""
@@ -63,12 +82,16 @@ class Driver:
         named = [renamed(leaf, f"fpirhc_leaf_{name}") for name, leaf in self.leaves.items()]
         for leaf in named:
             generator.add(leaf)
-        lines = [f"#define {name} {value}" for name, value in self.constants.items()]
-        lines += [f"#define {name} fpirhc_leaf_{name}" for name in self.leaves]
-        lines.append(f"#define ROOM {self.room}")
         # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
         generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
-        return "\n".join([of_type(generated), *lines, _FAST, self.text])
+        return "\n".join(
+            [of_type(generated), WORDS, self.around({name: f"fpirhc_leaf_{name}" for name in self.leaves})]
+        )
+
+    def around(self, leaves: Mapping[str, str]) -> str:
+        """Return the loops and their definitions, for leaves that stand before under these names."""
+        defined = {**self.constants, **leaves, "ROOM": self.room}
+        return "\n".join([*(f"#define {name} {value}" for name, value in defined.items()), _FAST, self.text])
 
 
 def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
@@ -81,7 +104,7 @@ def registered(name: str, driver: Driver) -> str:
     """Return the unique name of a driver: a Function of this name has it as its body in C."""
     source = driver.source()
     unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
-    _drivers[unique], _needs[unique] = source, (driver.room, driver.in_place)
+    _drivers[unique] = driver, source
     return unique
 
 
@@ -127,12 +150,18 @@ def is_driver(name: str) -> bool:
 
 def entry_of(name: str) -> tuple[str, int, tuple[int, int] | None]:
     """Return the name of the C function of a driver, the numbers that it needs in w, and what may lie at one place."""
-    return f"{name}_driver", *_needs[name]
+    driver = driver_of(name)
+    return f"{name}_driver", driver.room, driver.in_place
+
+
+def driver_of(name: str) -> Driver:
+    """Return the driver of a Function of this name."""
+    return _drivers[name][0]
 
 
 def file_of(name: str) -> str:
     """Return the C file of a driver."""
-    return f"#define ENTRY {name}_driver\n{_drivers[name]}"
+    return f"#define ENTRY {name}_driver\n{_drivers[name][1]}"
 
 
 def renamed(function: ca.Function, name: str) -> ca.Function:
@@ -144,33 +173,38 @@ def renamed(function: ca.Function, name: str) -> ca.Function:
 
 _TEXT = f"""
 int ENTRY{SIGNATURE} {{
-  casadi_real sums[8] = {{0, 0, 0, 0, 0, 0, 0, 0}}, total = 0;
-  const casadi_real large = 134217728;
+  casadi_real sums[8], total = ALL(0);
+  const Number large = 134217728;
   const casadi_real* x = arg[0];
   int k = 0, j;
+  for (j = 0; j < 8; ++j) sums[j] = ALL(0);
   for (; k + 8 <= SIZE; k += 8)
     for (j = 0; j < 8; ++j) sums[j] += x[k + j] * large - x[k + j] * large;
   for (; k < SIZE; ++k) total += x[k] * large - x[k] * large;
   for (j = 0; j < 8; ++j) total += sums[j];
-  if (res[0]) res[0][0] = total == 0;
+  if (res[0]) res[0][0] = EITHER(total == 0, ALL(1), ALL(0));
   return 0;
 }}
 """
 
 _KEPT = f"""
 int ENTRY{SIGNATURE} {{
-  casadi_real sums[8] = {{0, 0, 0, 0, 0, 0, 0, 0}}, total = 0;
-  const casadi_real large = 134217728;
+  casadi_real sums[8], total = ALL(0);
+  const Number large = 134217728;
   const casadi_real *x = arg[0], *old = arg[1];
   casadi_real* kept = res[0];
+  Truth good;
   int k = 0, j;
+  for (j = 0; j < 8; ++j) sums[j] = ALL(0);
   for (; k + 8 <= SIZE; k += 8)
     for (j = 0; j < 8; ++j) {{ kept[k + j] = x[k + j]; sums[j] += x[k + j] * large - x[k + j] * large; }}
   for (; k < SIZE; ++k) {{ kept[k] = x[k]; total += x[k] * large - x[k] * large; }}
   for (j = 0; j < 8; ++j) total += sums[j];
-  if (res[1]) res[1][0] = total == 0;
-  if (!(total == 0 && arg[2][0]))
-    for (k = 0; k < SIZE; ++k) kept[k] = old[k];
+  good = total == 0;
+  if (res[1]) res[1][0] = EITHER(good, ALL(1), ALL(0));
+  good &= arg[2][0] != 0;
+  if (!EVERY(good))
+    for (k = 0; k < SIZE; ++k) kept[k] = EITHER(good, kept[k], old[k]);
   return 0;
 }}
 """

@@ -14,7 +14,7 @@ from itertools import pairwise
 import casadi as ca
 
 from fpirhc.symbolic.dataflow import (
-    SCALAR,
+    ONE,
     Call,
     Callee,
     Choice,
@@ -24,6 +24,7 @@ from fpirhc.symbolic.dataflow import (
     Region,
     Unwritten,
     Value,
+    Words,
     branches_of,
     call_sites,
     is_graph,
@@ -50,14 +51,15 @@ class FlatCode:
 
     Args:
         outside: returns how a Function is called that is not written here.
+        words: of the operations.
 
     Attributes:
         texts: C functions, callees first.
         tables: C text of constants, without their names.
     """
 
-    def __init__(self, outside: Callable[[ca.Function], Callee]) -> None:
-        self._outside = outside
+    def __init__(self, outside: Callable[[ca.Function], Callee], words: Words = ONE) -> None:
+        self._outside, self._words = outside, words
         self.texts: list[str] = []
         self.tables: list[str] = []
         self._known: dict[int, Callee] = {}
@@ -70,17 +72,20 @@ class FlatCode:
             self._sites = call_sites(function)
         if key not in self._known:
             composed = is_graph(function) or branches_of(function) is not None or (always and is_written(function))
-            self._known[key] = self._written(function) if composed else self._outside(function)
+            self._known[key] = self.written(function) if composed else self._outside(function)
         return self._known[key]
 
-    def _written(self, function: ca.Function) -> Callee:
+    def written(self, function: ca.Function) -> Callee:
+        """Write a graph, a choice, or scalar code of known operations."""
         inputs = [Node(function.nnz_in(k), f"a{k}") for k in range(function.n_in())]
         try:
-            region = Dataflow(self.callee, self._sites, self.tables).region(function, [whole(node) for node in inputs])
+            region = Dataflow(self.callee, self._sites, self._words, self.tables).region(
+                function, [whole(node) for node in inputs]
+            )
         except Unwritten:
             return self._outside(function)
         name = f"flat_{len(self.texts)}"
-        text, room = _Writer(region).text()
+        text, room = _Writer(region, self._words).text()
         self.texts.append(f"/* {function.name()} */\n{HEAD.format(name)}{text}")
         return Callee(name, (function.n_in(), function.n_out()), room, sure=True)
 
@@ -88,8 +93,8 @@ class FlatCode:
 class _Writer:
     """The text of one function."""
 
-    def __init__(self, region: Region) -> None:
-        self._region, self._placed = region, Placement(region)
+    def __init__(self, region: Region, words: Words) -> None:
+        self._region, self._placed, self._words = region, Placement(region, apart=words.side_by_side), words
         self._lines: list[str] = []
         self._filled: set[Node] = set()
 
@@ -177,25 +182,40 @@ class _Writer:
             if what == ca.OP_INPUT:
                 text = given[read[0]][read[1]]
             elif what == ca.OP_CONST:
-                text = f"{code.instruction_constant(k):.16e}"
+                text = self._words.constant(code.instruction_constant(k))
             else:
-                text = SCALAR[what].format(*(f"s{i}" for i in read))
+                text = self._words.operations[what].format(*(f"s{i}" for i in read))
             places.add(made[0])
             lines.append(f"s{made[0]} = {text}")
         lines.insert(0, f"casadi_real {', '.join(f's{k}' for k in sorted(places))}")
         self._lines.extend([f"{indent}{{\n", *(f"{indent}  {line};\n" for line in lines if places), f"{indent}}}\n"])
 
     def _choice(self, step: Choice, indent: str) -> None:
-        condition = _entry(step.condition[0].node, step.condition[0].at)
-        for head, inner in zip((f"if ((casadi_int){condition})", "else"), step.regions, strict=True):
+        condition, side_by_side = _entry(step.condition[0].node, step.condition[0].at), self._words.side_by_side
+        heads = f"if ((casadi_int){condition})", "else"
+        if side_by_side:  # both, where some go one way and some the other
+            self._lines.append(f"{indent}{{ const M first = {condition} != 0;\n")
+            heads = "if (ANY(first))", "if (!EVERY(first))"
+        for head, inner in zip(heads, step.regions, strict=True):
             self._lines.append(f"{indent}{head} {{\n")
             self._write(inner, f"{indent}  ")
             for node, value in zip(step.results, inner.outputs, strict=True):
                 if node in self._placed.pointed:
                     self._lines.append(f"{indent}  {node.base} = {_pointer(value[0].node, value[0].at)};\n")
+                elif side_by_side and inner is step.regions[1]:
+                    self._blend(value, node, f"{indent}  ")
                 else:
                     self._copy(value, node, f"{indent}  ")
             self._lines.append(f"{indent}}}\n")
+        self._lines.append(f"{indent}}}\n" * side_by_side)
+
+    def _blend(self, value: Value, target: Node, indent: str) -> None:
+        """Copy a value where the first way was not gone."""
+        at = 0
+        for node, begin, size in value:
+            place = _entry(target, at, "i")
+            self._loop(size, place, f"either(first, {place}, {_entry(node, begin, 'i')})", indent)
+            at += size
 
 
 def _expression(step: Operation, at: int, index: str) -> str:

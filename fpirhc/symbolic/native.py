@@ -24,7 +24,7 @@ from pathlib import Path
 import casadi as ca
 
 from fpirhc.errors import CompileError, NoCode
-from fpirhc.symbolic import driver, flat_code, program
+from fpirhc.symbolic import dataflow, driver, flat_code, placement, program
 from fpirhc.symbolic.program import NAME, generate
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
@@ -222,7 +222,10 @@ def _note(function: ca.Function, compiler: str, more: Sequence[str], calls: int)
 @cache
 def _writer() -> str:
     """Hash of the code that writes C."""
-    files = (Path(__file__), *(Path(module.__file__ or "") for module in (driver, flat_code, program)))
+    files = (
+        Path(__file__),
+        *(Path(module.__file__ or "") for module in (dataflow, driver, flat_code, placement, program)),
+    )
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -270,11 +273,11 @@ def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) ->
     return key, _loaded[key]
 
 
-def shared_library(source: str, flags: Sequence[str] = (), libraries: Sequence[str] = ()) -> Path:
-    """Return the path of a library of one C file, compiled where it is not in the cache.
+def shared_library(sources: Sequence[str], flags: Sequence[str] = (), libraries: Sequence[str] = ()) -> Path:
+    """Return the path of a library of C files, compiled where it is not in the cache.
 
     Args:
-        source: C.
+        sources: C; all but the first may be shared with other libraries.
         flags: for the compiler, after its usual ones.
         libraries: for the linker, such as '-lm'.
 
@@ -284,11 +287,11 @@ def shared_library(source: str, flags: Sequence[str] = (), libraries: Sequence[s
     compiler = find_compiler()
     if compiler is None:
         raise CompileError(_why_no_compiler())
-    unit, link = _unit(source, compiler, flags), (compiler, *flags, *_LINK)
-    key = hashlib.sha256("\0".join((unit.key, *link, *libraries)).encode()).hexdigest()[:32]
+    units, link = [_unit(source, compiler, flags) for source in sources], (compiler, *flags, *_LINK)
+    key = hashlib.sha256("\0".join((*(unit.key for unit in units), *link, *libraries)).encode()).hexdigest()[:32]
     path = cache_folder() / f"{key}{_suffix()}"
     if not _is_intact(path):
-        _compile([unit], link, path, libraries)
+        _compile(units, link, path, libraries)
     return path
 
 

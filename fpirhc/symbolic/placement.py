@@ -33,6 +33,10 @@ class Place:
 class Placement:
     """Decides where everything lies that a region computes.
 
+    Args:
+        region: of a function.
+        apart: whether the ends of a choice lie apart from its results, which are mixed of both.
+
     Attributes:
         uses: how often every node is read.
         pointed: results of a choice between values that stay where they are: a pointer tells which one it is.
@@ -40,7 +44,8 @@ class Placement:
         room: numbers of work in all.
     """
 
-    def __init__(self, region: Region) -> None:
+    def __init__(self, region: Region, *, apart: bool = False) -> None:
+        self._apart = apart
         self.uses: Counter[Node] = Counter()
         self.pointed: set[Node] = set()
         self.callees: dict[Call, int] = {}
@@ -91,7 +96,7 @@ class Placement:
                     node.base = self._own(node.size)
             for inner in step.regions:
                 for node, value in zip(step.results, inner.outputs, strict=True):
-                    if node not in self.pointed:
+                    if node not in self.pointed and not self._apart:
                         self._claim(value, node.base, node.offset, inner)
                 self._settle(inner)
 
@@ -110,7 +115,7 @@ class Placement:
 
     def _is_pointer(self, step: Step, k: int) -> bool:
         """Whether a result is one of two values that stay where they are."""
-        if not isinstance(step, Choice) or step.results[k].size == 1:
+        if self._apart or not isinstance(step, Choice) or step.results[k].size == 1:
             return False
         ends = [inner.outputs[k] for inner in step.regions]
         if not all(len(end) == 1 and _stays(end[0].node) for end in ends):

@@ -85,6 +85,16 @@ CASES = {
         replace(TWO_MASS.problem, dead_time=fp.DeadTime(inputs={"Q1": 5e-3, "Q2": 2.5e-3})),
         fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Increment(fp.Affine(gain=-0.5), cycles=(5.0, 2.5))),
     ),
+    "plans": (TWO_MASS.problem, TWO_MASS.controllers["RHC+FPI"]),
+    "plans at limits": (
+        replace(
+            TWO_MASS.problem,
+            duration=3.0,
+            measure_from=1.0,
+            limits=fp.Limits(inputs={"Q1": (-40.0, 40.0), "Q2": (-5.0, 5.0)}),
+        ),
+        TWO_MASS.controllers["RHC+FPI"],
+    ),
     "map": (FISHERY.problem, next(c for n, c in FISHERY.controllers.items() if n.startswith("CTC"))),
 }
 
@@ -94,12 +104,16 @@ def plants(ready: Simulator, count: int, share: float = 0.2) -> np.ndarray:
     return exact * (1 + share * np.random.default_rng(0).uniform(-1, 1, (count, exact.size)))
 
 
-def by_itself(ready: Simulator, exact: np.ndarray) -> tuple[np.ndarray, np.ndarray, str | None]:
-    """Rms and largest error and the end of the ordinary run."""
+def by_itself(ready: Simulator, exact: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, int], str | None]:
+    """Rms and largest error, cycles by status, and the end of the ordinary run."""
     variant = ready.problem.with_exact(exact)
     run = ready.run(seed=0, variant=variant)
     errors = measured_errors(variant, run)
-    return np.sqrt(np.mean(errors**2, axis=0)), np.max(np.abs(errors), axis=0), run.stop
+    statuses = {
+        fp.Status(int(one)).name: int(count)
+        for one, count in zip(*np.unique(run["status"], return_counts=True), strict=True)
+    }
+    return np.sqrt(np.mean(errors**2, axis=0)), np.max(np.abs(errors), axis=0), statuses, run.stop
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -115,10 +129,12 @@ def test_errors_are_those_of_the_ordinary_loop(name):
     assert many.lanes > 1, many.why
     assert not many.stops
     for k in (0, 3, 10):
-        rms, largest, stop = by_itself(ready, exact[k])
+        rms, largest, statuses, stop = by_itself(ready, exact[k])
         assert stop is None
         np.testing.assert_allclose([v[k] for v in many.rms_error.values()], rms, rtol=close)
         np.testing.assert_allclose([v[k] for v in many.max_error.values()], largest, rtol=close)
+        counted = {status: int(count[k]) for status, count in many.statuses.items() if count[k]}
+        assert counted == statuses
 
 
 def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
@@ -132,7 +148,7 @@ def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
     calm = run_many(ready, exact)
     exact[5, place] *= 0.05
     many = run_many(ready, exact)
-    assert dict(many.stops) == {5: by_itself(ready, exact[5])[2]}
+    assert dict(many.stops) == {5: by_itself(ready, exact[5])[-1]}
     assert np.isnan(many.rms_error["q1"][5])
     kept = np.arange(8) != 5
     for name in ("q1", "q2"):
@@ -141,10 +157,14 @@ def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
 
 @pytest.mark.parametrize(
     ("controller", "compiler", "why"),
-    [("RHC", True, "the loop has a plan, a table or a solver in it"), ("CTC", False, "there is no C compiler")],
+    [
+        ("RHC", True, "the loop has a part that is not written for lanes: fpirhc_"),
+        ("CTC", False, "there is no C compiler"),
+    ],
 )
 def test_without_lanes_the_errors_are_the_same_and_it_says_why(controller, compiler, why, monkeypatch):
-    problem = replace(TWO_MASS.problem, duration=0.5, measure_from=0.1)
+    limits = fp.Limits(states={"q1": (-9.0, 9.0)} if compiler else {})
+    problem = replace(TWO_MASS.problem, duration=0.5, measure_from=0.1, limits=limits)
     ready = fp.simulator(problem, TWO_MASS.controllers[controller], compiled=compiler)
     if not compiler:
         monkeypatch.setenv("FPIRHC_CC", "none")

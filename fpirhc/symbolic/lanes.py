@@ -1,0 +1,111 @@
+"""Composed Functions as C in which every value is a row of numbers, one of each of the loops that run side by side.
+
+Theory: docs/theory-plants.md, "Many plants side by side".
+"""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+from collections.abc import Sequence
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import casadi as ca
+
+from fpirhc.errors import CompileError, NoCode
+from fpirhc.symbolic.dataflow import SIDE_BY_SIDE, Callee
+from fpirhc.symbolic.driver import SIGNATURE, driver_of, entry_of, is_driver
+from fpirhc.symbolic.flat_code import FlatCode
+from fpirhc.symbolic.native import shared_library
+
+_KNOWN = {*SIDE_BY_SIDE.operations, ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST}
+
+
+def written_in_lanes(function: ca.Function) -> tuple[tuple[str, ...], Callee]:
+    """Return the C files of a Function, in which LANES is to be defined, and how it is called in the first one.
+
+    The others are the loops of optimisers. Every argument and result needs an address.
+
+    Raises:
+        NoCode: a part of it is not written for lanes.
+    """
+    own = _File()
+    inner = own.flat.callee(function, always=True)
+    return (own.text(), *map(_driver_file, own.drivers)), inner
+
+
+def lanes_library(sources: Sequence[str]) -> tuple[ctypes.CDLL, int]:
+    """Compile C files for the widest registers of this machine; return the library and how many lanes it has.
+
+    It has the vector library of the system where that can be linked.
+
+    Raises:
+        CompileError: neither with it nor without it.
+    """
+    lanes, flags = _registers()
+    try:
+        path = shared_library(sources, (f"-DLANES={lanes}", *flags, "-DVECTOR_LIBRARY"), ("-lmvec",))
+    except CompileError:
+        path = shared_library(sources, (f"-DLANES={lanes}", *flags))
+    return ctypes.CDLL(str(path)), lanes
+
+
+@cache
+def _registers() -> tuple[int, tuple[str, ...]]:
+    """How many numbers a vector register of this machine holds, and the compiler's flags for that."""
+    try:
+        facts = Path("/proc/cpuinfo").read_text(encoding="utf-8") if platform.machine() == "x86_64" else ""
+    except OSError:
+        facts = ""
+    if " avx512dq " in facts:
+        return 8, ("-mavx512f", "-mavx512dq", "-mprefer-vector-width=512")
+    return (4, ("-mavx2",)) if " avx2 " in facts else (2, ())
+
+
+class _File:
+    """The functions of one file."""
+
+    def __init__(self) -> None:
+        self.drivers: list[str] = []
+        self.flat = FlatCode(self._outside, SIDE_BY_SIDE)
+
+    def _outside(self, function: ca.Function) -> Callee:
+        """How that is called which is no graph.
+
+        Raises:
+            NoCode: it is not written for lanes.
+        """
+        name = function.name()
+        if is_driver(name) and driver_of(name).side_by_side:
+            if name not in self.drivers:
+                self.drivers.append(name)
+            entry, room, in_place = entry_of(name)
+            return Callee(entry, (function.n_in(), function.n_out()), room, in_place=in_place)
+        if function.is_a("SXFunction"):
+            known = {function.instruction_id(k) for k in range(function.n_instructions())} <= _KNOWN
+            if known:
+                return self.flat.written(function)
+        raise NoCode(f"the loop has a part that is not written for lanes: {name}")
+
+    def text(self) -> str:
+        """The functions that are written so far, with what they need."""
+        tables = [f"static const casadi_real flat_table_{k}{table}\n" for k, table in enumerate(self.flat.tables)]
+        declared = [f"int {entry_of(name)[0]}{SIGNATURE};\n" for name in self.drivers]
+        return "".join([_words(), *tables, *declared, *self.flat.texts])
+
+
+def _driver_file(name: str) -> str:
+    """The loops of an optimiser, around leaves that are written for lanes."""
+    driver, own = driver_of(name), _File()
+    leaves = {key: own.flat.callee(leaf, always=True) for key, leaf in driver.leaves.items()}
+    if own.drivers or any(leaf.room for leaf in leaves.values()):
+        raise NoCode(f"the loop has a part that is not written for lanes: a stage of {name}")
+    around = driver.around({key: leaf.name for key, leaf in leaves.items()})
+    return f"#define ENTRY {entry_of(name)[0]}\n{own.text()}{around}"
+
+
+@cache
+def _words() -> str:
+    return resources.files("fpirhc.symbolic").joinpath("lanes.c").read_text(encoding="utf-8")
