@@ -26,7 +26,7 @@ from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each, is_late, scaled
 from fpirhc.simulation.linearise.asked_loop import AskedLoop, near_fixed_point
-from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearCycle, LinearLoop
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.latest import Latest
 from fpirhc.task.problem import Problem
@@ -118,8 +118,8 @@ class Points:
     """A closed loop at points of the reference, with its map as it is near the fixed point."""
 
     def __init__(self, grid: ReviewGrid, controller: Controller, problem: Problem | None = None) -> None:
-        """Compose the loop, of the grid's problem or of the same one with its reality."""
-        self.grid, self.asked = grid, AskedLoop(problem or grid.problem, near_fixed_point(controller))
+        """Compose the loop of a controller `near_fixed_point`, of the grid's problem or of the same one with its reality."""
+        self.grid, self.asked = grid, AskedLoop(problem or grid.problem, controller)
         self._loops: dict[tuple[int, int], LinearLoop] = {}
         self._quiets: dict[tuple[int, int], np.ndarray] = {}
         self._ideals: dict[int, LinearLoop] = {}
@@ -152,6 +152,10 @@ class Points:
     def noisy(self, place: int, kept: np.ndarray) -> LinearLoop:
         """Return the linear loop at a point behind the noise of the sensors, see `AskedLoop.noisy`."""
         return self.asked.noisy(self.quiet(place), kept)
+
+    def shaken(self, place: int, corners: Sequence[tuple[float, float]]) -> tuple[LinearLoop, ...]:
+        """Return the linear loops at a point behind noise of the response that the map sees, see `AskedLoop.shaken`."""
+        return self.asked.shaken(self.quiet(place), corners)
 
     def quiet(self, place: int, draw: int = 0) -> np.ndarray:
         """Return the memory at a point, with the parameters of a draw."""
@@ -215,8 +219,8 @@ class Points:
 
 def points_of(grid: ReviewGrid, controller: Controller) -> Points:
     """Return the closed loop at the grid's points; the last ones are kept, because several questions ask the same loop."""
-    same, equal = (grid.problem, grid.states), (identity(near_fixed_point(controller)),)
-    return _LATEST.of(same, equal, lambda: Points(grid, controller))
+    linear = near_fixed_point(controller)
+    return _LATEST.of((grid.problem, grid.states), (identity(linear),), lambda: Points(grid, linear))
 
 
 _LATEST: Latest[Points] = Latest(8)
@@ -337,8 +341,7 @@ class LoopsByGain:
         """Return the loop at another effective gain."""
         low, own = pair
         share = (gain - self.gains[1]) / (self.gains[1] - self.gains[0])
-        cycles = (_mixed(one, other, share) for one, other in zip(own.cycles, low.cycles, strict=True))
-        return replace(own, cycles=tuple(cycles))
+        return own.mixed(low, share)
 
     def stable(self, gain: float, pair: Pair) -> bool:
         """Whether no mode grows with an effective gain but one that grows with all of them, too little to show in the run."""
@@ -373,14 +376,6 @@ def loops_by_gain(grid: ReviewGrid, controller: Controller, own: Loops) -> Loops
     except (FpirhcError, np.linalg.LinAlgError):
         return None
     return loops
-
-
-def _mixed(first: LinearCycle, second: LinearCycle, share: float) -> LinearCycle:
-    def mixed(name: str) -> np.ndarray:
-        one, other = getattr(first, name), getattr(second, name)
-        return np.asarray(one + share * (one - other))
-
-    return replace(first, dynamics=mixed("dynamics"), entry=mixed("entry"), arriving=mixed("arriving"))
 
 
 _WAYS = (-0.25, 0.5, 1.0, 1.25)  # of the way from the nominal response to the request that the plant needs

@@ -14,26 +14,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.by_name import FoundByName
-from fpirhc.contraction.spectrum import Array, response_jacobians
+from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import refuse_without, resolved, without_deformation
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
-from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, NotContractive, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, review_grid
-from fpirhc.review.loops import loops_along, points_of, thinned
+from fpirhc.review.loops import Points, points_of, spectrum_near, thinned, usable
 from fpirhc.review.prediction import TRIED
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.sensing.base import response_names
+from fpirhc.simulation.linearise.asked_loop import behind_noise
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.trials import Trials, harm_in
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
 RINGING = 6.0  # kappa: damping 0.2, between 4 and 8, beyond which tracking gains nothing
-_BISECTIONS = 50
+_TRIED, _BISECTIONS = 49, 40  # gains, and parts of the way between two of them
+_PLACES = 9  # points of the reference
 _SMALLEST = 1e-6  # of the deadbeat gain
 
 
@@ -95,16 +97,15 @@ def suggest(
     Raises:
         InvalidValue: a budget that is not positive, a negative noise or ringing, no noise, as of a response that is estimated,
         whose noise must be given. InvalidName: unknown input or coordinate. NotSupported: a controller without adaptation.
-        NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
+        NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits; a budget that no gain keeps.
     """
-    found = within_budget(problem, controller, chatter=chatter, noise=noise, ringing=ringing)
+    found = _within_budget(problem, controller, chatter, noise, ringing)
     return replace(found, harm=_harm(problem, controller, found.deformation))
 
 
-def within_budget(
+def _within_budget(
     problem: Problem,
     controller: Controller,
-    *,
     chatter: float | Mapping[str, float],
     noise: Mapping[str, float] | None = None,
     ringing: float = RINGING,
@@ -115,18 +116,21 @@ def within_budget(
     budget = _allowed(problem, chatter)
     grid = review_grid(problem, 0.0, 0)
     noisy = noisy_points(grid, ready, noise)
-    sign, largest = _largest_eigenvalue(noisy.jacobians)
+    believed = ready.plant_model(problem).parameters(problem.plant)
+    sign, largest = _largest_eigenvalue(
+        spectrum_near(grid, believed, grid.draws[:1], ready.deformation.iteration, near=False)
+    )
 
-    def fits(size: float) -> bool:
-        return bool((noisy.steps(sign * size, filter_pole(size * largest, ringing)) <= budget).all())
+    def steps(size: float) -> np.ndarray:
+        return noisy.steps(sign * size, filter_pole(size * largest, ringing))
 
-    size = _largest_within(fits, 1 / largest)
+    size = _largest_within(steps, budget, 1 / largest)
     pole = filter_pole(size * largest, ringing)
     deformation = _with(ready.deformation, sign * size, pole)
     own = getattr(deformation, deformation.gain_name, None)
     name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
     predicted = dict(zip(problem.plant.inputs, map(float, noisy.steps(sign * size, pole)), strict=True))
-    floor = _floor(loops_along(grid, ready).ideal, noisy, problem)
+    floor = noisy.errors(sign * size, pole, problem)
     return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
 
 
@@ -160,25 +164,36 @@ def _allowed(problem: Problem, chatter: float | Mapping[str, float]) -> np.ndarr
     return np.array([float(budgets.get(name, math.inf)) for name in inputs])
 
 
-def _largest_eigenvalue(jacobians: np.ndarray) -> tuple[float, float]:
+def _largest_eigenvalue(spectrum: Spectrum) -> tuple[float, float]:
     """Sign of the gain, and the inverse of the deadbeat gain: the largest |lambda|^2 / |Re lambda|."""
-    values = np.linalg.eigvals(jacobians).ravel()
-    if values.real.min() * values.real.max() <= 0:
+    values, low, high = spectrum.eigenvalues, spectrum.smallest_real, spectrum.largest_real
+    if low * high <= 0:
         raise NotContractive(
-            f"the response Jacobian has eigenvalues with real parts from {values.real.min():.4g} to {values.real.max():.4g} along "
-            "the reference: no gain converges"
+            f"the response Jacobian has eigenvalues with real parts from {low:.4g} to {high:.4g} along the reference: no "
+            "gain converges"
         )
-    return float(np.sign(values.real[0])), float((np.abs(values) ** 2 / np.abs(values.real)).max())
+    return math.copysign(1.0, low), float((np.abs(values) ** 2 / np.abs(values.real)).max())
 
 
-def _largest_within(fits: Callable[[float], bool], most: float) -> float:
-    low, high = _SMALLEST * most, most
-    if fits(high):
-        return high
-    for _ in range(_BISECTIONS):
+def _largest_within(steps: Callable[[float], np.ndarray], budget: np.ndarray, most: float) -> float:
+    """The largest gain within the budget, sought downwards: with a small one the loop itself may grow."""
+
+    def fits(size: float) -> bool:
+        return bool((steps(size) <= budget).all())
+
+    sizes = most * np.geomspace(1.0, _SMALLEST, _TRIED)
+    place = next((k for k, size in enumerate(sizes) if fits(size)), None)
+    if place is None:
+        least = min(float((steps(size) / budget).max()) for size in sizes)
+        raise NotContractive(
+            f"no gain is within the budget: its chatter is at least {least:.3g} times as large with every gain with which the loop "
+            "converges; allow more, or measure with less noise"
+        )
+    low, high = sizes[place], sizes[max(place - 1, 0)]
+    for _ in range(_BISECTIONS if place else 0):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if fits(middle) else (low, middle)
-    return low
+    return float(low)
 
 
 def _with(deformation: Deformation, gain: float, pole: float) -> Deformation:
@@ -192,59 +207,55 @@ def _with(deformation: Deformation, gain: float, pole: float) -> Deformation:
     return with_inner(deformation, _with(inner, gain, pole))
 
 
-def _floor(ideal: LinearLoop | None, noisy: Noisy, problem: Problem) -> dict[str, float]:
-    """Rms of the coordinates in the loop with the right model, with noise at the response."""
-    plant = problem.plant
-    if ideal is None or ideal.radius >= 1:
-        return dict.fromkeys(plant.controlled_names, math.nan)
-    spread = ideal.spread(noisy.inverses[0] @ noisy.covariance @ noisy.inverses[0].T)
-    sizes = np.sqrt(np.diag(ideal.errors @ spread @ ideal.errors.T))
-    judged = dict(zip(problem.judged_names, map(float, sizes), strict=True))
-    return {c: judged.get(c, math.nan) for c in plant.controlled_names}
-
-
-_JACOBIANS = 9  # points of the reference
 _DRAWN = 20_000  # values of a noise, whose spread is its deviation
+_POLE = 0.5  # of the filter of loops from which those of others are interpolated
 
 
 @dataclass(frozen=True, eq=False)
 class Noisy:
-    """Points of the reference; build it with `noisy_points`.
+    """Linear loops behind noise of the response that the map sees; build it with `noisy_points`.
 
-    Parameters: jacobians J W (points, n, n), inverses B: the model's inputs per unit of response (points, nu, n),
-    covariance (n, n) of the noise, moved: B W, the inputs per unit of a step of the map (points, nu, n).
+    The matrices of a cycle are affine in the gain and in the pole of the filter of its error, so four loops are those of all.
+
+    Parameters: corners: loops of each point for (a / 2, 0), (a, 0), (a / 2, pole), (a, pole) of the map's own gain a;
+    gain: a; covariance (n, n) of the noise.
     """
 
-    jacobians: np.ndarray
-    inverses: np.ndarray
+    corners: tuple[tuple[LinearLoop, ...], ...]
+    gain: float
     covariance: np.ndarray
-    moved: np.ndarray
 
     def steps(self, gain: float, pole: float) -> np.ndarray:
-        """Return the rms step of every input (nu,), the largest of all points.
+        """Return the rms step of every input (nu,), the largest of all points; infinite where noise grows."""
+        return np.asarray(np.max([one.steps(self.covariance) for one in self._loops(gain, pole)], axis=0))
 
-        Raises:
-            NotContractive: gain and pole with which noise grows.
-        """
-        spreads = [noise_spread(j, self.covariance, gain, pole).step for j in self.jacobians]
-        covariances = [b @ s @ b.T for b, s in zip(self.moved, spreads, strict=True)]
-        return np.asarray(np.sqrt(np.max([np.diag(m) for m in covariances], axis=0)))
+    def errors(self, gain: float, pole: float, problem: Problem) -> dict[str, float]:
+        """Return the rms error from noise by controlled coordinate, the largest of all points; NaN of what is not judged."""
+        spreads = [one.errors @ one.spread(self.covariance) @ one.errors.T for one in self._loops(gain, pole)]
+        rms = np.sqrt(np.max([np.diag(one) for one in spreads], axis=0))
+        judged = dict(zip(problem.judged_names, map(float, rms), strict=True))
+        return {c: judged.get(c, math.nan) for c in problem.plant.controlled_names}
+
+    def _loops(self, gain: float, pole: float) -> list[LinearLoop]:
+        share = 2 * (gain / self.gain - 1)
+        return [b.mixed(a, share).mixed(d.mixed(c, share), -pole / _POLE) for a, b, c, d in self.corners]
 
 
 def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, float] | None) -> Noisy:
-    """Return the points with the noise of the problem's sensors, or the given one.
+    """Return the loops at points of the reference with the noise of the problem's sensors, or the given one.
 
     Parameters: `controller`, resolved; `noise`: standard deviation of the measured response by controlled coordinate.
 
     Raises:
         InvalidValue: no noise, as of a response that is estimated, or a negative one. InvalidName: an unknown coordinate.
-        NotContractive: no finite response Jacobian.
+        NotSupported: a map that cannot be replaced. FpirhcError: no linear loop.
     """
-    jacobians, inverses = _along_the_reference(
-        grid, controller.plant_model(grid.problem).parameters(grid.problem.plant)
-    )
-    covariance, iteration = np.diag(_deviations(grid.problem, noise) ** 2), controller.deformation.iteration
-    return Noisy(iteration.weighted(jacobians), inverses, covariance, iteration.weighted(inverses))
+    covariance, gain = np.diag(_deviations(grid.problem, noise) ** 2), controller.deformation.effective_gain()
+    bare = controller.with_deformation(_with(controller.deformation, gain, 0.0))
+    points = Points(grid, behind_noise(bare))
+    places = thinned(usable(grid), _PLACES if points.asked.quick else _POINTS)
+    corners = [(share * gain, pole) for pole in (0.0, _POLE) for share in (0.5, 1.0)]
+    return Noisy(tuple(points.shaken(k, corners) for k in places), gain, covariance)
 
 
 def chatter_of(grid: ReviewGrid, controller: Controller, gain: float, pole: float) -> dict[str, float]:
@@ -294,68 +305,6 @@ def _of_sensors(problem: Problem) -> dict[str, float]:
     noises = {measured[name]: sensor.noise for name, sensor in sensing.sensors.items() if name in measured}
     random = np.random.default_rng(0)
     return {c: float(np.std(n.values(times, random))) for c, n in noises.items() if n is not None}
-
-
-def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Response Jacobians (points, n, n), and the model's inputs per unit of response (points, nu, n), where all are finite."""
-    plant = grid.problem.plant
-    places = np.unique(np.linspace(0, len(grid.times) - 1, _JACOBIANS).astype(int))
-    exact = np.tile(grid.draws[0], (len(places), 1))
-    jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
-    gains = [
-        np.asarray(plant.equations.input_gain(grid.states[k], grid.commands[0, k], believed).full()) for k in places
-    ]
-    usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
-    if not usable:
-        raise NotContractive(
-            "the response Jacobian is finite nowhere along the reference; see whether the problem is well posed"
-        )
-    return jacobians[usable], np.array([np.linalg.inv(gains[k]) for k in usable])
-
-
-@dataclass(frozen=True, eq=False)
-class NoiseSpread:
-    """Covariances of the request and of its step per cycle.
-
-    Args:
-        request: covariance of r, shape (n, n), in the unit of the response squared.
-        step: covariance of r_k - r_{k-1}, shape (n, n), in the same unit.
-    """
-
-    request: Array
-    step: Array
-
-
-def noise_spread(jacobian: Array, noise: Array, gain: float, pole: float) -> NoiseSpread:
-    """Return the stationary covariances of g_k = p g_{k-1} + (1 - p)(J r_{k-1} + n_k), r_k = r_{k-1} - a g_k.
-
-    Args:
-        jacobian: J, shape (n, n), dimensionless.
-        noise: covariance of the noise of the response, shape (n, n), in the unit of the response squared.
-        gain: effective gain a.
-        pole: p of the filter of the error, in [0, 1).
-
-    Raises:
-        InvalidShape: matrices that do not fit.
-        NotContractive: a loop that is not stable.
-    """
-    j, covariance = np.atleast_2d(jacobian), np.atleast_2d(noise)
-    if j.shape != covariance.shape or j.shape[0] != j.shape[1]:
-        raise InvalidShape(f"jacobian {j.shape} and noise {covariance.shape}: expected two square matrices of one size")
-    one, share = np.eye(len(j)), 1 - pole
-    loop = np.block([[one - gain * share * j, -gain * pole * one], [share * j, pole * one]])
-    radius = float(np.abs(np.linalg.eigvals(loop)).max())
-    if not radius < 1:
-        raise NotContractive(
-            f"gain {gain:.4g} with the filter's pole {pole:.4g}: an error changes by {radius:.4g} per cycle, so noise grows; lower "
-            "the gain"
-        )
-    entry = share * np.vstack([-gain * one, one])
-    from scipy.linalg import solve_discrete_lyapunov  # it takes longer to import than a problem to load
-
-    spread = solve_discrete_lyapunov(loop, entry @ covariance @ entry.T)
-    n = len(j)
-    return NoiseSpread(spread[:n, :n], gain**2 * spread[n:, n:])
 
 
 def filter_pole(product: float, ringing: float) -> float:
@@ -423,7 +372,7 @@ def suits_noise(case: Case) -> Answer | None:
     try:
         steps = chatter_of(case.grid, case.controller, deformation.effective_gain(), deformation.iteration.error_pole)
         budget = _budget(case) or steps
-        pair = within_budget(case.problem, case.controller, chatter=budget)
+        pair = _within_budget(case.problem, case.controller, budget)
     except FpirhcError as error:
         return Answer(NOISE_PAIR, Verdict.UNKNOWN, str(error))
     pole = deformation.iteration.error_pole

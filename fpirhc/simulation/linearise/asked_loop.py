@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,24 +28,26 @@ from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, rea
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
-from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.disturbance import Step as Jump
 from fpirhc.task.problem import Problem
 
-GAIN = "map_gain"  # in the memory
+GAIN, POLE, FILTERED, NOISE = "map_gain", "map_pole", "map_filtered", "map_noise"  # in the memory
 
 
 @dataclass(frozen=True)
 class LinearMap(Deformation):
-    """r+ = r - a W (f - d).
+    """r+ = r - a W (f - d); behind noise and a filter r+ = r - a W g+ with g+ = p g + (1 - p)(f + n - d).
 
     Args:
         gain: a at the start.
         weights: W by rows; None: the one matrix.
+        noisy: whether n, which is the next cycle's zero, and p, zero at the start, are in the memory.
     """
 
     gain: float
     weights: tuple[tuple[float, ...], ...] | None = None
+    noisy: bool = False
 
     @property
     def iteration(self) -> Iteration:
@@ -53,15 +55,19 @@ class LinearMap(Deformation):
         return Iteration(limited=False, weights=self.weights)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        del elements
-        return Layout((scalar(GAIN, start=self.gain),))
+        more = (scalar(POLE), Signal(FILTERED, elements), Signal(NOISE, elements)) if self.noisy else ()
+        return Layout((scalar(GAIN, start=self.gain), *more))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        error = response - desired
+        error, more = response - desired, dict[str, Expression]()
+        if self.noisy:
+            pole = memory[POLE]
+            error = pole * memory[FILTERED] + (1 - pole) * (error + memory[NOISE])
+            more = {POLE: pole, FILTERED: error, NOISE: 0 * memory[NOISE]}
         weighted = error if self.weights is None else ca.DM(self.weights) @ error
-        return request - memory[GAIN] * weighted, {GAIN: memory[GAIN]}
+        return request - memory[GAIN] * weighted, {GAIN: memory[GAIN], **more}
 
     def effective_gain(self) -> float:
         return self.gain
@@ -87,10 +93,19 @@ def near_fixed_point(controller: Controller) -> Controller:
         return controller
 
 
-def _linear(deformation: Deformation) -> Deformation:
+def behind_noise(controller: Controller) -> Controller:
+    """Return the controller with its map as it is near the fixed point, behind noise of the response and a filter of the error.
+
+    Raises:
+        NotSupported: a controller whose map cannot be replaced.
+    """
+    return controller.with_deformation(_linear(controller.deformation, noisy=True))
+
+
+def _linear(deformation: Deformation, *, noisy: bool = False) -> Deformation:
     if deformation.inner is None:
-        return LinearMap(deformation.effective_gain(), deformation.iteration.weights)
-    return with_inner(deformation, _linear(deformation.inner))
+        return LinearMap(deformation.effective_gain(), deformation.iteration.weights, noisy)
+    return with_inner(deformation, _linear(deformation.inner, noisy=noisy))
 
 
 # Columns of the memory that jump or are only recorded: counts, and what the line search of a plan remembers.
@@ -140,7 +155,9 @@ class AskedLoop:
         self._state = self.loop.memory.slice("_state_before")
         self._request = [k for k, c in enumerate(self.loop.memory.columns) if "_deformed_last." in c]
         self._phases = [k for k, c in enumerate(self.loop.memory.columns) if c.endswith("_phase")]
-        self._gains = [k for k, c in enumerate(self.loop.memory.columns) if c.split(".")[-1] == GAIN]
+        self._gains, self._poles, self._noises = (
+            [k for k, c in enumerate(self.loop.memory.columns) if name in c.split(".")] for name in (GAIN, POLE, NOISE)
+        )
         self._known: dict[bytes, list[Directions]] = {}  # of the points of `at`
 
     @property
@@ -321,6 +338,21 @@ class AskedLoop:
         some = period[1:2] or period if held else period
         return self._among([[self.with_gain(one, gain) for one in some] for gain in gains])
 
+    def shaken(self, memory: np.ndarray, corners: Sequence[tuple[float, float]]) -> tuple[LinearLoop, ...]:
+        """Return linear loops behind white noise w of the response that a map sees, one for each (gain, pole of its filter).
+
+        Args:
+            memory: of a loop with a map that is `behind_noise`.
+            corners: the effective gains and poles.
+        """
+        period, periods = self._period(memory), []
+        for gain, pole in corners:
+            moved = [self.with_gain(one, gain) for one in period]
+            for one in moved:
+                one[self._poles] = pole
+            periods.append(moved)
+        return self._among(periods)
+
     def _among(self, periods: list[list[np.ndarray]]) -> tuple[LinearLoop, ...]:
         """The linear loops along several periods, in the same coordinates."""
         scales, names = self._scales(periods[0][0]), [b"".join(map(bytes, period)) for period in periods]
@@ -339,14 +371,15 @@ class AskedLoop:
         if self.quick:
             return [along(some, np.eye(self._free.size)[:, self._free], width) for some in ways]
         with np.errstate(invalid="ignore", over="ignore"):  # a loop that runs away is infinite on both sides
-            return reached(ways, self._free, self._places, width, begun)
+            return reached(ways, self._free, self._places, width, begun, self._noises)
 
     def _linear(self, directions: list[Directions], number: int, scales: np.ndarray, sent: slice) -> LinearLoop:
         """The linear loop of one of the ways of every cycle, and the commands in one place of the trace."""
-        cycles = []
+        cycles, shaken = [], None if self._sizes is None else self._sizes[self._noises]
         for at, later in zip(directions, [*directions[1:], directions[0]], strict=True):
             state, onto, kicked = at.basis[self._state] * scales[:, None], later.basis.T, at.kicked[number][0]
-            cycles.append(LinearCycle(onto @ at.moved[number], onto @ kicked, at.traces[number][sent], state))
+            entry = onto @ kicked if not self._noises else onto[:, self._noises] / shaken
+            cycles.append(LinearCycle(onto @ at.moved[number], entry, at.traces[number][sent], state))
         first = directions[0]
         placed = (first.basis[self._state] / scales[:, None]).T
         return LinearLoop(tuple(cycles), first.traces[number][self._errors], placed, self.problem.period)

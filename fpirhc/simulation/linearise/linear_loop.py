@@ -13,6 +13,7 @@ from functools import cached_property, reduce
 import numpy as np
 
 NEUTRAL = 1e-6  # distance of |pole| from 1, where a mode neither decays nor grows
+_DOUBLINGS, _OVER = 16, 1e-14  # of a sum over periods, and the share of it below which it is over
 _SHOWN = 1e-6  # share of a judged error in an eigenvector, in scales
 
 
@@ -24,6 +25,12 @@ class LinearCycle:
     entry: np.ndarray
     arriving: np.ndarray
     state: np.ndarray
+
+    def mixed(self, other: LinearCycle, share: float) -> LinearCycle:
+        """Return one + share (one - other)."""
+        own, before = ((one.dynamics, one.entry, one.arriving) for one in (self, other))
+        dynamics, entry, arriving = (one + share * (one - low) for one, low in zip(own, before, strict=True))
+        return LinearCycle(dynamics, entry, arriving, self.state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,27 +159,38 @@ class LinearLoop:
     def spread(self, covariance: np.ndarray) -> np.ndarray:
         """Return the covariance (n, n) of z at the first cycle where w is white noise with a covariance (nw, nw) in every cycle.
 
-        It solves P = F P F' + Q over a period, where Q is what the noise of its cycles adds up to.
+        It is P = F P F' + Q of a loop that converges, where Q is what the noise of the cycles of a period adds up to. The sum
+        ends after 65 536 periods at the latest, so that a neutral mode is as wide as after a long run.
         """
-        from scipy.linalg import solve_discrete_lyapunov  # it takes longer to import than a problem to load
-
-        added = np.zeros_like(self.dynamics, shape=2 * self.cycles[0].dynamics.shape[1:])
+        total, moved = np.zeros_like(self.dynamics, shape=2 * self.cycles[0].dynamics.shape[1:]), self.dynamics
         for one in self.cycles:
-            added = one.dynamics @ added @ one.dynamics.T + one.entry @ covariance @ one.entry.T
-        return np.asarray(solve_discrete_lyapunov(self.dynamics, added))
+            total = one.dynamics @ total @ one.dynamics.T + one.entry @ covariance @ one.entry.T
+        with np.errstate(over="ignore", invalid="ignore"):  # a loop that grows has no bound
+            for _ in range(_DOUBLINGS):
+                added = moved @ total @ moved.T
+                total, moved = total + added, moved @ moved
+                if not np.abs(added).max(initial=0.0) > _OVER * np.abs(total).max(initial=0.0):
+                    break
+        return np.asarray(total)
 
     def steps(self, covariance: np.ndarray) -> np.ndarray:
         """Return the rms (nu,) of v_k+1 - v_k = (C F - C) z_k + C G w_k over a period, where w is white noise with a covariance.
 
-        The loop is stable; the covariance has the shape (nw, nw).
+        The covariance has the shape (nw, nw). What grows is infinite.
         """
         spread, squares = self.spread(covariance), np.zeros(len(self.cycles[0].arriving))
-        for one, later in zip(self.cycles, (*self.cycles[1:], self.cycles[0]), strict=True):
-            moved = later.arriving @ one.dynamics - one.arriving
-            parts = (moved, spread), (later.arriving @ one.entry, covariance)
-            squares += sum(np.einsum("ij,jk,ik->i", m, s, m) for m, s in parts)
-            spread = one.dynamics @ spread @ one.dynamics.T + one.entry @ covariance @ one.entry.T
-        return np.asarray(np.sqrt(squares / len(self.cycles)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for one, later in zip(self.cycles, (*self.cycles[1:], self.cycles[0]), strict=True):
+                moved = later.arriving @ one.dynamics - one.arriving
+                parts = (moved, spread), (later.arriving @ one.entry, covariance)
+                squares += sum(np.einsum("ij,jk,ik->i", m, s, m) for m, s in parts)
+                spread = one.dynamics @ spread @ one.dynamics.T + one.entry @ covariance @ one.entry.T
+        return np.sqrt(np.where(np.isfinite(squares), np.maximum(squares, 0.0), np.inf) / len(self.cycles))
+
+    def mixed(self, other: LinearLoop, share: float) -> LinearLoop:
+        """Return one + share (one - other) of loops in the same coordinates, whose matrices a number moves in proportion."""
+        cycles = (one.mixed(before, share) for one, before in zip(self.cycles, other.cycles, strict=True))
+        return replace(self, cycles=tuple(cycles))
 
     @property
     def _shown(self) -> np.ndarray:

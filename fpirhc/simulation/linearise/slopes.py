@@ -123,6 +123,7 @@ def reached(
     first: np.ndarray,
     inputs: int,
     begun: Sequence[Directions] | None = None,
+    always: Sequence[int] = (),
 ) -> list[Directions]:
     """Return directions at every cycle of a period that the motion from some first ones does not leave.
 
@@ -132,13 +133,14 @@ def reached(
         first: places of the plant's state.
         inputs: entries of w.
         begun: those of each cycle's last way alone, from which the others go on; None: none are known.
+        always: places of entries that deviate anew in every cycle.
 
     Raises:
         NotSupported: more directions than a loop should need.
     """
     count, fixed = len(ways), ~free
     parts = [_Part(some, free.size, inputs, None if begun is None else begun[k]) for k, some in enumerate(ways)]
-    waiting: list[list[np.ndarray]] = [[] for _ in ways]  # of each cycle, what is to be looked at
+    waiting = [list(np.eye(free.size)[list(always)]) for _ in ways]  # of each cycle, what is to be looked at
     if begun is None:
         waiting[0].extend(np.eye(free.size)[first])
 
