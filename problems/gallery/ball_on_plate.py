@@ -21,8 +21,8 @@ Task: an eight of 20 by 14 cm. Errors of the true place count from 4 s on:
     RHC offset-free           0.00017  0.00026
 
 The iteration leaves a tenth and a fifth of the error, and the offset-free plan less. The iteration needs the acceleration, which a
-camera gives late and with noise, so its gain has to be small, behind a filter; were accelerations known at once, three times the gain
-would win. The filter of the offset-free plan asks for places and velocities alone.
+camera gives late and with noise, so its gain has to be small, behind a filter; were accelerations known at once, three times the
+gain would win. The filter of the offset-free plan asks for places and velocities alone.
 
 References: the equations of the ball are Lagrange's, as in textbooks of control; the numbers are our own.
 """

@@ -415,3 +415,40 @@ def test_a_camera_serves_a_rival_better_than_the_iteration():
     fast = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-3), fp.ModelReferenced(fp.Affine(gain=-0.5)))
     known = fp.measure(ideal, fp.simulate(ideal, fast, seed=0, compiled=False)).rms_error
     assert (np.array(list(known.values())) < 0.2 * errors["RHC offset-free"]).all()
+
+
+# A house
+
+
+def test_bill_and_comfort_are_those_of_the_description():
+    """The second table, figure by figure."""
+    one, columns = task("building"), ("total", "bill", "outside", "hours_outside")
+    lines = one.description.split("by 0.2 K [h]")[1].split("\n\n")[0].strip().splitlines()
+    assert [line.strip().rsplit(maxsplit=4)[0] for line in lines] == list(one.controllers)
+    for line in lines:
+        name, *numbers = line.strip().rsplit(maxsplit=4)
+        measured = fp.measure(one.problem, run_of("building", name), one.metrics)
+        found = [measured[column][""] for column in columns]
+        assert [float(n) for n in numbers] == pytest.approx(found, abs=0.06, rel=0.02), name
+
+
+def test_an_economic_plan_of_a_day_is_that_of_ipopt():
+    """Linear prices and a kink at the edge of the band: the same heat in every cycle of a day, to a hundredth of the largest."""
+    problem = replace(task("building").problem, duration=24.0, measure_from=0.0)
+    heats = [
+        fp.simulate(problem, fp.RecedingHorizon(optimiser), seed=0, compiled=False)["command.heat"]
+        for optimiser in (task("building").controllers["RHC"].optimiser, fp.Ipopt())
+    ]
+    np.testing.assert_allclose(heats[0], heats[1], atol=0.08)
+
+
+def test_the_house_loses_what_it_is_given():
+    """Over a run: heat and gains less what goes out are what air and walls hold more, by the trapezoidal rule."""
+    problem, run = task("building").problem, run_of("building", "RHC")
+    p = {n: one.exact for n, one in problem.plant.parameters.items()}
+    weather, gains = (np.array([problem.signals[n].values(t) for t in run.time], float) for n in ("outdoor", "gains"))
+    room, wall = run["plant_state.room"], run["plant_state.wall"]
+    lost = p["glass"] * (room - weather) + p["outside"] * (wall - weather)
+    given = run["command.heat"][:-1].sum() + (gains[:-1] + gains[1:] - lost[:-1] - lost[1:]).sum() / 2
+    held = p["air"] * (room[-1] - room[0]) + p["mass"] * (wall[-1] - wall[0])
+    assert held == pytest.approx(problem.period * given, abs=0.01 * problem.period * run["command.heat"].sum())

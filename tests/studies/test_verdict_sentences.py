@@ -136,6 +136,28 @@ def test_the_figure_that_a_problem_is_judged_by(better, before, after, outcome, 
     assert other.text.startswith("FPI makes no clear difference: it changes the rms error of y")
 
 
+@pytest.mark.parametrize(
+    ("better", "rival", "said_of_it"),
+    [
+        ("smaller", 1.0, ["By loss PID is better than this pair: 1 N (RHC 4 N, FPI 2 N)."]),
+        ("smaller", 1.9, []),
+        ("smaller", 3.0, []),
+        ("larger", 5.0, ["By loss PID is better than this pair: 5 N (RHC 4 N, FPI 2 N)."]),
+        ("larger", math.nan, []),
+    ],
+)
+def test_a_row_is_better_by_the_figure_and_not_by_its_error(better, rival, said_of_it):
+    """The error of the row is a hundredth, which a problem that is judged by a figure does not ask for."""
+    loss = Metric("loss", lambda problem, run: 0.0, better=better, unit="N")
+    rows = [
+        entry(name, pair, measured={"loss": {"": value}}, metrics=[loss], errors={"y": 0.01 if name == "PID" else 1.0})
+        for name, pair, value in (("RHC", None, 4.0), ("FPI", "RHC", 2.0), ("PID", None, rival))
+    ]
+    sentences = findings(rows, {}, None, None, figure=Objective(loss, unit="N"))
+    assert [one.text for one in sentences if "PID" in one.text] == said_of_it
+    assert "PID is far better than this pair" in findings(rows, {}, None)[-1].text
+
+
 def test_several_coordinates():
     """Each has its numbers, unit and factor, the worst first; better and worse together are mixed."""
     plain, adaptive = entry("RHC", errors={"y": 1.0, "z": 2.0}), entry("FPI", "RHC", errors={"y": 0.2, "z": 1.0})

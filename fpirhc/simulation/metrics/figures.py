@@ -52,8 +52,8 @@ def TimeOver(what: What, level: float, *, name: str = "time_over", headline: boo
 
 @checked_call
 def Total(what: What, *, name: str = "total", headline: bool = True) -> Metric:
-    """Return the integral of s over time, the sum over the cycles times the period; arguments as in `InBand`."""
-    return _figure(name, what, lambda s, period: np.sum(s) * period, lambda unit, time: f"{unit} {time}", headline)
+    """Return the integral of s over time, the sum over the cycles times the period; EUR of EUR/h; arguments as in `InBand`."""
+    return _figure(name, what, lambda s, period: np.sum(s) * period, _times, headline)
 
 
 @checked_call
@@ -146,6 +146,11 @@ def _figure(
     return Metric(
         name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, finite=True, better=better
     )
+
+
+def _times(unit: str, time: str) -> str:
+    """The unit times that of time; a rate per time loses it."""
+    return unit.removesuffix(f"/{time}") if unit.endswith(f"/{time}") else f"{unit} {time}"
 
 
 def _of_whole_runs(function: Callable[[Problem, Run], float], problem: Problem, run: Run) -> float:

@@ -1,7 +1,8 @@
 """What the other rows of a table say about the headline pair: far better rows, an exact model that is no bound, unequal rates.
 
 Rows are compared by their relative error, the rms over the coordinates that the adaptive controller's cost weighs of rms error over
-scale (see `changes`). Two rows with the same rate and the same information are at parity within a factor of two.
+scale (see `changes`), or by the figure that the problem is judged by. Two rows with the same rate and the same information are at
+parity within a factor of two.
 """
 
 from __future__ import annotations
@@ -12,25 +13,44 @@ from typing import TYPE_CHECKING
 
 from fpirhc.plant.motion import with_space
 from fpirhc.review.questions.margins import SLOWER
-from fpirhc.studies.comparison.changes import HELPS, HURTS, ROUNDING, times
-from fpirhc.studies.comparison.outcome import Finding
+from fpirhc.studies.comparison.changes import HELPS, HURTS, ROUNDING, Change, times
+from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.summary import written_out
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.entry import Entry
+    from fpirhc.studies.tuning.objective import Objective
 
 FAR = 2.0  # times a smaller error, from which another row is far better
 
 
-def remarks(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scales: Mapping[str, float]) -> list[Finding]:
+def remarks(
+    entries: Sequence[Entry],
+    pair: tuple[Entry, Entry] | None,
+    scales: Mapping[str, float],
+    figure: Objective | None = None,
+) -> list[Finding]:
     """Return the remarks about the first pair; none without a pair that finished."""
-    texts = [
-        *_worse_learners(entries, scales),
-        *_far_better(entries, pair, scales),
-        *_no_bound(entries, scales),
-        *_rates(entries),
-    ]
-    return [Finding(text) for text in texts]
+    if figure is not None and figure.metric is not None:
+        told = _best_by(entries, pair, figure)
+    else:
+        told = [*_worse_learners(entries, scales), *_far_better(entries, pair, scales), *_no_bound(entries, scales)]
+    return [Finding(text) for text in (*told, *_rates(entries))]
+
+
+def _best_by(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, figure: Objective) -> list[str]:
+    """The row beside the pair that is clearly better by the figure: an error is then no measure, and an exact model no bound."""
+    values = {e.name: figure.of(e.metrics) if e.run.stop is None else math.inf for e in (*entries, *(pair or ()))}
+    others = [e.name for e in entries if pair is not None and e not in pair and not e.exact]
+    name = min(others, key=values.__getitem__, default=None)
+    if pair is None or name is None:
+        return []
+    ahead, best = min(values[e.name] for e in pair), values[name]
+    outcome = Change(figure.name, abs(ahead), abs(best)).outcome
+    if not best < ahead or (math.isfinite(ahead) and ahead * best > 0 and outcome is Outcome.NO_DIFFERENCE):
+        return []
+    both = ", ".join(f"{e.name} {figure.text(values[e.name])}" for e in pair)
+    return [f"By {figure.noun} {name} is better than this pair: {figure.text(best)} ({both})."]
 
 
 def relative_error(entry: Entry, scales: Mapping[str, float], weighed: frozenset[str] | None) -> float:

@@ -60,7 +60,7 @@ def findings(
     judged += [Finding(text) for text in left if text]
     judged += [Finding(_of(e, text)) for e in entries if not e.adaptive and (text := stuck_cause(e))]
     judged += [Finding(f"{name} is not judged: {why}.") for name, why in (unjudged or {}).items()]
-    judged += remarks(entries, ordered[0] if ordered else None, measure.scales)
+    judged += remarks(entries, ordered[0] if ordered else None, measure.scales, figure)
     if skipped:
         judged.append(Finding("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + "."))
     return (*by_figure, *judged)
@@ -71,8 +71,7 @@ def _by_figure(plain: Entry, adaptive: Entry, figure: Objective) -> Finding:
     pair, metric = (plain.name, adaptive.name), figure.metric
     assert metric is not None
     before, after = (
-        math.nan if e.run.stop is not None else e.metrics[metric.name].get(figure.element, math.nan)
-        for e in (plain, adaptive)
+        math.nan if e.run.stop is not None else figure.told(figure.of(e.metrics)) for e in (plain, adaptive)
     )
     name = figure.noun
     if not math.isfinite(before + after):

@@ -9,7 +9,7 @@ from typing import Any
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.plant.motion import followed_units, with_space
-from fpirhc.simulation.metrics import Metric
+from fpirhc.simulation.metrics import Metric, Metrics
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 
@@ -94,6 +94,12 @@ class Objective:
     @property
     def _unit(self) -> str:
         return "" if self.unit in ("", "1") else with_space(self.unit)
+
+    def of(self, metrics: Metrics) -> float:
+        """Return the metric's number of one run with the sign that makes smaller better; infinite where it has none."""
+        assert self.metric is not None
+        value = self._sign * metrics[self.metric.name].get(self.element, math.nan)
+        return value if math.isfinite(value) else math.inf
 
     def value(self, record: Mapping[str, Any]) -> float:
         """Return the number of a scenario's record with the sign that makes smaller better; infinite where the run failed.
