@@ -43,7 +43,7 @@ from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.functions import nan_where, numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, live_numbers, nominal, not_live, settled
+from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, copied, live_numbers, nominal, settled
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
 
@@ -199,10 +199,14 @@ class RecedingHorizon(Controller):
         return blocks, delays
 
 
-def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
+def _optimal_control(
+    problem: Problem, optimiser: Optimiser, moving: Mapping[str, LiveNumber] | None = None
+) -> OptimalControl:
+    """The horizon; live numbers that move its reference are among its settings, as those that the optimiser reads."""
+    moving = live_numbers(problem.reference) if moving is None else moving
     assert problem.horizon is not None
     assert problem.cost is not None
-    ahead, read = previewed_values(problem.plant, problem.signals), _read_from_data(optimiser)
+    ahead, read = previewed_values(problem.plant, problem.signals), {**_read_from_data(optimiser), **moving}
     limits, start = problem.limits, problem.start_state
     return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start, read)
 
@@ -254,7 +258,6 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
-    _check_reference(problem)
     optimiser, on_failure, restarts = controller.optimiser, controller.on_failure, controller.replanning.restarts
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
     count = live_signals(ocp.settings, plant.input).size
@@ -266,13 +269,18 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     solve = built(optimiser, ocp, "step")
     feedforward_of = _feedforward(problem)
     low, high = problem.limits.input_ends(plant)
-    logged = tuple(scalar(name) for name in optimiser.logged)
     stopped = (scalar(STOPPED),) if on_failure.stops else ()
-    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *stopped, *logged)
+    writes = (
+        like(plant.input, "planned"),
+        Signal("solve", _SOLVE),
+        scalar("_solve_status"),
+        *stopped,
+        *map(scalar, optimiser.logged),
+    )
 
     def step(s: Signals) -> dict[str, Value]:
         own = own_values(problem, s)
-        motion = () if preview is None else preview(*own)
+        motion = () if preview is None else preview(s.time, *own)
         data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, optimiser, ocp, s))
         for seen in measured_signals(plant)[1:] if restarts else ():  # outputs that are given beside the state
             shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=controller.planner.feeds_back(plant))
@@ -308,10 +316,12 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
 
     def derived(values: Mapping[str, float]) -> Derived:
         lower, upper = settled(problem.limits, values).input_bounds(plant)
-        ahead = replace(ocp.at(values), input_lower=lower, input_upper=upper)
+        led, along = _led(problem, optimiser, ocp, values)
+        ahead = replace(along.at(values), input_lower=lower, input_upper=upper)
         settled(optimiser, values).check(ahead)
         signals = _derived_numbers(ahead) if ocp.settings else {}
-        first = lambda: optimiser.memory(ocp).unpack(first_memory(start, optimiser, ahead, data_of))  # noqa: E731
+        table_of = data_of if led is problem else _stage_data(led, count)
+        first = lambda: optimiser.memory(ocp).unpack(first_memory(start, optimiser, ahead, table_of))  # noqa: E731
         return Derived(signals, first, {name: _STALE[name] for name in signals})
 
     own = memory + Layout((scalar("plan_begun"),))
@@ -319,17 +329,15 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     return Block("plan", _plan_reads(problem, ocp, room), Layout(writes), step, own, opaque=True, derived=live)
 
 
-def _check_reference(problem: Problem) -> None:
-    """Raise where scale and first plan, which follow from the first horizon, would follow a live setting of the reference.
-
-    Raises:
-        NotSupported: the reference moves within the first horizon.
-    """
-    assert problem.horizon is not None
+def _led(
+    problem: Problem, optimiser: Optimiser, ocp: OptimalControl, values: Mapping[str, float]
+) -> tuple[Problem, OptimalControl]:
+    """Problem and horizon along the reference with other numbers: scale and first plan are taken from the first horizon."""
     moving = live_numbers(problem.reference)
-    if moving and not problem.reference.rests(float(problem.horizon.nodes[-1])):
-        why = "the reference moves within the first horizon, from which the optimiser's scale and the first plan are taken"
-        raise not_live([next(iter(moving))], f"{why}; let it rest there", " with a plan")
+    if not moving:
+        return problem, ocp
+    led = copied(problem, {"reference": settled(problem.reference, values)})
+    return led, _optimal_control(led, optimiser, moving)
 
 
 def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.Function:
@@ -382,8 +390,9 @@ def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: S
     """The live settings, and what follows from them, at the end of a stage's data; nothing without any."""
     if not ocp.settings:
         return []
-    live = live_numbers(problem.cost, problem.limits) | _read_from_data(optimiser)
-    numbers = {path: number.of(ca.MX) for path, number in live.items()}
+    live = live_numbers(problem.cost, problem.limits, problem.reference) | _read_from_data(optimiser)
+    declared = {one.name: getattr(s, one.name) for one in own_signals(problem)}
+    numbers = {path: declared.get(PREFIX + path, number.of(ca.MX)) for path, number in live.items()}
     if _computed(ocp):
         numbers |= dict(zip(_computed(ocp), ca.vertsplit(getattr(s, _NUMBERS)), strict=True))
     settings = (numbers[path] for path in ocp.settings)

@@ -54,7 +54,7 @@ def motion_of(problem: Problem, ahead: float = 0.0) -> ca.Function:
 
 
 def preview_of(problem: Problem) -> ca.Function | None:
-    """Function (own signals) -> (states, responses) at the nodes of the horizon; None without own signals."""
+    """Function (t, own signals) -> (states, responses) at the nodes of the horizon; None without own signals."""
     if problem.horizon is None:
         return None
     return problem.reference.preview(problem.plant, problem.horizon.nodes)

@@ -17,7 +17,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Response, error_signal, like, rename
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.reference_states import own_signals
+from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.sensing_chain import first_estimates, first_shown
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import forcing_units, outside_names, time_signal
@@ -391,17 +391,18 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     places = [plant.output.elements.index(c) for c in problem.judged_names]
     own = [motion.elements.index(c) for c in problem.judged_names]  # what moves may not have every state of the model
     writes = Layout((error_signal(problem, "true_error"),))
-    if own_signals(problem):
+    if given_signals(problem):
         reads = Layout((like(plant.output, "reference"), motion))
         return Block(
             "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
         )
-    function = problem.reference.function(plant)
+    function, reads = motion_of(problem), Layout((time_signal(plant), motion, *own_signals(problem)))
 
     def step(s: Signals) -> dict[str, Expression]:
-        return {"true_error": function(s.time)[0][places] - getattr(s, motion.name)[own]}
+        along = function(s.time, *own_values(problem, s))[0]
+        return {"true_error": along[places] - getattr(s, motion.name)[own]}
 
-    return Block("truth", Layout((time_signal(plant), motion)), writes, step, opaque=problem.reference.opaque)
+    return Block("truth", reads, writes, step, opaque=problem.reference.opaque)
 
 
 def _seen_block(problem: Problem, shown: Shown) -> Block:

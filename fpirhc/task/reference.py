@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import casadi as ca
@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import described, real_number
+from fpirhc.fields.kinds import Finite, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.maps import differentiated, time_derivatives
 from fpirhc.plant.motion import followed, followed_units
@@ -24,7 +24,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.latest import Latest
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.layout import Expression, Signal, scalar
+from fpirhc.symbolic.live import PREFIX, live_numbers, nominal
 
 Steps = float | Sequence[Sequence[float]]  # one set-point, or pairs (time, set-point)
 
@@ -113,14 +114,9 @@ class Reference(Checked, ABC):
         return self.derivatives(coordinate, order)
 
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
-        """Function (own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from now on; None without own signals."""
+        """Function (t, own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from t on; None without own signals."""
         del plant, nodes
         return None
-
-    def rests(self, until: float) -> bool:
-        """Return whether the nominal motion is known to stand still up to some time, whatever the numbers of live settings are."""
-        del until
-        return False
 
     def largest_jump(self, plant: Plant) -> float:
         """Largest known jump of the controlled responses from one cycle to the next, which no derivative shows."""
@@ -132,17 +128,90 @@ class Reference(Checked, ABC):
 class Trajectory(Reference):
     """A nominal motion given as expressions of time: Trajectory(lambda t: {"q1": ca.sin(2 * t)}).
 
+        y(t) = m(0) + s (m(t) - m(0)),  y^(k)(t) = s m^(k)(t)       for every coordinate y with its motion m
+
     Args:
         motion: function of the time in seconds that returns {coordinate: expression}.
+        scale: s; how far the motion goes from its first point. It may be live.
     """
 
     motion: Callable[[Expression], Mapping[str, Expression]]
+    scale: Finite = field(default=1.0, kw_only=True)
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
-        return {
-            str(name): scalar_expression(f"reference: coordinate '{name}'", value, of=self.motion, symbols=(t,))
-            for name, value in named_results("reference", called("reference", self.motion, t)).items()
-        }
+        def of(time: Expression) -> dict[str, Expression]:
+            named = named_results("reference", called("reference", self.motion, time))
+            return {
+                str(name): scalar_expression(f"reference: coordinate '{name}'", value, of=self.motion, symbols=(time,))
+                for name, value in named.items()
+            }
+
+        scale = nominal(self.scale)
+        if scale == 1:
+            return of(t)
+        still = ca.SX.sym("t")
+        first = {name: ca.substitute(value, still, 0) for name, value in of(still).items()}
+        return {name: first[name] + scale * (value - first[name]) for name, value in of(t).items()}
+
+    def function(self, plant: Plant) -> ca.Function:
+        if nominal(self.scale) == 1:
+            return super().function(plant)
+        t = ca.SX.sym("t")
+        results = self._scaled(plant)(t, nominal(self.scale))
+        return ca.Function("fpirhc_reference", [t], list(results), ["t"], ["state", "response"])
+
+    def derivatives(self, coordinate: str, order: int) -> ca.Function:
+        if nominal(self.scale) == 1:
+            return super().derivatives(coordinate, order)
+        t = ca.SX.sym("t")
+        return ca.Function(
+            "fpirhc_reference_derivatives", [t], [self._derivatives(coordinate, order)(t, nominal(self.scale))]
+        )
+
+    def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
+        """The scale where it is live."""
+        del plant, stages
+        return tuple(
+            scalar(PREFIX + path, start=number.value) for path, number in live_numbers({"scale": self.scale}).items()
+        )
+
+    def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
+        if not self.own(plant, stages):
+            return super().motion_now(plant, stages, ahead)
+        t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
+        results = self._scaled(plant)(t + ahead, scale)
+        return ca.Function("fpirhc_reference_now", [t, scale], list(results), ["t", "scale"], ["state", "response"])
+
+    def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
+        live = self.own(plant, stages)
+        return self._derivatives(coordinate, order) if live else super().chain(plant, stages, coordinate, order)
+
+    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
+        if not self.own(plant, 0):
+            return None
+        t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
+        columns = [self._scaled(plant)(t + float(time), scale) for time in nodes]
+        tables = [ca.densify(ca.horzcat(*parts)) for parts in zip(*columns, strict=True)]
+        return ca.Function("fpirhc_reference_preview", [t, scale], tables, ["t", "scale"], ["states", "responses"])
+
+    def _scaled(self, plant: Plant) -> ca.Function:
+        """Function (t, scale) -> (state, response)."""
+        t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
+        function = Trajectory(self.motion).function(plant)
+        first, now = function(ca.SX(0)), function(t)
+        orders = [e.count("'") for e in plant.output.elements], list(plant.chains.values())
+        results = []
+        for one, begun, order in zip(now, first, orders, strict=True):
+            place = begun * ca.DM([float(k == 0) for k in order])  # derivatives count from zero
+            results.append(ca.densify(place + scale * (one - place)))
+        return ca.Function("fpirhc_reference_scaled", [t, scale], results)
+
+    def _derivatives(self, coordinate: str, order: int) -> ca.Function:
+        """Function (t, scale) -> the coordinate's value and its derivatives up to `order`."""
+        t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
+        values = Trajectory(self.motion).derivatives(coordinate, order)
+        place = ca.vertcat(values(ca.SX(0))[0], ca.SX.zeros(order))
+        return ca.Function("fpirhc_reference_chain", [t, scale], [ca.densify(place + scale * (values(t) - place))])
 
 
 @dataclass(frozen=True, eq=False)

@@ -108,7 +108,7 @@ class FilterBank:
         return ca.Function("fpirhc_reference_chain", [ca.SX.sym("t"), own], [ca.densify(whole[: order + 1])])
 
     def preview(self, times: np.ndarray) -> ca.Function:
-        """Function (own signal) -> (states (nx, N + 1), responses (n, N + 1)): free motion, the set-points of every node held."""
+        """Function (t, own signal) -> (states (nx, N + 1), responses (n, N + 1)): free motion, every node's set-points held."""
         own = ca.SX.sym("own", self.own.size)
         z, points, rate = self._parts(own)
         lengths = np.round(np.diff(times) / times[1], 12)  # equal stages are equal to the last bit
@@ -120,7 +120,8 @@ class FilterBank:
             stage = phis[lengths[min(node, len(lengths) - 1)]]
             z = [_after_motion(phi, z[k], held[k]) for k, phi in enumerate(stage)]
         tables = [ca.densify(ca.horzcat(*parts)) for parts in zip(*columns, strict=True)]
-        return ca.Function("fpirhc_reference_preview", [own], tables, ["own"], ["states", "responses"])
+        names = ["t", "own"], ["states", "responses"]
+        return ca.Function("fpirhc_reference_preview", [ca.SX.sym("t"), own], tables, *names)
 
     def _split(self, column: Expression) -> list[Expression]:
         return ca.vertsplit(column, [0, *np.cumsum(list(self.orders.values())).tolist()])
@@ -331,13 +332,8 @@ class Setpoint(Reference):
         return self._bank(plant, stages).chain(coordinate, order)
 
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
-        """Function (own signal) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
+        """Function (t, own signal) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
         return self._bank(plant, len(nodes) - 1).preview(nodes)
-
-    def rests(self, until: float) -> bool:
-        steps = {name: pairs(name, values) for name, values in self.values.items()}
-        still = all(time == 0 or time > until for one in steps.values() for time, _ in one)
-        return still and all(value == steps[name][0][1] for name, value in self.start.items())
 
     def largest_jump(self, plant: Plant) -> float:
         jumps: dict[float, list[float]] = {}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -18,6 +20,35 @@ def test_derivatives_up_to_the_order():
     result = np.append(state.full().ravel(), float(response))
     expected = [2**k * np.sin(0.6 + k * np.pi / 2) for k in range(5)]
     np.testing.assert_allclose(result, expected, rtol=1e-12, equal_nan=False)
+
+
+def test_a_scale_goes_from_the_first_point():
+    """For y = 3 + sin 2t and the scale s: y = 3 + s sin 2t, and all derivatives are s times those of sin 2t."""
+    scaled = fp.Trajectory(lambda t: {"y": 3 + ca.sin(2 * t)}, scale=-1.5)
+    state, response = scaled.function(chain(2))(0.3)
+    wanted = [3 - 1.5 * np.sin(0.6), -3 * np.cos(0.6), 6 * np.sin(0.6)]
+    np.testing.assert_allclose(np.append(state.full().ravel(), float(response)), wanted, rtol=1e-12)
+    np.testing.assert_allclose(scaled.derivatives("y", 2)(0.3).full().ravel(), wanted, rtol=1e-12)
+    np.testing.assert_allclose(float(ca.evalf(scaled.coordinates(ca.SX(0.3))["y"])), wanted[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("fishery", "RHC+FPI"), ("crane_slots", "slots+FPI"),
+     ("delayed_mass", "RHC+FPI"), ("planar_arm", "AID+FPI")],
+)  # fmt: skip
+def test_a_live_scale_is_that_of_a_task_with_it(name, title):
+    """Plans, their first one and previews, slots, and controllers behind dead time follow the number in force, to rounding."""
+    task = fp.load_problem(name)
+    short = replace(task.problem, duration=60 * task.problem.period, measure_from=0.0)
+    ready = fp.simulator(short, task.controllers[title], compiled=False, live=["reference.scale"])
+    run = ready.run(seed=0, settings={"reference.scale": 1.3})
+    other = fp.simulate(
+        fp.with_settings(short, {"reference.scale": 1.3}), task.controllers[title], seed=0, compiled=False
+    )
+    for signal in ("reference", "command", "true_error" if "true_error" in run.layout.names else "error"):
+        wanted = np.asarray(other[signal])
+        np.testing.assert_allclose(run[signal], wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))
 
 
 def test_table_agrees_with_the_expression_it_samples():

@@ -16,7 +16,7 @@ import fpirhc as fp
 from fpirhc.cli.verbs.run import by_kind
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.reference_states import request_along_reference
-from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue, NotSupported
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue
 from fpirhc.report.terminal import set_points_in_force
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.run import load_run
@@ -287,7 +287,7 @@ def test_run_and_file_record_what_was_in_force(tmp_path):
     ("name", "compiled"), [("CTC+FPI (eq 6)", False), ("CTC+FPI (eq 6)", True), ("RHC+FPI", False)]
 )
 def test_live_rate_of_the_filter(name, compiled):
-    """Changed equals rebuilt bit by bit, also with a plan where the reference rests over the first horizon."""
+    """Changed equals rebuilt bit by bit, also with a plan whose reference rests over the first horizon."""
     steps = {"q1": [(0.0, 2.2), (0.21, 2.4)], "q2": 5.4}
     controller = TWO_MASS.controllers[name]
     ready = fp.simulator(two_mass(values=steps), controller, compiled=compiled, live=["reference.rate"])
@@ -297,10 +297,13 @@ def test_live_rate_of_the_filter(name, compiled):
     np.testing.assert_array_equal(changed["command"], rebuilt["command"])
 
 
-def test_live_rate_is_refused_where_a_plan_depends_on_it():
-    """A reference that moves within the first horizon decides the optimiser's scale."""
-    with pytest.raises(NotSupported, match=r"'reference\.rate' cannot be live with a plan"):
-        fp.simulator(two_mass(), TWO_MASS.controllers["RHC"], compiled=False, live=["reference.rate"])
+def test_a_live_rate_moves_the_first_horizon():
+    """The optimiser's scale and the first plan follow the rate, as those of a loop that is built with it."""
+    ready = fp.simulator(two_mass(), TWO_MASS.controllers["RHC"], compiled=False, live=["reference.rate"])
+    changed = ready.run(seed=0, settings={"reference.rate": 7.3})
+    rebuilt = fp.simulate(two_mass(rate=7.3), TWO_MASS.controllers["RHC"], seed=0, compiled=False)
+    size = np.abs(rebuilt["command"]).max()
+    np.testing.assert_allclose(changed["command"], rebuilt["command"], rtol=0, atol=1e-11 * size)
     with pytest.raises(InvalidName, match=r"reference"):
         fp.simulator(two_mass(), TWO_MASS.controllers["CTC"], compiled=False, live=["referense.rate"])
 

@@ -11,7 +11,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, bounded, closing_blocks, desired_blocks, fed, like
 from fpirhc.controllers.mirror import MEASURED_TIME
-from fpirhc.controllers.reference_states import own_signals
+from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
@@ -76,7 +76,7 @@ class AdaptiveInverseDynamics(Controller):
             NotSupported: errors of an earlier instant, to set-points.
         """
         self._learning.check(problem, inverts=True)
-        if _late(problem) and own_signals(problem) and not self.rule.reads_response:
+        if _late(problem) and given_signals(problem) and not self.rule.reads_response:
             raise NotSupported(
                 f"{type(self.rule).__name__} pairs a response with the error of the same instant, and behind dead time set-points "
                 "are not remembered for it; use Projection, or a Trajectory"
@@ -127,14 +127,14 @@ class AdaptiveInverseDynamics(Controller):
     def _target(self, problem: Problem) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
         """The reference when the response was realised, and what it reads; no sample is older than the start."""
         plant, pairs = problem.plant, ResponsePairs(problem, problem.dead_time)
-        if not _late(problem) or own_signals(problem):
+        if not _late(problem) or given_signals(problem):
             return lambda s: s._target, (like(plant.output, "_target"),)
-        reference = problem.reference.function(plant)
+        reference = motion_of(problem)
 
         def then(s: Signals) -> Expression:
-            return reference(ca.fmax(getattr(s, MEASURED_TIME) - pairs.late, 0))[0]
+            return reference(ca.fmax(getattr(s, MEASURED_TIME) - pairs.late, 0), *own_values(problem, s))[0]
 
-        return then, (replace(time_signal(plant), name=MEASURED_TIME),)
+        return then, (replace(time_signal(plant), name=MEASURED_TIME), *own_signals(problem))
 
     def lyapunov_row(self) -> np.ndarray:
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""

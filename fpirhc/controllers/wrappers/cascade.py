@@ -109,19 +109,17 @@ class Shifted(Reference):
         return ca.Function("fpirhc_target_chain", [t, own], [values])
 
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
-        """Function (own signal) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
-        _, own, parts, places = self._symbols(plant, len(nodes) - 1)
+        """Function (t, own signal) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
+        t, own, parts, places = self._symbols(plant, len(nodes) - 1)
         known = self.reference.preview(plant, nodes)
         if known is not None:
-            states, responses = known(*parts[:-2])
+            states, responses = known(parts[-1], *parts[:-2])
         else:
             at_nodes = [self.reference.function(plant)(parts[-1] + float(time)) for time in nodes]
             states, responses = (ca.horzcat(*columns) for columns in zip(*at_nodes, strict=True))
         shifted = states + ca.repmat(places @ parts[-2], 1, len(nodes))
-        return ca.Function("fpirhc_target_preview", [own], [shifted, responses], ["own"], ["states", "responses"])
-
-    def rests(self, until: float) -> bool:
-        return self.reference.rests(until)
+        names = ["t", "own"], ["states", "responses"]
+        return ca.Function("fpirhc_target_preview", [t, own], [shifted, responses], *names)
 
     def largest_jump(self, plant: Plant) -> float:
         return self.reference.largest_jump(plant)

@@ -17,7 +17,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, like
 from fpirhc.controllers.contract import ControllerWrapper, require_controlled_response
 from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
-from fpirhc.controllers.reference_states import own_signals
+from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import with_inner
 from fpirhc.errors import InvalidValue, NotSupported
@@ -180,7 +180,7 @@ class Predicted(ControllerWrapper):
     def notes(self, problem: Problem) -> tuple[str, ...]:
         notes = self.controller.notes(problem)
         cycles = nominal(self)._queue(problem).cycles
-        if not own_signals(problem) or not cycles:
+        if not given_signals(problem) or not cycles:
             return notes
         late = f"{cast(float, cycles) * problem.period:g} {problem.time_unit}"
         return (
