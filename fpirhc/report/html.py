@@ -99,8 +99,8 @@ def write_report(comparison: Comparison, path: Path) -> None:
     write_whole(render(comparison), path, "report")
 
 
-def render(comparison: Comparison) -> str:
-    """Return the page's text."""
+def render(comparison: Comparison, lab: str = "") -> str:
+    """Return the page's text; `lab` is the address of a page beside it that the reader can go on to."""
     pair, entries = headline_pair(comparison), comparison.entries
     own, motions = own_pictures(comparison)
     begin = [e.name for e in pair] if pair else []
@@ -127,6 +127,7 @@ def render(comparison: Comparison) -> str:
         if lyapunov
         else [],
         in_force=_in_force(comparison),
+        lab=lab,
     )
 
 

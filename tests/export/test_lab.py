@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.contraction.spectrum import factors_along, response_jacobians
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.export.lab import lab as module
 from fpirhc.export.lab.lab import Lab, make_lab, page
+from fpirhc.export.lab.loop import LabLoop
 from fpirhc.symbolic.paths import changed_at
 
 CASES = {
@@ -86,6 +88,7 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
     noise = [s.path for s in lab.sliders if s.rows]
     assert noise == (["sensing.sensors.speed.noise.deviation"] if name == "noisy_motor" else [])
     assert all(paths[path].unit == "rad/s" for path in noise)
+    assert "reference.scale" in paths
     moved |= {path: 0.7 * paths[path].value for path in noise}
     said = answers(lab, moved, tmp_path)
     for loop, one in zip(lab.loops, said, strict=True):
@@ -109,14 +112,33 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
         error = np.reshape(run[loop.error], (problem.cycles, -1))
         counted = error[int(np.ceil(problem.measure_from / problem.period - 1e-9)) :]
         assert np.allclose(one["squares"], (counted**2).sum(axis=0), rtol=1e-9, atol=0)
+        assert (one["factors"] is not None) == (problem.name != "crane_slots" and loop.name == "RHC+FPI")
+        if one["factors"]:
+            assert np.allclose(one["factors"], contraction(loop, run, variant), rtol=1e-9, atol=0)
 
 
-def test_dead_time_and_set_points_have_the_numbers_of_a_task_that_states_them(tmp_path):
-    """Dead time of an input that has none, and two set-points of one coordinate: 1e-12 of the largest number."""
+def contraction(loop: LabLoop, run: fp.Run, variant: Any) -> np.ndarray:
+    """Python's factors in the cycles of the page's frames, with the gain in force."""
+    rows, plant = np.arange(0, run.cycles, loop.frame), loop.ready.problem.plant
+    states, deformed = (np.reshape(run[name], (run.cycles, -1))[rows] for name in ("state", "deformed"))
+    exact = np.tile(variant.plant.exact, (len(rows), 1))
+    jacobians = response_jacobians(plant, states, deformed, exact, variant.plant.approximate)
+    return factors_along(len(rows), lambda at: jacobians[at], run.settings["effective_gain"])
+
+
+def test_reference_dead_time_and_set_points_have_the_numbers_of_a_task_that_states_them(tmp_path):
+    """A larger reference, dead time of an input that has none, two set-points of one coordinate: 1e-12 of the largest number."""
     pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
     task, name = fp.load_problem("two_mass"), "CTC+FPI (eq 6)"
+    scaled = replace(task.problem, duration=0.3, measure_from=0.0)
+    lab = make_lab("two_mass", "", "two_mass", scaled, {name: task.controllers[name]})
+    said = answers(lab, {"reference.scale": 1.3}, tmp_path)[0]
+    run = fp.simulate(fp.with_settings(scaled, {"reference.scale": 1.3}), task.controllers[name], seed=0)
+    for column, values in zip(lab.loops[0].shown, said["columns"], strict=True):
+        wanted = np.ravel(run[column])
+        assert np.abs(np.array(values) - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max()), column
     steps: Any = {"q1": [(0.0, 0.1), (0.3, 0.2)], "q2": 1.0}
     reference = fp.Setpoint(steps, rate=20.0, start={"q1": 0.0, "q2": 0.9})
     problem = replace(task.problem, duration=0.6, measure_from=0.0, reference=reference)
@@ -191,7 +213,7 @@ class _Body:
 
 def test_a_page_runs_its_own_scripts_and_webassembly_alone(short, monkeypatch):
     """The policy names hashes, and nothing of a title or a reason is markup."""
-    monkeypatch.setattr(module.LabLoop, "module", b"")
+    monkeypatch.setattr(LabLoop, "module", b"")
     lab = replace(short, title="<b>&", without={"a": "</script><b>"})
     text = page(lab)
     policy = text.partition('content="')[2].partition('"')[0]

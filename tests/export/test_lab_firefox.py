@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import fpirhc as fp
 from fpirhc.export.lab.lab import make_lab, write_lab
 from fpirhc.symbolic.paths import changed_at
 
+PROGRAM = shutil.which("firefox-esr") or shutil.which("firefox")
 PLACE = "DATA.sliders.findIndex((s) => s.path === 'exact.m1')"
 CURVES = "JSON.stringify(answers.map((a) => a.columns.map((c) => [...c])))"
 
@@ -25,8 +27,8 @@ CURVES = "JSON.stringify(answers.map((a) => a.columns.map((c) => [...c])))"
 class Firefox:
     """A page in a browser without a window; `complaints` are the console's."""
 
-    def __init__(self, socket: Any) -> None:
-        self._socket, self._count = socket, 0
+    def __init__(self, socket: Any, process: int) -> None:
+        self._socket, self._count, self._process = socket, 0, process
         self.complaints: list[str] = []
         self.ask("session.new", capabilities={})
         self.ask("session.subscribe", events=["log.entryAdded"])
@@ -54,6 +56,15 @@ class Firefox:
         while self.evaluate("busy || (window.shownNumber || 0)") in (True, began):
             time.sleep(0.02)
 
+    def memory(self) -> int:
+        """Bytes in memory of the browser's processes."""
+        said = subprocess.run(["ps", "-eo", "pid=,ppid=,rss="], capture_output=True, text=True, check=True).stdout
+        rows = [tuple(map(int, line.split())) for line in said.splitlines()]
+        own = {self._process}
+        while more := {one for one, parent, _ in rows if parent in own} - own:
+            own |= more
+        return 1024 * sum(size for one, _, size in rows if one in own)
+
     def evaluate(self, expression: str) -> Any:
         """The value of an expression that is text, a number or a promise of these."""
         target = {"context": self._page}
@@ -64,21 +75,30 @@ class Firefox:
 
 @pytest.fixture
 def firefox(tmp_path: Path) -> Iterator[Firefox]:
-    program = shutil.which("firefox-esr") or shutil.which("firefox")
-    if program is None:
+    if PROGRAM is None:
         pytest.skip("Firefox is not installed")
-    client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
+    pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
     profile = tmp_path / "profile"
     profile.mkdir()
+    with opened(profile) as browser:
+        yield browser
+
+
+@contextmanager
+def opened(profile: Path) -> Iterator[Firefox]:
+    """Firefox with an empty profile."""
+    from websockets.sync import client
+
+    assert PROGRAM is not None
     started = subprocess.Popen(
-        [program, "--headless", "--no-remote", "--profile", str(profile), "--remote-debugging-port", "0"],
+        [PROGRAM, "--headless", "--no-remote", "--profile", str(profile), "--remote-debugging-port", "0"],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
         assert started.stderr
         found = next(m for text in started.stderr if (m := re.search(r"BiDi listening on (ws://\S+)", text)))
         with client.connect(f"{found[1]}/session", max_size=None) as socket:
-            yield Firefox(socket)
+            yield Firefox(socket, started.pid)
     finally:
         started.terminate()
         started.wait()
@@ -88,7 +108,7 @@ def firefox(tmp_path: Path) -> Iterator[Firefox]:
 
 @pytest.mark.browser
 def test_firefox_has_the_numbers_of_a_run(firefox, tmp_path):
-    """Every curve to 1e-12 of the largest number, before and after a move; a hundred moves, and the console is silent."""
+    """Every curve to 1e-12 of the largest number, before and after a move; 500 moves, and the console is silent."""
     pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
     task = fp.load_problem("two_mass")
     chosen = {name: task.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")}
@@ -104,8 +124,12 @@ def test_firefox_has_the_numbers_of_a_run(firefox, tmp_path):
             for name, values in zip(loop.shown, columns, strict=True):
                 wanted = np.ravel(run[name])[:: loop.every]
                 assert np.abs(np.array(values) - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max()), name
-    for k in range(1, 101):
-        firefox.move(0.5 + k / 50)
+    for k in range(1, 51):
+        firefox.move(0.5 + k / 250)
+    began = firefox.memory()
+    for k in range(1, 501):
+        firefox.move(0.5 + k / 250)
+    assert firefox.memory() < began + 100e6
     assert "CTC+FPI (eq 6)" in firefox.evaluate("document.getElementById('sentence').textContent")
     assert firefox.evaluate("document.getElementById('motion').querySelectorAll('canvas').length") == 2
     assert firefox.complaints == []

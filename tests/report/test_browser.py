@@ -17,6 +17,7 @@ import pytest
 from plants import chain, linear
 
 import fpirhc as fp
+from fpirhc.cli.main import main
 from fpirhc.export.lab.lab import make_lab, write_lab
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import write_report, write_scenarios
@@ -296,5 +297,30 @@ def test_a_lab_runs_anew_while_a_slider_moves(width, scheme, visit, pictures, tm
     assert page.evaluate("performance.memory.usedJSHeapSize") < 2 * size + 2e7
     page.screenshot(path=pictures / f"lab-{width}-{scheme}.png", full_page=True)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.inner_text("#factors").startswith("contraction factor of CTC+FPI (eq 6): at most 0.")
     assert not opened.complaints
     assert not [address for address in opened.requests if not address.startswith(("file:", "blob:"))]
+
+
+def test_a_report_has_a_button_to_the_lab_beside_it(visit, tmp_path):
+    """`compare --lab` writes both files; the button leads from one to the other, and neither page complains."""
+    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
+    words = [
+        "compare",
+        "two_mass",
+        "--controllers",
+        "CTC",
+        "CTC+FPI (eq 6)",
+        "--lab",
+        "--no-compile",
+        "--out",
+        str(tmp_path),
+    ]
+    assert main(words) == 0
+    opened = visit(tmp_path / "report.html")
+    opened.page.click("text=Move sliders in the lab")
+    assert opened.page.url.endswith("/lab.html")
+    while opened.page.evaluate("!window.shownNumber"):
+        opened.page.wait_for_timeout(20)
+    assert "CTC+FPI (eq 6) lowers the rms error" in opened.page.inner_text("#sentence")
+    assert not opened.complaints

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.comparison import Comparison
     from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 
+_LAB = "lab.html"  # beside the report
 _EXAMPLES = (
     ("fpirhc compare two_mass --scenarios 100 --mismatch 20", "exact parameters within 20 % of the problem's"),
     (
@@ -67,6 +68,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_json(parser, "the table")
     text = "number that the verdict speaks of, such as in_band or rms_error.q1 (default: the problem's headline_metric, or errors)"
     parser.add_argument("--headline", metavar="NAME", help=text)
+    text = "write the lab of the headline's pair beside the report, which gets a button to it; see 'fpirhc lab --help'"
+    parser.add_argument("--lab", action="store_true", help=text)
     text = "use the settings in a file that 'fpirhc tune' wrote, and name them in the report"
     parser.add_argument("--tuned", metavar="FILE", help=text)
     _add_scenarios(parser)
@@ -94,6 +97,11 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
         named = list(select(task, controllers)) if controllers else None
         task, controllers = with_optimisers(task, options.optimisers, named), None
     folder = results_folder(options.out, task.name)
+    if options.lab:
+        from fpirhc.export.lab.lab import lab_of, write_lab
+
+        pair = [name for name in task.headline or () if not controllers or name in controllers]
+        write_lab(lab_of(task, options.problem, pair if len(pair) > 1 else (controllers or ())[:2]), folder / _LAB)
     with progress_bars() as progress:
         comparison = compare(
             task,
@@ -106,7 +114,8 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
         )
     comparison = noted(comparison, tuned.notes) if tuned else comparison
     announce_backend(entry.run for entry in comparison.entries)
-    publish(comparison.view, render(comparison), folder, as_json=options.json)
+    page = render(comparison, lab=_LAB if options.lab else "")
+    publish(comparison.view, page, folder, as_json=options.json)
     return _code(comparison)
 
 
@@ -133,13 +142,18 @@ def _add_scenarios(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Check that options of scenarios stand beside `--scenarios` or `--cases`, and not beside `--optimisers`.
+    """Check that options of scenarios stand beside `--scenarios` or `--cases`, and not beside `--optimisers` or `--lab`.
 
     Raises:
         InvalidValue: options that cannot be combined; the message names the remedy.
     """
     from fpirhc.errors import InvalidValue
 
+    changed = [n for n in ("scenarios", "cases", "tuned", "optimisers") if getattr(options, n)]
+    if options.lab and changed:
+        raise InvalidValue(
+            f"--lab has the controllers of the problem file in one run; leave --{changed[0]} out, or --lab"
+        )
     if options.scenarios is not None and options.cases:
         raise InvalidValue("--cases and --scenarios are two comparisons; give one of them")
     if options.cases and options.mismatch:
@@ -219,6 +233,7 @@ VERB = Verb(
         ("fpirhc compare two_mass", "every controller of a problem; report.html and results.json"),
         ("fpirhc compare my_arm.py --controllers RHC RHC+FPI --out results/arm", "two controllers, another folder"),
         ("fpirhc compare two_mass --json", "one JSON object on standard output"),
+        ("fpirhc compare two_mass --lab", "lab.html beside the report: the headline's pair runs while sliders move"),
         ("fpirhc compare two_mass --optimisers all", "the headline pair with every optimiser"),
         *_EXAMPLES,
     ),

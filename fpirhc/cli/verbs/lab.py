@@ -20,20 +20,16 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
-    from fpirhc.export.lab.lab import make_lab, write_lab
+    from fpirhc.export.lab.lab import lab_of, write_lab
     from fpirhc.problem_files.problem_file import load_problem
-    from fpirhc.studies.comparison.compare import select
 
     task = load_problem(options.problem)
-    names = options.controllers or list(task.headline or list(task.controllers)[:2])
-    chosen = select(task, names)
     path = Path(options.out or "results")
     path = path / f"{task.name}-lab.html" if path.is_dir() or not options.out else path
     output_folder(path.parent)
-    shown = {name: chosen[name] for name in names}
-    lab = make_lab(task.name, task.title, options.problem, task.problem, shown, options.live, task.pictures)
+    lab = lab_of(task, options.problem, options.controllers or (), options.live)
     write_lab(lab, path)
-    print(f"{len(lab.sliders)} sliders for {', '.join(names)}")
+    print(f"{len(lab.sliders)} sliders for {', '.join(loop.name for loop in lab.loops)}")
     for number, why in lab.without.items():
         print(f"no slider for {number}: {why}")
     print(f"wrote {path}")

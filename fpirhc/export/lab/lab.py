@@ -2,7 +2,8 @@
 
 Sliders write numbers into the loop's first memory, where parameters and live settings are, or into what it reads in every cycle:
 set-points, and random series in proportion. One whose number changes anything else there, which Python would have to compute, is
-left out, and the page says why. Automatic settings and scales of plans stay those of the build, as in a deployed controller.
+left out, and the page says why. With other parameters and another reference automatic settings, scales of plans and the first plan
+stay those of the build, as in a deployed controller.
 """
 
 from __future__ import annotations
@@ -13,40 +14,36 @@ import html
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, package
-from fpirhc.export.binaries import web_module
-from fpirhc.export.device import c_of
-from fpirhc.export.targets.c import template, with_own_math
+from fpirhc.export.lab.loop import LabLoop
+from fpirhc.export.targets.c import template
 from fpirhc.plant.motion import forcing_units
+from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.log import judged_motion
-from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.pictures.planar import Planar
 from fpirhc.simulation.simulate import Simulator, run_tables, simulator
-from fpirhc.symbolic.driver import SIGNATURE
+from fpirhc.studies.comparison.compare import select
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.symbolic.paths import changed_at, content_at, paths_to
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import pairs
 from fpirhc.whole_file import write_whole
 
-_POINTS = 2000  # of a curve
-_FRAMES = 500  # of a mechanism that moves
 _SPAN = 4.0  # a slider goes from a fourth to four times its number
 _WAIT = 5  # cycles of dead time that an input without any may get
 _RANDOM = ("sensing", "disturbances")  # parts of a problem with random series
 _SETTINGS = ("gain", "rate")  # sliders where nobody asks for others, beside the limits of inputs
+_OF_REFERENCE = ("scale", "rate")  # and these of the reference
 
 
 @dataclass(frozen=True)
@@ -89,116 +86,6 @@ class Slider:
 
 
 @dataclass(frozen=True, eq=False)
-class LabLoop:
-    """A closed loop that a page runs.
-
-    Args:
-        name: of the controller.
-        ready: the loop with its live settings.
-        picture: the mechanism that moves with it; None: none.
-    """
-
-    name: str
-    ready: Simulator
-    picture: Planar | None = None
-
-    @cached_property
-    def start(self) -> np.ndarray:
-        """The first memory."""
-        return self.started(self.ready.problem, {})
-
-    def started(self, problem: Problem, numbers: dict[str, float]) -> np.ndarray:
-        """Return the first memory with other parameters and settings."""
-        if not self.ready.live.paths:
-            return start_memory(self.ready.loop, problem, self.ready.controller)
-        changed, controller, values = self.ready.live.changed(numbers)
-        return start_memory(self.ready.loop, replace(changed, plant=problem.plant), controller, values)
-
-    def opens(self, path: str) -> bool:
-        """Whether a slider moves this setting, or one end of it."""
-        return any(one in (path, f"{path}.0", f"{path}.1") for one in self.ready.live.paths)
-
-    @cached_property
-    def shown(self) -> list[str]:
-        """Columns that the page draws."""
-        trace = self.ready.loop.trace
-        groups = ("time", "reference", judged_motion(trace), "command", self.error)
-        return [column for name in groups for column in trace[name].columns]
-
-    @property
-    def error(self) -> str:
-        """The signal of the error that counts: the plant's own where sensors show another."""
-        return "true_error" if "true_error" in self.ready.loop.trace else "error"
-
-    @cached_property
-    def module(self) -> bytes:
-        """The loop as WebAssembly."""
-        problem, loop = self.ready.problem, self.ready.loop
-        own, sizes = c_of(loop.function, "lab")
-        places = {name: k for k, name in enumerate(loop.trace.columns)}
-        errors = loop.trace[self.error].columns
-        count = [table.shape[1] for table in self.tables]
-        words = {
-            **{key: str(size + 4) for key, size in sizes.items()},
-            "declaration": f"int lab_raw{SIGNATURE};".replace("casadi_real", "double").replace(
-                "casadi_int", "long long"
-            ),
-            "memory": str(loop.memory.size),
-            "trace": str(loop.trace.size),
-            "cycles": str(problem.cycles),
-            "every": str(self.every),
-            "shown": str(len(self.shown)),
-            "errors": str(len(errors)),
-            "first": str(int(np.ceil(problem.measure_from / problem.period - 1e-9))),
-            "places": ", ".join(str(places[name]) for name in self.shown),
-            "error_places": ", ".join(str(places[name]) for name in errors),
-            "tables": "\n".join(
-                f'static double table_{k}[CYCLES * {size}];\nEXPORT("table_{k}") void* at_{k}(void) {{ return table_{k}; }}'
-                for k, size in enumerate(count)
-            ),
-            "arguments": "\n".join(f"    arg[{k + 1}] = table_{k} + k * {size};" for k, size in enumerate(count)),
-            "frame": str(self.frame),
-            "drawing": "static void draw(int row, const double* held) { (void)row, (void)held; }",
-        }
-        files = {f"lab_step{k}.c": text for k, text in enumerate(own)}
-        if self.picture:
-            drawn, sizes = c_of(self.drawn, "lab_drawn")
-            files |= {f"lab_drawn{k}.c": text for k, text in enumerate(drawn)}
-            followed = [places[name] for name in self.picture.columns(loop.trace)]
-            numbers = {"numbers": self.drawn.numel_out(0), "exact": loop.memory.slice("_exact").start}
-            words["drawing"] = template(
-                "drawing.c",
-                {key: str(size) for key, size in (sizes | numbers).items()}
-                | {"declaration": words["declaration"].replace("lab_raw", "lab_drawn_raw")}
-                | {"followed": ", ".join(map(str, followed)), "count": str(len(followed))},
-                __package__,
-            )
-        files["lab_run.c"] = template("loop.c", words, __package__)
-        return web_module(with_own_math(files, "lab"))
-
-    @property
-    def every(self) -> int:
-        """A curve has one point per so many cycles."""
-        return max(1, self.ready.problem.cycles // _POINTS)
-
-    @property
-    def frame(self) -> int:
-        """The mechanism has one frame per so many cycles."""
-        return max(1, self.ready.problem.cycles // _FRAMES)
-
-    @cached_property
-    def drawn(self) -> ca.Function:
-        """The Function (signals that the mechanism follows, exact parameters) -> numbers of its shapes."""
-        assert self.picture is not None
-        return self.picture.function(len(self.picture.columns(self.ready.loop.trace)))
-
-    @cached_property
-    def tables(self) -> list[np.ndarray]:
-        """Disturbances, the sensors' noise and set-points of the run with seed 0, one row per cycle."""
-        return run_tables(self.ready.problem, 0, self.ready.problem.cycles)
-
-
-@dataclass(frozen=True, eq=False)
 class Lab:
     """Loops and sliders of a page.
 
@@ -217,6 +104,18 @@ class Lab:
     loops: tuple[LabLoop, ...]
     sliders: tuple[Slider, ...]
     without: dict[str, str]
+
+
+def lab_of(task: Task, file: str, names: Sequence[str] = (), live: Sequence[str] = ()) -> Lab:
+    """Return the lab of some controllers of a problem file, or of the pair of its headline; see `make_lab`.
+
+    Raises:
+        FpirhcError: as `make_lab`; InvalidName for a controller that the file does not have.
+    """
+    chosen = names or task.headline or list(task.controllers)[:2]
+    controllers = select(task, list(chosen))
+    shown = {name: controllers[name] for name in chosen}
+    return make_lab(task.name, task.title, file, task.problem, shown, live, task.pictures)
 
 
 def make_lab(
@@ -284,10 +183,11 @@ def _mechanism(ready: Simulator, pictures: Sequence[Picture], without: dict[str,
 
 
 def _usual(problem: Problem, controller: Controller) -> list[str]:
-    """The first gain and the first rate of a controller, and the limits of inputs that are finite."""
+    """Gains and rates of a controller, the limits of inputs that are finite, dead times, and the numbers of the reference."""
     found = [path for name in _SETTINGS for path in paths_to(name, controller) if not path.startswith("optimiser.")]
     return [
         *found,
+        *(f"reference.{path}" for name in _OF_REFERENCE for path in paths_to(name, problem.reference)),
         *(f"limits.inputs.{name}" for name, ends in problem.limits.inputs.items() if np.isfinite(ends).any()),
         *(f"dead_time.inputs.{name}" for name in problem.dead_time.inputs),
         *(["dead_time.measurement"] if problem.dead_time.measurement else []),
@@ -406,7 +306,7 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
         )
         size = max(abs(value), 1e-3)
         low, high = (
-            max(low, min(value / _SPAN, value * _SPAN, value - size)),
+            max(low, value / _SPAN if low > 0 else min(value / _SPAN, value * _SPAN, value - size)),
             min(high, max(value / _SPAN, value * _SPAN))
             if value
             else min(high, max(size, _WAIT * having[0].ready.problem.period)),
@@ -447,12 +347,14 @@ def _places(
             without[path] = str(error)
             return {}
         columns = [loop.ready.loop.memory.columns[k] for k in moved]
-        also = [name for name in columns if not _is_the_number(name, path)]
+        spared = loop.computed_once if path.startswith("reference.") else ()
+        also = [name for name in columns if not _is_the_number(name, path) and name not in spared]
         if also:
             without[path] = f"'{also[0]}' in the memory of {loop.name} follows from it, and only Python computes that"
             return {}
-        if len(moved):
-            places[number] = moved.tolist()
+        own = [int(k) for k, name in zip(moved, columns, strict=True) if name not in spared]
+        if own:
+            places[number] = own
     return places
 
 
@@ -534,7 +436,8 @@ def _loop_data(loop: LabLoop) -> dict[str, Any]:
         "errors": len(loop.ready.loop.trace[loop.error].columns),
         "live": list(loop.ready.live.paths),
         "frame": loop.frame,
-        "numbers": loop.drawn.numel_out(0) if loop.picture else 0,
+        "shapes": loop.shapes,
+        "responses": loop.factor.size1_out(0) if loop.factor else 0,
     }
 
 

@@ -30,8 +30,40 @@ function run(loop, numbers, parts) {
   const kept = new Float64Array(e.memory.buffer, e.kept_at(), rows * width);
   const columns = Array.from({ length: width }, (_, j) => Float64Array.from({ length: rows }, (_, k) => kept[k * width + j]));
   const squares = [...new Float64Array(e.memory.buffer, e.squares_at(), loop.errors)];
-  const frames = loop.numbers ? new Float64Array(e.memory.buffer, e.frames_at(), Math.ceil(cycles / loop.frame) * loop.numbers).slice() : null;
-  return { cycles, columns, squares, frames, frameWidth: loop.numbers, took: performance.now() - began };
+  return { cycles, columns, squares, ...seen(loop, Math.ceil(cycles / loop.frame)), took: performance.now() - began };
+}
+
+// Of every frame the numbers of the mechanism, and by how much an error of the response is multiplied in this cycle.
+function seen(loop, count) {
+  const numbers = loop.shapes + loop.responses ** 2;
+  if (!numbers) return { frames: null, factors: null, frameWidth: 0 };
+  const all = new Float64Array(loop.exports.memory.buffer, loop.exports.frames_at(), count * numbers);
+  const frames = new Float64Array(count * loop.shapes), factors = loop.responses ? new Float64Array(count) : null;
+  for (let k = 0; k < count; ++k) {
+    const from = k * numbers, behind = from + loop.shapes;
+    frames.set(all.subarray(from, behind), k * loop.shapes);
+    if (factors) factors[k] = radius(Array.from(all.subarray(behind, from + numbers)), loop.responses);
+  }
+  return { frames, factors, frameWidth: loop.shapes };
+}
+
+// The spectral radius max|lambda| = lim |M^k|^(1/k) of an n x n matrix, by squares; 1 where an entry is no number, as nothing shrinks there.
+function radius(matrix, n) {
+  if (!matrix.every(Number.isFinite)) return 1;
+  if (n === 1) return Math.abs(matrix[0]);
+  let logarithm = 0, one = matrix;
+  for (let power = 1; power <= 2 ** 40; power *= 2) {
+    const size = Math.max(...one.map(Math.abs));
+    if (!size) return 0;
+    logarithm += Math.log(size) / power;
+    const part = one.map((x) => x / size);
+    one = part.map((_, at) => {
+      let sum = 0;
+      for (let j = 0; j < n; ++j) sum += part[(at % n) + n * j] * part[j + n * Math.floor(at / n)];
+      return sum;
+    });
+  }
+  return Math.exp(logarithm);
 }
 
 onmessage = async ({ data }) => {
