@@ -1,7 +1,8 @@
 """Generated scalar code, written shorter for processors that compute numbers by calls.
 
-CasADi writes a choice as (c ? x : 0) + (!c ? y : 0), and a comparison as a number. Here a choice is one expression, a comparison is
-a byte, and every value is computed just before it is needed. Values stay as they are, except that a chosen -0 is no longer +0.
+CasADi writes a choice as (c ? x : 0) + (!c ? y : 0), a comparison as a number, and NaN as asin(2). Here a choice is one expression,
+a comparison is a byte, and every value is computed just before it is needed, an elementary function only where a choice takes what
+follows from it. Values that are taken stay as they are, except that a chosen -0 is no longer +0.
 """
 
 from __future__ import annotations
@@ -23,6 +24,12 @@ _NOT = re.compile(r"\(!(v\d+)\)\Z")
 _HALF = re.compile(r"\((v\d+)\?(v\d+):0\)\Z")
 _CHOICE = re.compile(r"\(v\d+\?(v\d+):(0|v\d+)\)\Z")
 _SUM = re.compile(r"\((v\d+)\+(v\d+)\)\Z")
+_TWICE, _ARCSINE = re.compile(r"\(2\.\*(v\d+)\)\Z"), re.compile(r"asin\((v\d+)\)\Z")
+_NO_NUMBER = re.compile(r"\((v\d+)\?NAN:0\)\Z")
+_BOTH = re.compile(r"casadi_f(min|max)\((v\d+),(v\d+)\)\Z")
+_WHOLE_CHOICE = re.compile(r"\((v\d+)\?(\w+):(\w+)\)\Z")
+_ELEMENTARY = re.compile(r"(?:exp|log|pow|sin|cos|tan|tanh|atanh|asin|acos|atan|sinh|cosh)\(")
+_Way = tuple[tuple[str, bool], ...]  # flags, outermost first, and what they are where a value is taken
 
 
 def condensed(text: str) -> str:
@@ -42,9 +49,11 @@ class _Lines:
         values: expressions by name, in the order in which they are computed.
         rows: where a value is read, by name.
         stored: (place, name).
+        flags: names of the values that are 0 or 1.
     """
 
     values: dict[str, str] = field(default_factory=dict)
+    flags: set[str] = field(default_factory=set)
     rows: dict[str, str] = field(default_factory=dict)
     stored: list[tuple[str, str]] = field(default_factory=list)
 
@@ -57,7 +66,11 @@ class _Lines:
                 self.stored.append((f"res{stored[1]}[{stored[2]}]", now[stored[3]]))
             elif assigned:
                 name, read = f"v{len(self.values)}", _READ.match(assigned[2])
-                self.values[name] = self._chosen(_OLD.sub(lambda one: now[one[0]], assigned[2]))
+                value = self._without_numbers(self._chosen(_OLD.sub(lambda one: now[one[0]], assigned[2])))
+                self.values[name] = value
+                chosen = _CHOICE.match(value)
+                if _FLAG.match(value) or (chosen and {chosen[1], chosen[2]} <= self.flags | {"0"}):
+                    self.flags.add(name)
                 if read:
                     self.rows[name] = f"arg{read[1]}[{read[2]}]"
                 now[assigned[1]] = name
@@ -73,9 +86,45 @@ class _Lines:
                 return f"({first[1]}?{first[2]}:{second[2]})"
         return value
 
+    def _without_numbers(self, value: str) -> str:
+        """What flags decide as a choice or as a flag, where it is written as arithmetic."""
+        arcsine, both, sum_ = _ARCSINE.match(value), _BOTH.match(value), _SUM.match(value)
+        twice = _TWICE.match(self.values[arcsine[1]]) if arcsine else None
+        if twice and twice[1] in self.flags:
+            return f"({twice[1]}?NAN:0)"
+        if both and {both[2], both[3]} <= self.flags:
+            return f"({both[2]}{'&&' if both[1] == 'min' else '||'}{both[3]})"
+        for one, other in (sum_.groups(), sum_.groups()[::-1]) if sum_ else ():
+            none = _NO_NUMBER.match(self.values[one])
+            if none:
+                return f"({none[1]}?NAN:{other})"
+        return value
+
+    def _ways(self) -> dict[str, _Way]:
+        """For every value the choices behind which alone it is taken."""
+        ways: dict[str, _Way] = {name: () for _, name in self.stored}
+        for name, value in reversed(self.values.items()):
+            if name not in ways:
+                continue  # nobody takes it
+            way, choice = ways[name], _WHOLE_CHOICE.match(value)
+            for one in _NEW.findall(value):
+                apart = choice is not None and choice[2] != choice[3] and one != choice[1]
+                side = {choice[2]: True, choice[3]: False}.get(one) if choice and apart else None
+                here = (*way, (choice[1], side)) if choice and side is not None else way
+                ways[one] = _shared(ways[one], here) if one in ways else here
+        return ways
+
+    def _where_taken(self) -> None:
+        """Compute elementary functions where they are taken, 0 elsewhere, as far as it is known before."""
+        for name, way in self._ways().items():
+            known = [("" if yes else "!") + flag for flag, yes in way if int(flag[1:]) < int(name[1:])]
+            if known and _ELEMENTARY.match(self.values[name]):
+                self.values[name] = f"({'&&'.join(dict.fromkeys(known))}?{self.values[name]}:0)"
+
     def text(self) -> str:
         """The lines, the results first that need the least that is not yet computed: few values then wait at a time."""
-        flags, lines = self._flags(), list[str]()
+        self._where_taken()
+        flags, lines = self.flags, list[str]()
         left = [(place, name, self._needed(name)) for place, name in self.stored]
         while left:
             place, name, missing = left.pop(min(range(len(left)), key=lambda k: len(left[k][2])))
@@ -102,11 +151,8 @@ class _Lines:
     def _with_rows(self, value: str) -> str:
         return _NEW.sub(lambda one: self.rows.get(one[0], one[0]), value)
 
-    def _flags(self) -> set[str]:
-        """Names of the values that are 0 or 1."""
-        flags = set[str]()
-        for name, value in self.values.items():
-            chosen = _CHOICE.match(value)
-            if _FLAG.match(value) or (chosen and {chosen[1], chosen[2]} <= flags | {"0"}):
-                flags.add(name)
-        return flags
+
+def _shared(one: _Way, other: _Way) -> _Way:
+    """The choices with which both ways begin."""
+    same = [a == b for a, b in zip(one, other, strict=False)]
+    return one[: same.index(False) if False in same else len(same)]
