@@ -124,12 +124,12 @@ def test_firefox_has_the_numbers_of_a_run(firefox, tmp_path):
             for name, values in zip(loop.shown, columns, strict=True):
                 wanted = np.ravel(run[name])[:: loop.every]
                 assert np.abs(np.array(values) - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max()), name
-    for k in range(1, 51):
+    for k in range(1, 101):
         firefox.move(0.5 + k / 250)
     began = firefox.memory()
     for k in range(1, 501):
         firefox.move(0.5 + k / 250)
-    assert firefox.memory() < began + 100e6
+    assert firefox.memory() < began + 200e6
     assert "CTC+FPI (eq 6)" in firefox.evaluate("document.getElementById('sentence').textContent")
     assert firefox.evaluate("document.getElementById('motion').querySelectorAll('canvas').length") == 2
     assert firefox.complaints == []

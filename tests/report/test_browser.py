@@ -297,7 +297,7 @@ def test_a_lab_runs_anew_while_a_slider_moves(width, scheme, visit, pictures, tm
     assert page.evaluate("performance.memory.usedJSHeapSize") < 2 * size + 2e7
     page.screenshot(path=pictures / f"lab-{width}-{scheme}.png", full_page=True)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert page.inner_text("#factors").startswith("contraction factor of CTC+FPI (eq 6): at most 0.")
+    assert page.inner_text("#factors").startswith("Contraction factor of CTC+FPI (eq 6): at most 0.")
     assert not opened.complaints
     assert not [address for address in opened.requests if not address.startswith(("file:", "blob:"))]
 

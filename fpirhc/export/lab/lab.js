@@ -93,7 +93,7 @@ function draw(answers) {
   }
   moving?.load(answers.map((one, k) => ({ name: DATA.loops[k].name, color: colors[k], step: DATA.motion.step, width: one.frameWidth, numbers: one.frames })));
   say("sentence", verdict(answers));
-  say("factors", answers.map(contraction).filter(Boolean).join("; "));
+  say("factors", answers.map(contraction).filter(Boolean).join(". "));
   const sorted = [...times].slice(-50).sort((a, b) => a - b), worst = sorted[Math.floor(0.95 * (sorted.length - 1))];
   say("rate", answers.map((a, k) => DATA.loops[k].name + " " + a.took.toFixed(0) + " ms").join(", ") +
     " for " + DATA.cycles + " cycles; from move to picture " + sorted[sorted.length >> 1].toFixed(0) + " ms (95 %: " + worst.toFixed(0) + " ms)");
@@ -123,7 +123,7 @@ function contraction({ factors }, k) {
   if (!factors) return "";
   const largest = factors.reduce((a, b) => Math.max(a, b), 0), growing = factors.filter((one) => one >= 1).length / factors.length;
   const said = growing ? "errors of the response grow in " + short(100 * growing) + " % of the cycles" : "below 1, so errors of the response shrink in every cycle";
-  return "contraction factor of " + DATA.loops[k].name + ": at most " + short(largest) + ", " + said;
+  return "Contraction factor of " + DATA.loops[k].name + ": at most " + short(largest) + ", " + said;
 }
 
 // The address, and the same in Python

@@ -71,7 +71,11 @@ onmessage = async ({ data }) => {
     if (data.loops) {
       loops = await Promise.all(data.loops.map(made));
       postMessage({ ready: true });
-    } else postMessage({ number: data.number, answers: loops.map((loop, k) => run(loop, data.numbers[k], data.rows)) });
+    } else {
+      const answers = loops.map((loop, k) => run(loop, data.numbers[k], data.rows));
+      const arrays = answers.flatMap((one) => [...one.columns, one.frames, one.factors]).filter(Boolean);
+      postMessage({ number: data.number, answers }, arrays.map((array) => array.buffer)); // handed over, not copied
+    }
   } catch (error) {
     postMessage({ error: String(error) });
   }
