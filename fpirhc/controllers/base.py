@@ -51,6 +51,30 @@ def fed(block: Block, name: str, source: Signal) -> Block:
     )
 
 
+def under_names(block: Block, names: Mapping[str, str]) -> Block:
+    """Return the block with other names for the signals that it reads, writes and remembers."""
+
+    def other(layout: Layout) -> Layout:
+        return Layout(tuple(replace(s, name=names.get(s.name, s.name)) for s in layout.signals))
+
+    def step(s: Signals) -> dict[str, Value]:
+        given = {names.get(n, n): n for n in (*block.reads.names, *block.memory.names)}
+        values = block.step(Signals({n: getattr(s, new) for new, n in given.items()}))
+        later = {f"{n}_next": f"{names.get(n, n)}_next" for n in block.memory.names}
+        return {later.get(n, names.get(n, n)): value for n, value in values.items()}
+
+    waits, lossy = block.waits, block.bridged
+    return replace(
+        block,
+        reads=other(block.reads),
+        writes=other(block.writes),
+        memory=other(block.memory),
+        step=step,
+        waits=None if waits is None else under_names(waits, names),
+        bridged=None if lossy is None else lambda: under_names(lossy(), names),
+    )
+
+
 def reference_block(problem: Problem) -> Block:
     """Block (time, state or outputs) -> (their reference, response of the controlled ones, error of the judged ones)."""
     plant, seen = problem.plant, problem.plant.output

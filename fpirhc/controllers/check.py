@@ -20,7 +20,7 @@ from fpirhc.contraction.spectrum import Spectrum, assess_gain, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import form_inside
-from fpirhc.errors import NotContractive, NotSupported
+from fpirhc.errors import NotContractive
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import every
@@ -91,6 +91,12 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
     best = None if form.referenced else next((d for d, most in limits.items() if abs(gain) < most), None)
     raise NotContractive(_too_late(problem, deformation, form, largest, best))
+
+
+def limit_behind(deformation: Deformation, weights: np.ndarray, late: float, eigenvalue: float) -> float:
+    """Return the largest effective gain for a response with these weights of past requests, late by some cycles."""
+    form = _form(deformation)
+    return form.limit(_late(weights, late), eigenvalue, form.pairing)
 
 
 def product_limit(problem: Problem, deformation: Deformation) -> float | None:
@@ -222,8 +228,7 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     Raises:
         FpirhcError: the controller's own check fails.
         NotContractive: the gain of the deformation has the wrong sign, or is too large behind estimator and filter.
-        NotSupported: a form of the deformation that cannot be used here; a
-            response of the controller's own behind sensors or dead time.
+        NotSupported: a form of the deformation that cannot be used here.
     """
     task, build = nominal(problem), nominal(controller)
     ready = _CHECKED.of((task, build), (numbers_only, _REFUSES.get()), lambda: _checked(task, build, numbers_only))
@@ -244,13 +249,7 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
         check_gain_sign(problem, ready.deformation)
         check_gain_size(problem, ready.deformation)
         return ready
-    late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-    if late or not problem.sensing.ideal:
-        what = "dead time" if late else "sensing"
-        raise NotSupported(
-            f"{type(ready).__name__} reads responses of its own, without delay and noise; leave {what} out of the problem"
-        )
-    return ready
+    return ready  # its own check judges the gains of its own responses
 
 
 def check_form(problem: Problem, controller: Controller) -> None:

@@ -63,11 +63,12 @@ class Response:
 
     Args:
         signal: named 'realised'.
-        function: Function (state, input, parameters, forcing) -> the response.
+        function: Function (state, input, parameters, forcing) -> the response; None where the controller finds it from its
+            measurements.
     """
 
     signal: Signal
-    function: ca.Function
+    function: ca.Function | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +255,7 @@ class Controller(Checked, ABC):
     def with_defaults(self, problem: Problem) -> Self:
         """Return the controller with the numbers chosen that it leaves to the problem; what it wraps has its own already."""
         own = self.deformation
-        deformation = _late(own, problem)
+        deformation = late_deformation(own, problem)
         if automatic(deformation):
             where = problem if self.inner is None else self.inner_problem(problem)
             request = (
@@ -305,23 +306,29 @@ class ControllerWrapper(Controller, ABC):
 
 def with_lateness(problem: Problem, controller: Controller) -> Controller:
     """Return the controller whose deformation believes the problem's dead times, and an external plant's lag, where it is open."""
-    own = controller.deformation
-    told = _late(own, problem)
-    return controller if told is own else controller.with_deformation(told)
+    return _with_late(problem, controller)
 
 
 def believing(problem: Problem, controller: Controller) -> Controller:
     """Return the resolved controller whose deformation believes this problem's dead times and lags in every other one too."""
-    ready = resolved(problem, controller)
-    own = ready.deformation
-    told = _late(own, problem, least=0)
-    return ready if told is own else ready.with_deformation(told)
+    return _with_late(problem, resolved(problem, controller), least=0)
 
 
-def _late(deformation: Deformation, problem: Problem, least: float = math.ulp(0.0)) -> Deformation:
-    """The deformation with open dead times and lags of at least `least`; inputs not one per coordinate have the longest."""
+def _with_late(problem: Problem, controller: Controller, least: float = math.ulp(0.0)) -> Controller:
+    """The controller with the deformation of `late_deformation`; one with several deformations has its own for each already."""
+    own = controller.deformation
+    late = late_deformation(own, problem, least)
+    kept = late is own or controller.response(problem) is not None
+    return controller if kept else controller.with_deformation(late)
+
+
+def late_deformation(deformation: Deformation, problem: Problem, least: float = math.ulp(0.0)) -> Deformation:
+    """Return the deformation with open dead times and lags of at least `least`.
+
+    Inputs that are not one per coordinate have the longest.
+    """
     if deformation.inner is not None:
-        inner = _late(deformation.inner, problem, least)
+        inner = late_deformation(deformation.inner, problem, least)
         deformation = deformation if inner is deformation.inner else with_inner(deformation, inner)
     if not is_dataclass(deformation):
         return deformation
@@ -401,6 +408,12 @@ def refuse_without(controller: Controller, what: str) -> NoReturn:
         NotSupported: always, with what it lacks.
     """
     raise NotSupported(f"{type(innermost(controller)).__name__} has no {what}")
+
+
+def given_response(problem: Problem, controller: Controller) -> Response | None:
+    """Return the response that a controller is given in place of that of the plant's controlled quantities; None: that one."""
+    own = controller.response(problem)
+    return None if own is None or own.function is None else own
 
 
 def require_controlled_response(problem: Problem, controller: Controller, refusal: str) -> None:

@@ -9,13 +9,14 @@ acted according to the beliefs. Where the response is estimated from samples, a 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.model_inputs import NONE, CommandPath
+from fpirhc.controllers.model_inputs import CommandPath
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import controlled_places, time_signal
@@ -42,25 +43,26 @@ def measured_output(plant: Plant) -> Signal:
     return Signal(MEASURED_OUTPUT, plant.output.elements, plant.output.units)
 
 
-_BEFORE, _ANSWERS = "mirror_state_before", "mirror_answers"
-
-
 __all__ = ["MEASURED", "MEASURED_OUTPUT", "MEASURED_TIME", "measured_reads", "mirror_blocks", "with_measured_state"]
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
     """Return the block that writes '_modelled', the response that a model-referenced map reads, with what it remembers."""
-    mirror = deformation.mirror
-    estimator, part = problem.sensing.estimator, mirror.measurement % 1 > NONE
-    inputs = problem.plant.input
-    last, waits = Signal("_command_before", inputs.elements, inputs.units), Queue(mirror.cycles, longest=mirror.longest)
-    path = CommandPath(problem, "mirror", last, waits, mirror.measurement, mirror.lag, counts=False)
+    path = believed_path(problem, deformation)
+    estimator, part = problem.sensing.estimator, path.fraction > 0
     if estimator.of_steps or (estimator.shows_response and not part):
         return [instant_mirror(path)], []
     path = replace(path, counts=True)
     if problem.plant.outputs:
         return [twin_of_outputs(path)], []
     return [twin_block(path)], [Delay(problem.plant.response_signal(BEFORE), "_deformation")]
+
+
+def believed_path(problem: Problem, deformation: Deformation, owner: str = "mirror") -> CommandPath:
+    """Return the way of the commands to the model of a deformation; `owner` begins the names of what is remembered."""
+    mirror, inputs = deformation.mirror, problem.plant.input
+    last, waits = Signal("_command_before", inputs.elements, inputs.units), Queue(mirror.cycles, longest=mirror.longest)
+    return CommandPath(problem, owner, last, waits, mirror.measurement, mirror.lag, counts=False)
 
 
 def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
@@ -83,7 +85,26 @@ def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
     return tuple([signal for signal in every if signal.name in read])
 
 
-def instant_mirror(path: CommandPath, *, lost: bool = False) -> Block:
+class Answers(NamedTuple):
+    """The responses that a model gives.
+
+    Args:
+        response: function of (state, input, parameters).
+        orders: of the responses, by name.
+        signal: that holds them.
+    """
+
+    response: Callable[[Expression, Expression, Expression], Expression]
+    orders: Mapping[str, int]
+    signal: Signal
+
+
+def _controlled(plant: Plant) -> Answers:
+    orders = {name: plant.chains[name] for name in plant.controlled_names}
+    return Answers(plant.equations.controlled_response, orders, plant.response_signal("_modelled"))
+
+
+def instant_mirror(path: CommandPath, answers: Answers | None = None, *, lost: bool = False) -> Block:
     """Return the block (measured state, last command, parameters) -> the model's response that is measured in this cycle.
 
     There is no twin that could drift. The model answers from the measured state, or on a map from that of the cycle before. A
@@ -92,43 +113,42 @@ def instant_mirror(path: CommandPath, *, lost: bool = False) -> Block:
 
     Args:
         path: of the commands to the model.
+        answers: of the model; None: the controlled responses.
         lost: whether samples may be lost; the state of the last cycle is then on the line over the gap.
     """
     plant = path.problem.plant
+    response, orders, written = answers or _controlled(plant)
     age, start = response_age(plant), tuple(map(float, path.problem.start_state))
-    before = (Signal(_BEFORE, plant.state.elements, plant.state.units, start),) * age
-    waits = [age * (plant.chains[name] - 1) for name in plant.controlled_names]
-    waiting = tuple(
-        f"{name}@{i}" for name, cycles in zip(plant.controlled_names, waits, strict=True) for i in range(1, cycles + 1)
-    )
-    queues = (Signal(_ANSWERS, waiting),) if waiting else ()
+    last, queued = f"{path.owner}_state_before", f"{path.owner}_answers"
+    before = (Signal(last, plant.state.elements, plant.state.units, start),) * age
+    waits = [age * (order - 1) for order in orders.values()]
+    waiting = tuple(f"{name}@{i}" for name, cycles in zip(orders, waits, strict=True) for i in range(1, cycles + 1))
+    queues = (Signal(queued, waiting),) if waiting else ()
 
     def step(s: Signals) -> dict[str, Expression]:
         acting, _, remembered = path.acted(s)
-        at = getattr(s, _BEFORE if age else MEASURED)
+        at = getattr(s, last if age else MEASURED)
         at = straightened(at, getattr(s, MEASURED), s.gap) if lost else at
         parameters, signals = path.parameters(s)
-        answers = ca.vertsplit(plant.equations.controlled_response(at, acting, parameters))
-        past = ca.vertsplit(getattr(s, _ANSWERS)) if waiting else []
+        past = ca.vertsplit(getattr(s, queued)) if waiting else []
         modelled, later = [], []
-        for answer, cycles in zip(answers, waits, strict=True):
+        for answer, cycles in zip(ca.vertsplit(response(at, acting, parameters)), waits, strict=True):
             queue, past = [answer, *past[:cycles]], past[cycles:]
             modelled.append(queue[-1])
             later += queue[:-1]
         remembered |= {f"{one.name}_next": getattr(s, MEASURED) for one in before} | signals
         if later:
-            remembered[f"{_ANSWERS}_next"] = ca.vertcat(*later)
-        return {"_modelled": ca.vertcat(*modelled), **remembered}
+            remembered[f"{queued}_next"] = ca.vertcat(*later)
+        return {written.name: ca.vertcat(*modelled), **remembered}
 
     reads = measured_state(plant), *path.reads
-    writes = Layout((plant.response_signal("_modelled"),))
-    block = Block("mirror", Layout(reads), writes, step, Layout((*path.memory, *before, *queues)))
+    block = Block(path.owner, Layout(reads), Layout((written,)), step, Layout((*path.memory, *before, *queues)))
     if not age:
         return replace(block, waits=unseen(block, (MEASURED,))) if path.memory else block
     if not lost:
-        return replace(block, bridged=lambda: instant_mirror(path, lost=True))
-    unmoved = unseen(instant_mirror(path), (MEASURED,))
-    held = replace(unmoved, step=lambda s: {**unmoved.step(s), f"{_BEFORE}_next": getattr(s, _BEFORE)})
+        return replace(block, bridged=lambda: instant_mirror(path, answers, lost=True))
+    unmoved = unseen(instant_mirror(path, answers), (MEASURED,))
+    held = replace(unmoved, step=lambda s: {**unmoved.step(s), f"{last}_next": getattr(s, last)})
     return replace(block, reads=Layout((*reads, GAP)), waits=held)
 
 

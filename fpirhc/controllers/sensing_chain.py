@@ -15,6 +15,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, fed, like
 from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.mirror import measured_reads, with_measured_state
 from fpirhc.controllers.model_inputs import ACTED, NOW, KnownSignals
 from fpirhc.controllers.observed_state import Believing, check_believed
@@ -223,7 +224,7 @@ def _ahead_block(plant: Plant, measured: Signal, *, lost: bool = False) -> Block
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
     """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
-    plant, response = problem.plant, controller.response(problem)
+    plant, response = problem.plant, given_response(problem, controller)
     realised = response.signal if response else plant.response_signal("realised")
     parameters = controller.plant_model(problem).plant.parameter
     return Layout((time_signal(plant), *measured_signals(plant), realised, parameters, *given_signals(problem)))

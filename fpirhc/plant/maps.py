@@ -172,6 +172,11 @@ def poles_over(plant: Motion, modes: np.ndarray, time: float) -> np.ndarray:
     return np.asarray((1 + sampling(plant) * modes) ** round(time / sampling(plant)))
 
 
+def rate_of_decay(plant: Motion, time: float) -> float:
+    """Return the rate of what decays as exp(-t / time): -1 / time, or on a map that of its divided differences."""
+    return -1 / time if plant.step is None else math.expm1(-sampling(plant) / time) / sampling(plant)
+
+
 def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
     return np.real if plant.step is None else partial(decay_rates, cycle=sampling(plant))

@@ -29,7 +29,7 @@ from fpirhc.report.figures import (
     sweep_figure,
 )
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
-from fpirhc.simulation.log import shown_motion
+from fpirhc.simulation.log import responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import readable
 from fpirhc.studies.comparison.outcome import Outcome
@@ -338,7 +338,6 @@ def asset(name: str) -> str:
 
 INTERVALS = 300
 _REALITY = "reality_state"
-_RESPONSES = ("nominal", "desired", "deformed", "realised")
 
 
 def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]:
@@ -364,7 +363,7 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
         charts.append(_chart(f"command {i}", first.unit(f"command.{i}"), lines, edges))
     for e in entries:
         for c in e.run.layout["desired"].elements:
-            lines = [(signal, e.run[f"{signal}.{c}"]) for signal in _RESPONSES]
+            lines = [(what, e.run[f"{signal}.{c}"]) for what, signal in responses_of(e.run.layout).items()]
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
     charts += _reality_charts(entries, edges)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.simulation.log import Log, shown_motion
+from fpirhc.simulation.log import Log, responses_of, shown_motion
 from fpirhc.summary import printable
 
 if TYPE_CHECKING:
@@ -127,10 +127,10 @@ def draw_legend(axis: Axes) -> None:
 
 def draw_responses(axis: Axes, run: Log, name: str) -> None:
     """Draw the nominal, desired, deformed and realised response of one coordinate; a spike does not hide the rest."""
-    for signal, color in _RESPONSES.items():
-        style = ":" if signal == "realised" else "-"
-        draw_line(axis, run, f"{signal}.{name}", f"{name} {signal}", color, style)
-    values = np.abs(np.concatenate([run[f"{s}.{name}"] for s in _RESPONSES])) if run.cycles else np.zeros(1)
+    columns = {what: f"{signal}.{name}" for what, signal in responses_of(run.layout).items()}
+    for what, column in columns.items():
+        draw_line(axis, run, column, f"{name} {what}", _RESPONSES[what], ":" if what == "realised" else "-")
+    values = np.abs(np.concatenate([run[column] for column in columns.values()])) if run.cycles else np.zeros(1)
     usual = float(np.quantile(values, 0.99))
     if usual > 0 and values.max() > _TALL * usual:
         axis.set_ylim(-3 * usual, 3 * usual)

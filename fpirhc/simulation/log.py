@@ -121,6 +121,12 @@ def shown_motion(layout: Layout) -> str:
     return "output" if "output" in layout else "state"
 
 
+def responses_of(layout: Layout) -> dict[str, str]:
+    """Return the columns of responses by what they are: time slots find their realised ones from what is measured."""
+    own = "realised_of_slots" in layout
+    return {n: n for n in ("nominal", "desired", "deformed")} | {"realised": "realised_of_slots" if own else "realised"}
+
+
 def _true_error(layout: Layout, log: np.ndarray) -> np.ndarray:
     state = layout[judged_motion(layout)]
     if "reference" not in layout:

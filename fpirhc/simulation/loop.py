@@ -12,6 +12,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.gate import BRIDGED, INNER, Gate, across_gaps, gap_of
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.plausible import plausible_range, response_jumps
@@ -52,7 +53,7 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     inner, gap = across_gaps(compose_with_sensing(problem, ready)), gap_of(task, BRIDGED)
     acting = Gate(task, inner, trusted=("time", "memory"), plausible=plausible, gap=gap)
     disturbed = disturbance_signals(problem)
-    seeing = sensing_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
+    seeing = sensing_blocks(problem, given_response(problem, ready), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(problem, disturbed)
@@ -77,7 +78,7 @@ def start_memory(
     """
     remembered = []
     if not problem.sees_plant:
-        sensing = sensing_blocks(problem, controller.response(problem), predicts=False)
+        sensing = sensing_blocks(problem, given_response(problem, controller), predicts=False)
         remembered += [s for block in sensing for s in block.memory.signals]
     remembered += [delay.now for delay in _plant_delays(problem, controller)]
     starts = {s.name: s.start_vector() for s in remembered}

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, fed
+from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.gate import Gate, across_gaps, gap_of, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.plausible import response_jumps
@@ -243,7 +244,7 @@ def composed_step(
 
 def measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
     """Return the names of what a step is given: the state and the responses, or what the sensors show."""
-    raw, plant, own = raw_signal(problem), problem.plant, controller.response(problem)
+    raw, plant, own = raw_signal(problem), problem.plant, given_response(problem, controller)
     if raw is not None:
         return (*(e for signal in given_states(problem) for e in signal.elements), *raw.elements)
     responses = plant.response_signal("realised") if own is None else own.signal

@@ -234,22 +234,24 @@ class Equations(Mover):
         Runge-Kutta evaluation of this cycle. Outputs are those of the moving plant, with its exact parameters.
         """
         problem, truth = self.problem, self.problem.truth
-        reads, writes = _real_signals(problem), (*motion, response.signal)
+        signal, answer = response.signal, response.function
+        assert answer is not None  # see `given_response`
+        reads, writes = _real_signals(problem), (*motion, signal)
         own = () if problem.reality is None else (like(truth.plant.state, REALITY_STATE),)
-        shown = {signal.name: truth.function(signal.elements) for signal in motion}
+        shown = {one.name: truth.function(one.elements) for one in motion}
         shifts = bool(problem.disturbed_outputs)
         if shifts:
             reads, writes = (*reads, disturbance_signal(problem)), (*writes, logged_signal(problem))
 
         def step(s: Signals) -> dict[str, Expression]:
             now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
-            values = {response.signal.name: response.function(*now)}
+            values = {signal.name: answer(*now)}
             values |= {name: function(*now) for name, function in shown.items()}
             if shifts:
                 below, answered = added(problem, s.disturbance)
-                sums = {response.signal.name: answered, motion[-1].name: below}
+                sums = {signal.name: answered, motion[-1].name: below}
                 values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
-            return {**values, **{signal.name: s._state_before for signal in own}}
+            return {**values, **{one.name: s._state_before for one in own}}
 
         return Block("sense", Layout(reads), Layout((*writes, *own)), step)
 

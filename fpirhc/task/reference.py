@@ -18,7 +18,7 @@ from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
-from fpirhc.plant.maps import differentiated, time_derivatives
+from fpirhc.plant.maps import time_derivatives
 from fpirhc.plant.motion import followed, followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
@@ -68,13 +68,6 @@ class Reference(Checked, ABC):
         results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
         return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
 
-    def derivatives(self, coordinate: str, order: int) -> ca.Function:
-        """Function t -> the coordinate's nominal value and its derivatives up to `order`, shape (order + 1,)."""
-        matrix = kind(self.opaque)
-        t = matrix.sym("t")
-        values = differentiated(matrix(self.coordinates(t)[coordinate]), t, order)
-        return ca.Function("fpirhc_reference_derivatives", [t], [ca.densify(ca.vertcat(*values))])
-
     @property
     def set_points(self) -> Mapping[str, Steps]:
         """The set-points of a run that is given no others, by coordinate; {}: a run gives this reference no set-points."""
@@ -110,8 +103,11 @@ class Reference(Checked, ABC):
 
     def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
         """Function (t, own signals) -> the coordinate's value and its derivatives up to `order`, shape (order + 1,)."""
-        del plant, stages
-        return self.derivatives(coordinate, order)
+        del stages
+        matrix = kind(self.opaque)
+        t = matrix.sym("t")
+        values = time_derivatives(plant)(matrix(self.coordinates(t)[coordinate]), t, order)
+        return ca.Function("fpirhc_reference_derivatives", [t], [ca.densify(ca.vertcat(*values))])
 
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
         """Function (t, own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from t on; None without own signals."""

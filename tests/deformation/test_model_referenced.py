@@ -303,15 +303,15 @@ def test_forms_that_cannot_be_used(deformation, sentence):
 
 
 def test_controllers_that_cannot_use_it():
-    """ForceMRAC behind a dead time has nothing to mirror it with; a slot cannot keep commands of another slot."""
+    """ForceMRAC behind a dead time has nothing to mirror it with; a slot compares in whole cycles."""
     controller = fp.rivals.ForceMRAC(LAW, fp.ModelReferenced(affine(0.5)))
     with pytest.raises(
         NotSupported, match="ForceMRAC cannot use a model-referenced deformation here: it compares the last command"
     ):
         fp.simulate(short(LATE, 10), controller, seed=0)
     module = fp.load_problem("crane_slots")
-    late = exchanged(module.controllers["slots+FPI"], fp.ModelReferenced(fp.Affine(gain=-0.5), cycles=2))
-    with pytest.raises(fp.FpirhcError, match="commands of earlier cycles, which belong to another slot"):
+    late = exchanged(module.controllers["slots+FPI"], fp.ModelReferenced(fp.Affine(gain=-0.5), measurement=2.5))
+    with pytest.raises(fp.FpirhcError, match="a measurement is late by whole cycles"):
         fp.simulate(module.problem, late, seed=0)
 
 

@@ -17,7 +17,6 @@ import pytest
 from plants import simulated
 
 import fpirhc as fp
-from fpirhc.controllers.slots.slot import output_chain
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.plant.maps import over
 from fpirhc.report.html import chart_data
@@ -204,13 +203,6 @@ def test_what_does_not_fit_a_map_is_refused(what: str) -> None:
     build, message = BAD[what]
     with pytest.raises(FpirhcError, match=message):
         build()
-
-
-def test_derivatives_of_a_map_are_refused() -> None:
-    with pytest.raises(
-        NotSupported, match="output_chain differentiates with respect to time, which a map does not have"
-    ):
-        output_chain(fishery(), "stock")
 
 
 def test_a_page_draws_steps() -> None:

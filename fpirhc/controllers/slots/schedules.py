@@ -13,7 +13,6 @@ from typing import TypeGuard
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 
 from fpirhc.controllers.base import error_signal, like
 from fpirhc.controllers.reference_states import reference_states
@@ -22,7 +21,9 @@ from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import finite_number
 from fpirhc.horizon.nominal import reference_state
+from fpirhc.plant.maps import growth_of, rate_of_decay, step_of
 from fpirhc.plant.motion import time_signal
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import FINITE, Signals
 from fpirhc.symbolic.functions import rounded
@@ -190,7 +191,8 @@ class Mode:
     """One slot near the set-point, with n states of the plant.
 
     Args:
-        generator: A, shape (n + 2, n + 2).
+        plant: that moves.
+        generator: A of z' = A z, or of the divided differences of a map, shape (n + 2, n + 2).
         command: row k with u - u* = k z, shape (n + 2,).
         own: row of y^(r) in x - x*, shape (n,).
         gain: b, derivative of y^(r) with respect to the input.
@@ -200,6 +202,7 @@ class Mode:
         integrates: whether the law has an integral.
     """
 
+    plant: Plant
     generator: np.ndarray
     command: np.ndarray
     own: np.ndarray
@@ -211,23 +214,32 @@ class Mode:
 
     @property
     def eigenvalues(self) -> np.ndarray:
-        """Eigenvalues of the motion within the slot, 1/s, without the decay of the offset."""
+        """Eigenvalues of the motion within the slot, or of its divided differences, 1/s, without the decay of the offset."""
         size = self.generator.shape[0] - (1 if self.integrates else 2)
         return np.linalg.eigvals(self.generator[:size, :size])
 
     @property
     def rate(self) -> float:
-        """Largest real part of the eigenvalues, 1/s: the speed with which the slot's zero dynamics diverge."""
-        return float(self.eigenvalues.real.max()) if np.isfinite(self.generator).all() else math.inf
+        """Largest rate of growth, 1/s: the speed with which the slot's zero dynamics diverge."""
+        return float(growth_of(self.plant)(self.eigenvalues).max()) if np.isfinite(self.generator).all() else math.inf
 
-    def start(self, before: Mode) -> np.ndarray:
-        """Return the matrix from z at the end of the slot `before` to z at the start of this one; the command is continuous."""
+    def over(self, time: float) -> np.ndarray:
+        """Return the matrix from z to z after that time within the slot."""
+        return step_of(self.plant, self.generator, time)
+
+    def start(self, before: Mode, held: float = 0.0) -> np.ndarray:
+        """Return the matrix from z at the end of the slot `before` to z at the start of this one; the command is continuous.
+
+        Args:
+            before: slot that ends.
+            held: time before its end at which z is taken, since the last command was given then: the cycle of a map.
+        """
         n = self.own.size
-        matrix = np.zeros((n + 2, n + 2))
-        matrix[:n, :n] = np.eye(n)
-        matrix[n, :n] = self.first_integral
+        matrix, ended = np.zeros((n + 2, n + 2)), before.over(held)[:n]
+        matrix[:n] = ended
+        matrix[n] = self.first_integral @ ended
         if self.blends:
-            realised = np.concatenate([self.own, [0, 0]]) + self.gain * before.command
+            realised = self.own @ ended + self.gain * before.command
             matrix[n + 1] = realised - self.law @ matrix
         return matrix
 
@@ -305,9 +317,9 @@ def _mode(
     if law.integral:
         generator[n, :n] = -chain[0]
     if blend > 0:
-        generator[n + 1, n + 1] = -1 / blend
+        generator[n + 1, n + 1] = rate_of_decay(plant, blend)
     first = feedback / integral if law.integral and law.bumpless else np.zeros(n)
-    return Mode(generator, through, own.ravel(), gain.item(), desired, first, blend > 0, law.integral)
+    return Mode(plant, generator, through, own.ravel(), gain.item(), desired, first, blend > 0, law.integral)
 
 
 _NEVER = -FINITE  # score of a slot that may not be chosen
@@ -411,7 +423,7 @@ class ByLookAhead(Schedule):
         """The matrix of V one dwell later, as a form of the distance now, for every slot."""
         n = problem.plant.state.size
         weight = np.diag([self.weights.get(e, 0.0) for e in problem.plant.state.elements])
-        transitions = [(scipy.linalg.expm(m.generator * self.dwell) @ m.start(m))[:n, :n] for m in modes]
+        transitions = [(m.over(self.dwell) @ m.start(m))[:n, :n] for m in modes]
         return [phi.T @ weight @ phi for phi in transitions]
 
 

@@ -7,7 +7,7 @@ laws and deformations work in a slot as they do on a whole plant, or on the outp
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -15,12 +15,13 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import refuse
+from fpirhc.controllers.mirror import believed_path
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, nearest
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.chain import require_rates
-from fpirhc.plant.lie_derivatives import output_expression, structural_order
+from fpirhc.plant.lie_derivatives import lie_derivatives, output_expression, structural_order
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import derivative_unit, followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -67,6 +68,7 @@ class Channel:
         number: place among the slots.
         plant: the light one, y^(r) = u.
         start_gain: d y^(r)/du of the model at the problem's start.
+        differences: how often the highest derivative that is measured is differenced to find y^(r); 0: y^(r) itself is measured.
     """
 
     slot: Slot
@@ -74,6 +76,7 @@ class Channel:
     number: int
     plant: Plant
     start_gain: float
+    differences: int
 
     def wire(self, name: str) -> str:
         """Return the name of this slot's own copy of a signal."""
@@ -91,7 +94,7 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
         InvalidName: the coordinate or the input is unknown.
         NotInvertible: the input has no effect on the coordinate, y^(r) is not affine in it, or its gain is zero at the start.
         InvalidProblem: the order of the slot is not the model's.
-        NotSupported: a deformation that keeps pairs or commands of earlier cycles.
+        NotSupported: a deformation that keeps pairs of earlier cycles, or a model that cannot be compared with what is measured.
     """
     plant = problem.plant
     chain = output_chain(plant, slot.coordinate, slot.input)
@@ -104,28 +107,49 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
         raise NotInvertible(
             f"derivative {chain.order} of '{slot.coordinate}' is not affine in '{chain.input}', which a slot needs"
         )
-    refuse(_against(slot.deformation))
+    differences = 0 if reads_equations(problem) else _differences(plant, chain)
+    refuse(_against(problem, slot.deformation, differences))
     rest = np.zeros(plant.input.size)
     gain = float(chain.gain(problem.start_state, rest, plant.approximate))
     if not (np.isfinite(gain) and gain != 0):
         raise NotInvertible(f"'{chain.input}' has no effect on '{slot.coordinate}' at the start (gain {gain:g})")
-    return Channel(slot, chain, number, _light_plant(plant, chain), gain)
+    light = integrators(plant, {chain.coordinate: (chain.unit, chain.order)}, (chain.input,))
+    return Channel(slot, chain, number, light, gain, differences)
 
 
-def _against(deformation: Deformation) -> Iterator[str]:
+def reads_equations(problem: Problem) -> bool:
+    """Return whether y^(r) is given as the equations of what moves have it: nothing is measured otherwise, or late."""
+    return problem.sees_plant and problem.of_equations is problem
+
+
+def measured_order(plant: Plant, coordinate: str) -> int:
+    """Return the highest derivative of a coordinate that is measured or estimated; on a map the higher ones are predicted."""
+    return 0 if response_age(plant) else plant.chains[coordinate] - 1
+
+
+def _differences(plant: Plant, chain: OutputChain) -> int:
+    shown = chain.coordinate in plant.controlled_names and plant.response_orders[chain.coordinate] == chain.order
+    return 0 if shown else chain.order - measured_order(plant, chain.coordinate)
+
+
+def _against(problem: Problem, deformation: Deformation, differences: int) -> Iterator[str]:
     """Reasons against a deformation in a slot."""
-    if not deformation.mirror.bare:
+    estimator, referenced = problem.sensing.estimator, deformation.mirror.referenced
+    at_once = estimator.of_steps or (estimator.shows_response and differences < 2)
+    if referenced and not at_once:
         yield (
-            "ModelReferenced in a slot compares with the model's response of this instant; dead time and lag keep commands of "
-            "earlier cycles, which belong to another slot after a switch; leave cycles, measurement and lag out"
+            f"ModelReferenced in a slot compares with the model's response of one cycle, and {estimator} gives a mean over "
+            "several; use the map inside"
         )
-    if deformation.iteration.pairing is not None:
+    if referenced and believed_path(problem, deformation).fraction:
+        yield "ModelReferenced in a slot: a measurement is late by whole cycles; round measurement=..."
+    if not referenced and deformation.iteration.pairing is not None:
         pairs = deformation
         while pairs.inner is not None and pairs.inner.iteration.pairing is not None:
             pairs = pairs.inner
         yield (
-            f"{type(pairs).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch; "
-            "use the map itself"
+            f"{type(pairs).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch, where the command "
+            "would jump back to them; use the map itself, or behind a dead time ModelReferenced(map, cycles=...)"
         )
     outer = form_inside(deformation)
     if outer is not None:
@@ -191,24 +215,30 @@ def delays_for_channel(delays: tuple[Delay, ...], one: Channel) -> list[Delay]:
     ]
 
 
-def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
-    """Return the plant y^(r) = u of one quantity and the input that acts on it."""
-    name = chain.coordinate
+def integrators(plant: Plant, quantities: Mapping[str, tuple[str, int]], inputs: Sequence[str]) -> Plant:
+    """Return the plant y^(r) = u of some quantities, in the time of another plant.
+
+    Args:
+        plant: the other one.
+        quantities: (unit, order) of every quantity, by name.
+        inputs: names of the inputs that act on them, in order.
+    """
+    names, orders = tuple(quantities), {name: order for name, (_, order) in quantities.items()}
 
     def response(*arguments: Named) -> dict[str, Expression]:
-        return {name: arguments[-2][chain.input]}
+        return {name: arguments[-2][acting] for name, acting in zip(names, inputs, strict=True)}
 
     kind = inspect.Parameter.POSITIONAL_ONLY
-    lower = [f"d{k}" for k in range(chain.order)]
+    lower = [f"d{k}" for k in range(max(orders.values()))]
     vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in (*lower, "u", "p")])
     return replace(
         plant,
-        coordinates={name: chain.unit},
-        inputs={chain.input: plant.inputs[chain.input]},
+        coordinates={name: unit for name, (unit, _) in quantities.items()},
+        inputs={name: plant.inputs.get(name, "1") for name in inputs},
         parameters={},
         response=response,
-        order=chain.order,
-        controlled=(name,),
+        order=orders,
+        controlled=names,
         inverse=None,
         ranges={},
         outputs={},
@@ -223,7 +253,7 @@ class OutputChain:
 
     With x' = f(x, u, p) and y one entry of x the chain is  y^(0) = y,  y^(k) = d y^(k-1)/dx f(x, u, p),  k from 1 to r, and the
     relative order r is the first k for which y^(k) depends on the input. The pattern of dependence decides, not a value, so a gain
-    that vanishes in one state does not change the order.
+    that vanishes in one state does not change the order. On a map divided differences stand in place of derivatives.
 
     Args:
         order: the relative order r.
@@ -255,17 +285,10 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
     Raises:
         InvalidName: an unknown coordinate or input, or no name although there are several inputs.
         NotInvertible: the input reaches no derivative of the coordinate, or another input reaches an earlier one.
-        NotSupported: a map.
     """
     name = _input(plant, coordinate, input_name)
-    require_rates(
-        plant,
-        "output_chain differentiates with respect to time, which a map does not have; write an output, whose differences and "
-        "order are those of `Plant.equations.output_orders` and `Plant.equations.output`",
-    )
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
-    rate = plant.equations.forced_rate(x, u, p, w)
     command = u[plant.input.elements.index(name)]
     first = [x[plant.state.elements.index(coordinate)]] if coordinate in plant.coordinates else []
     derivatives = first or [output_expression(plant, coordinate, x, u, p)]
@@ -274,7 +297,7 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
             f"the command moves '{coordinate}' at once (order 0), so a slot has no derivative to prescribe"
         )
     for order in range(1, plant.state.size + 1):
-        derivative = ca.jtimes(derivatives[-1], x, rate)
+        derivative = lie_derivatives(plant, derivatives[-1], 1, (x, u, p, w))[1]
         if ca.jacobian_sparsity(derivative, command).nnz():
             return _chain(plant, coordinate, name, derivatives, derivative, (x, u, p, w))
         if ca.depends_on(derivative, u):

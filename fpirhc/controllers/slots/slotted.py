@@ -12,25 +12,49 @@ from typing import Annotated
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 
 from fpirhc.contraction.spectrum import Spectrum, assess_gain
-from fpirhc.controllers.base import Controller, Response, clip, command_before, deform_block, error_signal, like
+from fpirhc.controllers.base import (
+    Controller,
+    Response,
+    clip,
+    command_before,
+    deform_block,
+    error_signal,
+    like,
+    under_names,
+)
+from fpirhc.controllers.check import limit_behind
+from fpirhc.controllers.contract import late_deformation
+from fpirhc.controllers.mirror import Answers, believed_path, instant_mirror, measured_output
 from fpirhc.controllers.reference_states import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.schedules import Schedule, linear_modes
-from fpirhc.controllers.slots.slot import Channel, First, Slot, channel, delays_for_channel, for_channel
+from fpirhc.controllers.slots.slot import (
+    Channel,
+    First,
+    Slot,
+    channel,
+    delays_for_channel,
+    for_channel,
+    integrators,
+    measured_order,
+    reads_equations,
+)
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import FpirhcError, Mistakes, NotContractive
 from fpirhc.fields.kinds import Accuracy, CountOrZero, NotNegative, Range
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.maps import growth_of, response_age
 from fpirhc.plant.motion import time_signal
+from fpirhc.sensing.base import spline_weights
+from fpirhc.sensing.positions import PositionDifference, StepDifference
 from fpirhc.status import Status
 from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
-from fpirhc.symbolic.functions import exp, signed
+from fpirhc.symbolic.functions import ceil, exp, signed, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
@@ -68,16 +92,18 @@ class Slotted(Controller):
         return next((s.deformation for s in self.slots if s.adapts), Identity())
 
     def response(self, problem: Problem) -> Response:
-        """Return the response y^(r) of every slot's coordinate, of the plant that moves."""
+        """Return the response y^(r) of every slot's coordinate: by the equations of what moves, or from what is measured."""
         channels = self.channels(problem)
-        return Response(by_slot(channels, "realised"), _response(problem, channels))
+        function = _response(problem, channels) if reads_equations(problem) else None
+        return Response(_realised(problem, channels), function)
 
     def with_deformation(self, deformation: Deformation) -> Slotted:
         return replace(self, slots=tuple(replace(slot, deformation=deformation) for slot in self.slots))
 
     def with_defaults(self, problem: Problem) -> Slotted:
-        del problem
-        return self
+        slots = [replace(s, deformation=late_deformation(s.deformation, problem)) for s in self.slots]
+        same = all(a.deformation is b.deformation for a, b in zip(slots, self.slots, strict=True))
+        return self if same else replace(self, slots=tuple(slots))
 
     def floquet(self, problem: Problem) -> Floquet:
         """Return the stability of the schedule, with ideal deformations and the plant's exact parameters."""
@@ -88,7 +114,8 @@ class Slotted(Controller):
         if floquet.radius is None:
             return (f"no Floquet radius: {floquet.reason}",)
         alone = ", ".join(
-            f"{name} {round(values.real.max(), 6) + 0.0:.3g}" for name, values in floquet.eigenvalues.items()
+            f"{name} {round(growth_of(problem.plant)(values).max(), 6) + 0.0:.3g}"
+            for name, values in floquet.eigenvalues.items()
         )
         verb = "shrink" if floquet.radius < 1 else "grow"
         return (
@@ -106,11 +133,7 @@ class Slotted(Controller):
         Raises:
             InvalidProblem: mistakes of slots and schedule, all together; a slot that lasts too long.
             NotContractive: the gain of a deformation has the wrong sign or is too large at the start.
-            NotSupported: an external plant.
         """
-        problem.require_equations(
-            "Slotted reads the responses of its slots from equations, and a plant outside has none; leave it out of the problem"
-        )
         mistakes = Mistakes("Slotted")
         names = [s.coordinate for s in self.slots]
         if not names:
@@ -143,20 +166,22 @@ class Slotted(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        channels = self.channels(problem)
-        blocks = [reference_block(problem)]
+        channels, realised = self.channels(problem), _realised(problem, self.channels(problem))
+        blocks = [*_realised_blocks(problem, channels), reference_block(problem)]
         blocks += [state_block(problem, one, self.smallest_gain) for one in channels]
         blocks += [admissible_block(channels), self.schedule.block(problem, channels), switch_block(channels)]
         delays: list[Delay] = []
         for one in channels:
             light, law = one.plant, one.slot.tracking
             blocks.append(for_channel(law.law(light, problem.period), one, {"time"}, {"desired": one.wire("law")}))
-            blocks.append(join_block(problem, channels, one, self.blend, self.blank))
+            if one.slot.deformation.mirror.referenced:
+                blocks.append(_mirror(problem, one))
+            blocks.append(join_block(problem, realised, one, self.blend, self.blank))
             names = {name: f"{name}_{one.slot.coordinate}" for name in one.slot.deformation.shown()}
             names["warm_up"] = one.wire("valid")
             blocks.append(for_channel(deform_block(light, one.slot.deformation), one, set(), names, settled_in(one)))
             delays += delays_for_channel(law.delays(light), one)
-        blocks += [command_block(problem, channels), judge_block()]
+        blocks += [command_block(problem, channels), judge_block(), _count_block(problem, channels)]
         blocks += [
             for_channel(c.slot.tracking.update(c.plant, problem.period), c, {"clipped", "time"}, {}) for c in channels
         ]
@@ -183,6 +208,98 @@ def _check_slot(problem: Problem, slot: Slot, mistakes: Mistakes) -> None:
         )
 
 
+def _realised(problem: Problem, channels: Sequence[Channel]) -> Signal:
+    """The signal of y^(r) of every slot; 'realised' is that of the plant's controlled quantities where it is measured."""
+    return by_slot(channels, "realised" if reads_equations(problem) else "realised_of_slots")
+
+
+def _realised_blocks(problem: Problem, channels: Sequence[Channel]) -> list[Block]:
+    """Blocks (measured outputs, realised) -> y^(r) of every slot, measured or differenced; none where equations give it."""
+    if reads_equations(problem):
+        return []
+    plant, motion, found = problem.plant, measured_output(problem.plant), "_slot_differences"
+    given, realised = plant.response_signal("realised"), _realised(problem, channels)
+    differenced = [c for c in channels if c.differences]
+    names = tuple(c.slot.coordinate for c in differenced)
+    blocks, reads = [], [given]
+    if differenced:
+        orders = [measured_order(plant, n) for n in names]
+        places = [motion.elements.index(n + "'" * k) for n, k in zip(names, orders, strict=True)]
+        samples = Signal("_slot_samples", names)
+        blocks = [
+            Block(
+                "slot_samples",
+                Layout((motion,)),
+                Layout((samples,)),
+                lambda s: {samples.name: getattr(s, motion.name)[places]},
+            ),
+            _difference_block(problem, differenced, orders, samples, found),
+        ]
+        reads.append(Signal(found, names))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        entries = [
+            getattr(s, found)[names.index(c.slot.coordinate)]
+            if c.differences
+            else s.realised[plant.controlled_names.index(c.slot.coordinate)]
+            for c in channels
+        ]
+        return {realised.name: ca.vertcat(*entries)}
+
+    return [*blocks, Block("slot_responses", Layout(tuple(reads)), Layout((realised,)), step)]
+
+
+def _difference_block(
+    problem: Problem, channels: Sequence[Channel], orders: Sequence[int], samples: Signal, found: str
+) -> Block:
+    """Block (samples) -> their backward differences, which go on over gaps as those of positions do."""
+    plant, at = problem.plant, (problem.start_state, problem.plant.approximate)
+    quantities = {c.slot.coordinate: (c.chain.unit, c.differences) for c in channels}
+    light = integrators(plant, quantities, tuple(quantities))
+    starts = {
+        c.slot.coordinate + "'" * k: v
+        for c, order in zip(channels, orders, strict=True)
+        for k, v in enumerate(np.asarray(c.chain.states(*at).full()).ravel()[order:])
+    }
+    first = np.array([starts[e] for e in light.state.elements])
+    estimate = PositionDifference().block(light, problem.period, first, samples)
+    names = {light.state.name: "_slot_chains", "realised": found, "estimate_past": "_slot_past"}
+    return under_names(replace(estimate, name="slot_differences"), names)
+
+
+def _usable_from(problem: Problem, one: Channel, measurement: float) -> float:
+    """Number of the first cycle whose y^(r) is of samples of this run; `measurement` is its dead time."""
+    if reads_equations(problem):
+        return 1
+    plant, estimator, late = problem.plant, problem.sensing.estimator, ceil(measurement / problem.period)
+    chain, name = one.chain, one.slot.coordinate
+    if not one.differences:
+        return 1 if estimator.measures_all else late + estimator.fills(chain.order)
+    estimated = measured_order(plant, name) and not estimator.measures_all
+    return late + one.differences + (estimator.fills(plant.chains[name]) if estimated else 0)
+
+
+def _count_block(problem: Problem, channels: Sequence[Channel]) -> Block:
+    """Block that counts the cycles until every y^(r) may be used."""
+    late = problem.dead_time.at_longest.measurement
+    most = max(live.nominal(_usable_from(problem, c, late)) for c in channels)
+
+    def step(s: Signals) -> dict[str, Value]:
+        return {"_warm_up_now": ca.fmin(s.warm_up + 1, most)}
+
+    return Block("running", Layout((scalar("warm_up"),)), Layout((scalar("_warm_up_now"),)), step)
+
+
+def _mirror(problem: Problem, one: Channel) -> Block:
+    """Block -> y^(r) of the model at what is measured and under the command that acted, as late as the plant's."""
+    chain, calm = one.chain, ca.DM.zeros(len(problem.plant.names))
+    path = believed_path(problem, one.slot.deformation, f"mirror_{one.number}")
+    answers = Answers(
+        lambda x, u, p: chain.response(x, u, p, calm), {chain.coordinate: chain.order}, one.signal("_modelled")
+    )
+    return instant_mirror(path, answers)
+
+
 def _response(problem: Problem, channels: Sequence[Channel]) -> ca.Function:
     """Function (state, input, parameters, forcing) of what moves -> y^(r) of every slot."""
     return problem.truth.function([c.chain.coordinate + "'" * c.chain.order for c in channels])
@@ -190,16 +307,42 @@ def _response(problem: Problem, channels: Sequence[Channel]) -> ca.Function:
 
 def _check_gain(problem: Problem, one: Channel) -> None:
     """Raise NotContractive where the deformation does not converge with J = beta of the plant / beta of the model, at the start."""
+    deformation, known = one.slot.deformation, problem.of_equations
     if not one.slot.adapts:
         return
-    truth, place = problem.real_plant, problem.plant.input.elements.index(one.chain.input)
+    truth, place = known.real_plant, problem.plant.input.elements.index(one.chain.input)
     x, u, p = truth.symbols()
-    response = _response(problem, [one])(x, u, p, ca.SX.zeros(len(truth.names)))
+    response = _response(known, [one])(x, u, p, ca.SX.zeros(len(truth.names)))
     gain = ca.Function("fpirhc_slot_gain", [x, u, p], [ca.jacobian(response, u[place])])
-    exact = float(gain(problem.real_start, np.zeros(u.numel()), problem.real_parameters))
-    report = assess_gain(one.slot.deformation, Spectrum(np.array([exact / one.start_gain])))
+    exact = float(gain(known.real_start, np.zeros(u.numel()), known.real_parameters))
+    report = assess_gain(deformation, Spectrum(np.array([exact / one.start_gain])))
     if not report.contractive:
         raise NotContractive(f"slot '{one.slot.coordinate}': {report.text}")
+    weights = _weights(problem, one)
+    if weights.size == 1:
+        return
+    late = problem.dead_time.inputs.get(one.chain.input, 0.0) + problem.dead_time.measurement
+    most, size = (
+        limit_behind(deformation, weights, late / problem.period, abs(exact / one.start_gain)),
+        abs(deformation.effective_gain()),
+    )
+    if size >= most:
+        raise NotContractive(
+            f"slot '{one.slot.coordinate}': its response is of several cycles, so the iteration converges only for effective gains "
+            f"below {most:.3g}, and this one is {size:.3g}; use a smaller gain"
+        )
+
+
+def _weights(problem: Problem, one: Channel) -> np.ndarray:
+    """Weights of past requests in the measured y^(r)."""
+    if reads_equations(problem):
+        return np.ones(1)
+    estimator = problem.sensing.estimator
+    if not one.differences:
+        return estimator.weights(one.chain.order, problem.period)
+    if estimator.of_steps:
+        return StepDifference().weights(one.chain.order, problem.period)
+    return spline_weights(one.differences)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,11 +394,12 @@ def radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule,
         reason = "the plant has several inputs, and those that a slot does not use keep their last command"
     if reason or not sequence:
         return Floquet(None, period, eigenvalues, reason or "the schedule is not periodic")
+    held = response_age(problem.plant) * problem.period
     before, whole = modes[names.index(sequence[-1][0])], np.eye(modes[0].generator.shape[0])
     for name, duration in sequence:
         mode = modes[names.index(name)]
-        begin = mode.start(before) if len(sequence) > 1 else mode.goes_on()
-        whole = scipy.linalg.expm(mode.generator * duration) @ begin @ whole
+        begin = mode.start(before, held) if len(sequence) > 1 else mode.goes_on() @ mode.over(held)
+        whole = mode.over(duration - held) @ begin @ whole
         before = mode
     entering = np.flatnonzero(np.abs(whole).sum(axis=0) > 0)
     radius = float(np.abs(np.linalg.eigvals(whole[np.ix_(entering, entering)])).max())
@@ -348,41 +492,51 @@ def switch_block(channels: Sequence[Channel]) -> Block:
     return Block("switch", reads, Layout((scalar("_age"), *writes)), step)
 
 
-def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blend: float, blank: int) -> Block:
-    """Block that joins the slot's law to the plant's last motion: the desired response and the pair of the last cycle."""
+def join_block(problem: Problem, measured: Signal, one: Channel, blend: float, blank: int) -> Block:
+    """Block that joins the slot's law to the plant's last motion: the desired response and the pair of the last cycle.
+
+    Args:
+        measured: signal of y^(r) of every slot.
+    """
     decay = exp(-problem.period / blend) if live.nominal(blend) > 0 else 0.0
     place = problem.plant.input.elements.index(one.chain.input)
-    names = ("law", "free", "gain", "active", "warm_up")
-    request_before = _request_before(one)
+    request_before, referenced = _request_before(one), one.slot.deformation.mirror.referenced
+    names = ("law", "free", "gain", "active", "warm_up", *((request_before,) if referenced else ()))
+    first = _usable_from(problem, one, problem.dead_time.measurement)
+    at_once = stays(first, 1)
 
     def step(s: Signals) -> dict[str, Expression]:
-        law, free, gain, active, goes_on = (getattr(s, one.wire(name)) for name in names)
-        running, realised = s.warm_up > 0.5, s.realised[one.number]
+        law, free, gain, active, goes_on, *modelled = (getattr(s, one.wire(name)) for name in names)
+        running, realised = s.warm_up > 0.5, getattr(s, measured.name)[one.number]
+        usable = running if at_once else s.warm_up > first - 0.5
         switched = ca.logic_and(ca.logic_and(active, running), ca.logic_not(goes_on))
         last_request = free + gain * s._command_before[place]
         response = realised if one.slot.adapts else last_request
+        for model in modelled:  # what the form adds is the difference of model and plant, and the command stays
+            response = last_request + realised - model
+        if one.slot.adapts and not at_once:
+            response = ca.if_else(usable, response, last_request)
         offset = ca.if_else(switched, response - law, decay * s._offset_before)
         desired = law + ca.if_else(active, offset, 0)
         blanked = ca.logic_and(ca.logic_and(active, running), s._age < blank - 0.5)
-        if request_before == "deformed_last":
-            own_request = ca.if_else(switched, last_request, s._deformed_before[one.number])
-        else:
-            own_request = last_request
+        own_request = ca.if_else(switched, last_request, s._deformed_before[one.number])
+        pair = next(iter(modelled), own_request)
         values = {
             "offset": offset,
             "desired": desired,
             "distance": ca.if_else(switched, last_request - desired, s._distance_before),
-            request_before: own_request,
-            "realised": realised,
-            "valid": ca.logic_and(ca.logic_and(active, running), ca.logic_not(blanked)),
+            "realised": realised if at_once else ca.if_else(usable, realised, pair),
+            "valid": ca.logic_and(ca.logic_and(active, usable), ca.logic_not(blanked)),
             "blanked": blanked,
+            **({} if referenced else {request_before: own_request}),
         }
         return {one.wire(name): value for name, value in values.items()}
 
     shared = [scalar(n) for n in ("warm_up", "_age", "_offset_before", "_distance_before")]
-    columns = [by_slot(channels, n) for n in ("realised", "_deformed_before")]
+    columns = [measured, replace(measured, name="_deformed_before")]
     reads = [*(one.signal(n) for n in names), *shared, *columns, like(problem.plant.input, "_command_before")]
-    results = ("offset", "desired", "distance", request_before, "realised", "valid", "blanked")
+    own = () if referenced else (request_before,)
+    results = ("offset", "desired", "distance", "realised", "valid", "blanked", *own)
     return Block(f"join_{one.number}", Layout(tuple(reads)), Layout(tuple(one.signal(n) for n in results)), step)
 
 
@@ -435,12 +589,11 @@ def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
             "_held": ca.logic_not(finite),
             "_offset": _finite(_pick(slot["active"], slot["offset"])),
             "_distance": _finite(_pick(slot["active"], slot["distance"])),
-            "_warm_up_now": 1,
         }
 
     reads = [c.signal(n) for c in channels for n in _PER_SLOT]
     responses = [by_slot(channels, n) for n in ("nominal", "desired", "deformed")]
-    scalars = [scalar(n) for n in ("clipped", "slot_held", "_held", "_offset", "_distance", "_warm_up_now")]
+    scalars = [scalar(n) for n in ("clipped", "slot_held", "_held", "_offset", "_distance")]
     writes = (plant.input, *responses, *scalars)
     return Block("command", Layout((*reads, like(plant.input, "_command_before"))), Layout(writes), step)
 

@@ -70,10 +70,6 @@ class Shifted(Reference):
         """Function t -> (nominal state (nx), nominal response (n)) without shift."""
         return self.reference.function(plant)
 
-    def derivatives(self, coordinate: str, order: int) -> ca.Function:
-        """Function t -> the coordinate's nominal value and its derivatives without shift."""
-        return self.reference.derivatives(coordinate, order)
-
     def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
         every = followed_units(plant)
         units = tuple(every[name] for name in plant.controlled_names)
