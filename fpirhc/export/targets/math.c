@@ -72,24 +72,32 @@ static pair times(pair a, pair b) {
 /* exp(x + low) for a small rest: 1 + r + r^2/2 + ... after r = x - n ln 2; the series beyond is interpolated at Chebyshev's nodes. */
 static double exponential(double x, double low) {
   double n, high, rest, r, q = 2.509554606865001e-08;
-  if (x != x) return x;
-  if (x > 709.79) return HUGE_VAL;
-  if (x < -745.2) return 0;
+  int far = ((unsigned long)(bits_of(x) >> 32) & 0x7ffffffful) >= 0x40862000ul; /* 708 and more, or not a number */
+  if (far) {
+    if (x != x) return x;
+    if (x > 709.79) return HUGE_VAL;
+    if (x < -745.2) return 0;
+  }
   n = whole(x * 1.4426950408889634), high = x - n * LN2, rest = n * LN2_REST - low, r = high - rest;
   q = q * r + 2.7613795667584423e-07, q = q * r + 2.755728008252803e-06, q = q * r + 2.4801536408860383e-05;
   q = q * r + 1.9841269854330848e-04, q = q * r + 1.3888888905871448e-03, q = q * r + 8.333333333332157e-03;
   q = q * r + 4.1666666666651364e-02, q = q * r + 1.6666666666666666e-01, q = q * r + 0.5;
-  return scaled(1 + (high + (r * r * q - rest)), (int)n);
+  r = 1 + (high + (r * r * q - rest));
+  return far ? scaled(r, (int)n) : r * power_of_2((int)n);
 }
 
-/* x = m 2^k with m between sqrt(1/2) and sqrt(2). */
+/* x = m 2^k with m between sqrt(1/2) and sqrt(2), to six digits, of the bits of a number that has all of its digits. */
+static double parted(unsigned long long bits, int* k) {
+  bits += 0x3ff0000000000000u - 0x3fe6a09e00000000u;
+  *k = (int)(bits >> 52) - 1023;
+  return of_bits((bits & 0xfffffffffffffu) + 0x3fe6a09e00000000u);
+}
+
+/* The same of every number above zero. */
 static double mantissa(double x, int* k) {
   double m;
-  *k = 0;
-  if (x < 2.2250738585072014e-308) x *= 18014398509481984.0, *k = -54;
-  *k += (int)(bits_of(x) >> 52) - 1023;
-  m = of_bits((bits_of(x) & 0xfffffffffffffu) | 0x3ff0000000000000u);
-  if (m > 1.4142135623730951) m *= 0.5, ++*k;
+  if (x >= 2.2250738585072014e-308) return parted(bits_of(x), k);
+  m = parted(bits_of(x * 18014398509481984.0), k), *k -= 54;
   return m;
 }
 
@@ -105,9 +113,12 @@ double @name@_exp(double x) { return exponential(x, 0); }
 /* log(1 + f) = 2 atanh(s), s = f / (2 + f) = f - f^2/2 + s (f^2/2 + R); R is interpolated at Chebyshev's nodes. */
 double @name@_log(double x) {
   int k;
+  unsigned long long bits = bits_of(x);
   double f, s, z, half, series = 0.14425745969553938;
-  if (has_no_log(x, &f)) return f;
-  f = mantissa(x, &k) - 1, s = f / (2 + f), z = s * s, half = 0.5 * f * f;
+  if (bits - 0x0010000000000000u < 0x7fe0000000000000u) f = parted(bits, &k) - 1;
+  else if (has_no_log(x, &f)) return f;
+  else f = mantissa(x, &k) - 1;
+  s = f / (2 + f), z = s * s, half = 0.5 * f * f;
   series = series * z + 0.15347854217867402, series = series * z + 0.18182383516054826, series = series * z + 0.22222218306451125;
   series = series * z + 0.2857142858132756, series = series * z + 0.3999999999999595, series = series * z + 0.6666666666666666;
   return k * LN2 - ((half - (s * (half + series * z) + k * LN2_REST)) - f);
