@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import casadi as ca
@@ -21,6 +23,12 @@ _LARGE_CACHE = 2e9  # bytes
 _SOLVERS = ("ipopt", "fatrop", "sqpmethod")  # of nonlinear programs, that optimisers here call
 _QUADRATIC = ("qrqp", "osqp")
 _OTHERS = ("alpaqa", "bonmin", "knitro", "madnlp", "snopt", "worhp")
+_EXPORT = (  # module or program, what it is for, and what brings it
+    ("ziglang", "WebAssembly, labs, Cortex-M and other platforms", "pip install 'fpirhc[compiler]'"),
+    ("fmpy", "functional mock-up units", "pip install 'fpirhc[fmu]'"),
+    ("unicorn", "a Cortex-M without a board", "pip install 'fpirhc[cortex]'"),
+    ("avr-gcc", "sizes on Arduino boards", "packages gcc-avr and avr-libc"),
+)
 
 
 class Outcome(IntEnum):
@@ -145,7 +153,20 @@ def python_threads() -> tuple[Outcome, str, str]:
     )
 
 
-CHECKS: tuple[_Check, ...] = (solver_plugins, c_compiler, cache, results_folder, python_threads)
+def export_tools() -> tuple[Outcome, str, str]:
+    """Name what `fpirhc export` and `fpirhc lab` can use beside the C compiler, and how to get the rest; none of it is a must."""
+    there, missing = [], []
+    for name, what, how in _EXPORT:
+        if shutil.which(name):
+            there.append(name)
+        elif find_spec(name) is not None:
+            there.append(f"{name} {version(name)}")
+        else:
+            missing.append(f"{name} for {what}: {how}")
+    return _fine("; ".join([f"here: {', '.join(there) or 'none'}", *(f"without {one}" for one in missing)]))
+
+
+CHECKS: tuple[_Check, ...] = (solver_plugins, c_compiler, export_tools, cache, results_folder, python_threads)
 
 
 @dataclass(frozen=True)

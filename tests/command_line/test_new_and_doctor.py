@@ -134,6 +134,17 @@ def test_a_missing_compiler_is_a_warning(monkeypatch):
     assert "gcc" in remedy
 
 
+def test_what_exports_lack_is_named_with_its_package(monkeypatch):
+    monkeypatch.setattr(machine, "find_spec", lambda _: None)
+    monkeypatch.setattr(machine.shutil, "which", lambda name: "/usr/bin/avr-gcc" if name == "avr-gcc" else None)
+    outcome, said, _ = machine.export_tools()
+    assert outcome == Outcome.OK
+    assert said.startswith(
+        "here: avr-gcc; without ziglang for WebAssembly, labs, Cortex-M and other platforms: pip install 'fpirhc[comp"
+    )
+    assert said.endswith("without unicorn for a Cortex-M without a board: pip install 'fpirhc[cortex]'")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="permissions of another kind")
 def test_a_cache_that_others_may_write_is_closed(tmp_path, monkeypatch):
     """What is loaded from the cache is run, so nobody else may put a library there."""

@@ -9,6 +9,7 @@ import pytest
 from first_files import messages_of
 
 from fpirhc.cli.main import main
+from fpirhc.export import binaries
 
 IPOPT = """import fpirhc as fp
 
@@ -31,6 +32,8 @@ two_mass RHC+FPI --to fmu =>
     the target fmu needs fmpy, which is not installed: pip install 'fpirhc[fmu]'
 two_mass RHC+FPI --check =>
     a program of this machine needs a C compiler: install gcc or clang, or name one by FPIRHC_CC
+two_mass RHC+FPI --to library =>
+    a shared library needs a C compiler: install gcc or clang, or pip install 'fpirhc[compiler]'
 two_mass RHC+FPI --out full =>
     'full' is not an empty folder, and nothing in it is replaced; choose another one with --out
 two_mass RHC+FPI --name 2nd =>
@@ -58,8 +61,9 @@ def test_what_is_refused_says_why_and_what_to_do(row, tmp_path, monkeypatch, cap
     monkeypatch.chdir(tmp_path)
     for module in ("ziglang", "fmpy"):
         monkeypatch.setitem(__import__("sys").modules, module, None)
-    if "--check" in words:
+    if "--check" in words or "library" in words:
         monkeypatch.setenv("FPIRHC_CC", "none")
+        monkeypatch.setattr(binaries, "find_spec", lambda _: None)
     out = [] if "--out" in words else ["--out", "new"]
     code = main(["export", *words, *out, "--cycles", "1"])
     said = re.sub(r"\d+ bytes", "N bytes", capsys.readouterr().err)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 
+from fpirhc.errors import NotInstalled
 from fpirhc.export.binaries import ENDINGS, shared_libraries
 from fpirhc.export.device import Device
 from fpirhc.export.target import Target
@@ -20,6 +21,10 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         f"{name}_library.c": filled(device, "library.c", change=change if device.bounds else nothing),
     }
     made = {f"{name}_{at}{ENDINGS[at.split('-')[1]]}": data for at, data in shared_libraries(own).items()}
+    if not made:
+        raise NotInstalled(
+            "a shared library needs a C compiler: install gcc or clang, or pip install 'fpirhc[compiler]'"
+        )
     return {**own, **made, "layout.json": json.dumps(layout_of(device), indent=1)}
 
 
