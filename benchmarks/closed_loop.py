@@ -8,7 +8,6 @@ the same mathematics with floats and logs the states only, and so is favoured. B
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
 import time
@@ -24,11 +23,11 @@ from fpirhc.symbolic.native import native
 from fpirhc.symbolic.program import chained
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+import by_hand
 from table import write_table
 
 REPEATS = 7
-TASK = fp.load_problem("two_mass")
-CONTROLLER = TASK.controllers["CTC+FPI (eq 6)"]
+TASK, CONTROLLER = by_hand.TASK, by_hand.CONTROLLER
 CYCLES = TASK.problem.cycles
 
 
@@ -72,54 +71,10 @@ def plain_calls() -> None:
 
 def python_floats() -> list[tuple[float, float]]:
     """The same loop written by hand with floats and the math module."""
-    p, h = 1e-3, 0.3
-    exact, model = (
-        [q.exact for q in TASK.problem.plant.parameters.values()],
-        [q.approximate for q in TASK.problem.plant.parameters.values()],
-    )
-
-    def response(x, v, u, par):
-        m1, m2, s1, s2, k1, k2, l1, l2, b1, b2, g = par
-        d1, d2 = x[0] - l1, x[1] - x[0] - l2
-        f1 = k1 * d1 * (d1 * d1 + 1e-12) ** ((s1 - 1) / 2)
-        f2 = k2 * d2 * (d2 * d2 + 1e-12) ** ((s2 - 1) / 2)
-        return g + (-f1 + f2 - b1 * v[0] + u[0]) / m1, g + (-f2 - b2 * v[1] + u[1]) / m2
-
-    t_ = math.tanh(h)
-    y = (-1 + math.sqrt(1 + 8 * t_ * t_)) / (4 * t_)
-    fixed = math.atanh(y)
-    x, v, r, f, e_int, states = [2.2, 5.4], [0.0, 0.0], None, None, None, []
+    cycle, memory, states = by_hand.cycle_of(by_hand.FLOATS), by_hand.START, []
     for k in range(CYCLES):
-        t = k * p
-        ref = (2.2 + 0.3 * math.sin(2 * t), 5.4 + 0.3 * math.sin(3 * t))
-        dref = (0.6 * math.cos(2 * t), 0.9 * math.cos(3 * t))
-        ddref = (-1.2 * math.sin(2 * t), -2.7 * math.sin(3 * t))
-        e, de = [ref[i] - x[i] for i in (0, 1)], [dref[i] - v[i] for i in (0, 1)]
-        if e_int is None:
-            e_int = [-(108 * e[i] + 18 * de[i]) / 216 for i in (0, 1)]
-        want = [ddref[i] + 216 * e_int[i] + 108 * e[i] + 18 * de[i] for i in (0, 1)]
-        if r is None:
-            r = want
-        else:
-            err = [f[i] - want[i] for i in (0, 1)]
-            size = math.sqrt(err[0] ** 2 + err[1] ** 2 + 1e-18)
-            grow = (math.atanh(0.5 * math.tanh(-0.5 * size + fixed + h)) - fixed) / size
-            r = [r[i] + grow * err[i] for i in (0, 1)]
-        free = response(x, v, (0.0, 0.0), model)
-        u = ((r[0] - free[0]) * model[0], (r[1] - free[1]) * model[1])
-        u = tuple(min(300.0, max(-300.0, value)) for value in u)
-        e_int = [e_int[i] + p * e[i] for i in (0, 1)]
-        a1 = response(x, v, u, exact)
-        x2, v2 = [x[i] + p / 2 * v[i] for i in (0, 1)], [v[i] + p / 2 * a1[i] for i in (0, 1)]
-        a2 = response(x2, v2, u, exact)
-        x3, v3 = [x[i] + p / 2 * v2[i] for i in (0, 1)], [v[i] + p / 2 * a2[i] for i in (0, 1)]
-        a3 = response(x3, v3, u, exact)
-        x4, v4 = [x[i] + p * v3[i] for i in (0, 1)], [v[i] + p * a3[i] for i in (0, 1)]
-        a4 = response(x4, v4, u, exact)
-        x = [x[i] + p / 6 * (v[i] + 2 * v2[i] + 2 * v3[i] + v4[i]) for i in (0, 1)]
-        v = [v[i] + p / 6 * (a1[i] + 2 * a2[i] + 2 * a3[i] + a4[i]) for i in (0, 1)]
-        f = response(x, v, u, exact)
-        states.append((x[0], x[1]))
+        memory, _ = cycle(k * by_hand.PERIOD, memory, by_hand.EXACT)
+        states.append(memory[:2])
     return states
 
 
