@@ -37,6 +37,37 @@ def add_seed(parser: Parser, use: str) -> None:
     parser.add_argument("--seed", type=whole(0), default=0, metavar="K", help=f"seed of {use} (default: 0)")
 
 
+def add_set(parser: Parser, more: str) -> None:
+    """--set PATH=NUMBER, again and again."""
+    text = "another number for a setting, such as deformation.gain=-1.2, limits.inputs.Q1=-50,20, exact.m1=1.4 or start.q1=2"
+    parser.add_argument(
+        "--set", action="append", default=[], dest="settings", metavar="PATH=NUMBER", help=f"{text}{more}"
+    )
+
+
+def numbers(settings: Sequence[str]) -> dict[str, float | tuple[float, ...]]:
+    """Return numbers by path from texts 'PATH=NUMBER', or 'PATH=LOWER,UPPER' for an interval.
+
+    Raises:
+        InvalidValue: a text of another form.
+    """
+    from fpirhc.errors import InvalidValue
+
+    values: dict[str, float | tuple[float, ...]] = {}
+    for text in settings:
+        path, _, value = text.partition("=")
+        try:
+            if not path.strip():
+                raise ValueError
+            parts = tuple(float(part) for part in value.split(","))
+        except ValueError:
+            raise InvalidValue(
+                f"--set {text}: expected PATH=NUMBER, such as deformation.gain=-1.2, or PATH=LOWER,UPPER for an interval"
+            ) from None
+        values[path.strip()] = parts if len(parts) > 1 else parts[0]
+    return values
+
+
 def whole(least: int) -> Callable[[str], int]:
     """Return the type of an option: a whole number of at least `least`."""
 

@@ -30,7 +30,7 @@ from fpirhc.symbolic.paths import changed_at, content_at, names_in, opened, path
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
-_OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances")
+OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances")
 _ALWAYS_DATA = "Parameters (exact and approximate) and the start are data of every loop; they need no live setting"
 _IN_TABLES = ("sensing", "disturbances")  # of what Python makes tables before a run
 _NUDGES, _SMALLEST = (0.07, 2.0), 1e-3  # shares by which a number is changed to see whether the loop depends on it
@@ -315,16 +315,16 @@ def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Con
     first = path.partition(".")[0]
     if first in names_in(controller) and getattr(controller, first) is not None:
         return controller
-    if first in _OF_PROBLEM and getattr(problem, first) is not None:
+    if first in OF_PROBLEM and getattr(problem, first) is not None:
         return problem
     valid = [n for n in names_in(controller) if getattr(controller, n) is not None]
-    valid += [n for n in _OF_PROBLEM if getattr(problem, n) is not None]
+    valid += [n for n in OF_PROBLEM if getattr(problem, n) is not None]
     below = " or ".join(f"'{one}'" for one in paths_to(first, controller))
     hint = f" Did you mean {below}?" if below else nearest(first, valid)
     if first in ("start", "plant", "parameters", *problem.plant.parameters):
         hint = f" {_ALWAYS_DATA}"
     raise InvalidName(
-        f"setting '{path}': neither the controller nor the problem's {', '.join(_OF_PROBLEM)} have '{first}'.{hint}"
+        f"setting '{path}': neither the controller nor the problem's {', '.join(OF_PROBLEM)} have '{first}'.{hint}"
     )
 
 

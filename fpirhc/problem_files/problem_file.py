@@ -32,7 +32,15 @@ from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, Prob
 from fpirhc.fields.checked import Checked, checked_call, mistakes_of
 from fpirhc.fields.kinds import call_of, described
 from fpirhc.fields.user_code import explained
-from fpirhc.problem_files.settings import TuningSpans, check_tuning
+from fpirhc.problem_files.settings import (
+    TuningSpans,
+    as_declared,
+    check_tuning,
+    current_setting,
+    of_problem,
+    with_numbers,
+    with_settings,
+)
 from fpirhc.problem_files.shipped import find_problem
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
@@ -156,6 +164,32 @@ def in_case(task: Task, name: str) -> Task:
     if task.cases is None:
         raise InvalidName(f"problem '{task.name}' has no cases; add cases = fpirhc.Cases({{...}}) to its file")
     return replace(task, problem=task.cases.problem(name, task.problem))
+
+
+def with_numbers_of_all(task: Task, values: Mapping[str, Any]) -> Task:
+    """Return the task with other numbers: of the problem, at paths of a case, and of every controller that has the setting.
+
+    Raises:
+        InvalidName: a setting that no controller has.
+        InvalidProblem: a number that does not fit the problem.
+        InvalidValue: a number that a controller does not accept.
+    """
+    own = {path: word for path in values if (word := of_problem(task.problem, path))}
+    problem, controllers = with_numbers(task.problem, {word: values[path] for path, word in own.items()}), {}
+    lacking: dict[str, list[InvalidName]] = {path: [] for path in values if path not in own}
+    for name, controller in task.controllers.items():
+        has = {}
+        for path, lacked in lacking.items():
+            try:
+                current_setting(controller, path)
+                has[path] = values[path]
+            except InvalidName as error:
+                lacked.append(error)
+        controllers[name] = with_settings(controller, as_declared(controller, has))
+    for lacked in lacking.values():
+        if len(lacked) == len(controllers):
+            raise lacked[-1]
+    return replace(task, problem=problem, controllers=controllers)
 
 
 def _problem(module: ModuleType, mistakes: Mistakes) -> Problem | None:

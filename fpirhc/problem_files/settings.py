@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, TypeVar
 
 from fpirhc.controllers.base import Controller
@@ -12,6 +12,7 @@ from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
+from fpirhc.task.cases import PARAMETERS, START, Cases
 from fpirhc.task.problem import Problem
 
 Values = Mapping[str, float]
@@ -42,6 +43,29 @@ def with_settings(owner: Owner, values: Values) -> Owner:
             raise InvalidValue(f"setting '{path}': expected a whole number, got {value!r}")
         changed = changed_at(changed, path, value)
     return changed
+
+
+def of_problem(problem: Problem, path: str) -> str | None:
+    """Return a path as a case has it, 'exact.m1' for 'm1.exact'; None where it does not begin with a word of a case."""
+    name, _, word = path.rpartition(".")
+    named = word in PARAMETERS and (name in problem.plant.parameters or name in problem.moved.parameters)
+    found = f"{word}.{name}" if named else path
+    return found if found.partition(".")[0] in {*PARAMETERS, START, *(f.name for f in fields(problem))} else None
+
+
+def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:
+    """Return a problem with other numbers at paths of a case, see `Cases`.
+
+    Raises:
+        InvalidProblem: a path or a number that does not fit, all together.
+    """
+    return Cases({"--set": dict(values)}).problem("--set", problem) if values else problem
+
+
+def as_declared(controller: Controller, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return numbers of settings, as whole numbers where the controller has such."""
+    plain = {p for p, v in values.items() if isinstance(v, tuple) or v % 1 or not is_whole(controller, p)}
+    return {p: v if p in plain else int(v) for p, v in values.items()}
 
 
 def current_setting(owner: Controller | Problem, path: str) -> float:

@@ -25,6 +25,7 @@ from fpirhc.simulation.drawing import (
     time_label,
 )
 from fpirhc.simulation.log import shown_motion
+from fpirhc.summary import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -429,6 +430,37 @@ def _sweep_maps(found: Sweep) -> Drawing:
     if drawn is not None:
         figure.colorbar(drawn, ax=panels[: len(found.maps)], label=literal(_figure_label(found)))
     return figure
+
+
+def sweep_panels(figure: Drawing, found: Sweep) -> list[dict[str, Any]]:
+    """Return where the panels of a drawn figure lie, and where the values of the settings in them, as shares of its size."""
+    panels = []
+    for axis in (one for one in figure.axes if one.get_label() != "<colorbar>"):
+        to_figure, (left, bottom) = axis.transData - figure.transFigure, (axis.get_xlim()[0], axis.get_ylim()[0])
+        across = to_figure.transform([(v, bottom) for v in found.axes[0].values])[:, 0]
+        along = [to_figure.transform([(left, v) for v in over.values])[:, 1] for over in found.axes[1:]]
+        ends = axis.get_position()
+        centres = [values.tolist() for values in (across, *along)]
+        panels.append({"low": [*map(float, ends.min)], "high": [*map(float, ends.max)], "centres": centres})
+    return panels
+
+
+def sweep_cells(found: Sweep) -> dict[str, Any]:
+    """Return what is said of every cell of a sweep, and the command of its run."""
+    axes = [{"path": a.path, "values": [number(v) for v in a.values], "set": found.set_texts(a)} for a in found.axes]
+    maps = [
+        {
+            "controller": one.controller,
+            "without": list(one.without),
+            "run": found.run_command(one.controller),
+            "cells": [
+                f"{found.aim.name} {found.aim.text(float(v))}" if outcome == "finished" else str(outcome)
+                for v, outcome in zip(one.values.ravel(), one.outcomes.ravel(), strict=True)
+            ],
+        }
+        for one in found.maps
+    ]
+    return {"axes": axes, "maps": maps, "seed": f" --seed {found.seed}"}
 
 
 def _draw_map(axis: Axes, found: Sweep, values: np.ndarray, **colours: Any) -> Any:

@@ -26,7 +26,9 @@ from fpirhc.report.figures import (
     lyapunov_figure,
     mismatch_figure,
     pair_figures,
+    sweep_cells,
     sweep_figure,
+    sweep_panels,
 )
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
 from fpirhc.simulation.log import responses_of, shown_motion
@@ -78,6 +80,7 @@ _SWEEP = (
     "One cell per run, all maps in one scale of colours. Grey cells failed; rings are the settings as they stand. The last map "
     "shows which controller is best."
 )
+_CELL = "Click on one, or choose it below: its number, and the command of its run."
 _LINES = "One point per run; crosses at the upper edge are runs that failed, dotted lines the settings as they stand."
 
 
@@ -105,7 +108,7 @@ def render(comparison: Comparison, lab: str = "") -> str:
     own, motions = own_pictures(comparison)
     begin = [e.name for e in pair] if pair else []
     series = {**chart_data(comparison, PALETTE), "bands": BANDS, "begin": begin, "motions": motions}
-    data = json.dumps(series, separators=(",", ":")).replace("<", "\\u003c")
+    data = _in_script(json.dumps(series, separators=(",", ":")))
     contraction, lyapunov = contraction_figure(comparison), lyapunov_figure(comparison)
     return render_page(
         "comparison.html",
@@ -248,8 +251,17 @@ def render_limits(found: OperatingLimits) -> str:
 
 def render_sweep(found: Sweep) -> str:
     """Return the page's text."""
-    name = " and ".join(axis.path for axis in found.axes)
-    return render_charted(found.view, sweep_figure(found), f"Over {name}", _SWEEP if len(found.axes) > 1 else _LINES)
+    figure, name = sweep_figure(found), " and ".join(axis.path for axis in found.axes)
+    caption = f"{_SWEEP if len(found.axes) > 1 else _LINES} {_CELL}"
+    chart = Image(figure.address, f"Over {name}", caption)  # drawn first: only then it is known where its panels lie
+    data = json.dumps({**sweep_cells(found), "panels": sweep_panels(figure, found)}, separators=(",", ":"))
+    script = f"const SWEEP={_in_script(data)};\n{asset('sweep.js')}"
+    return render_page("scenarios.html", found.view, [script], chart=chart, own=(), cells=True)
+
+
+def _in_script(data: str) -> str:
+    """JSON as a page's script has it: no text ends the script."""
+    return data.replace("<", "\\u003c")
 
 
 def render_charted(
@@ -257,7 +269,7 @@ def render_charted(
 ) -> str:
     """Return the text of a page with a figure, where there is one, below a heading, and with the problem's own pictures."""
     chart = Image(figure.address, heading, caption) if figure else None
-    return render_page("scenarios.html", view, chart=chart, own=own)
+    return render_page("scenarios.html", view, chart=chart, own=own, cells=False)
 
 
 def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:

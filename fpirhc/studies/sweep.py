@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import shlex
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -22,7 +23,7 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, Mistakes, near
 from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import current_setting, is_whole
+from fpirhc.problem_files.settings import current_setting, is_whole, of_problem
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.scenarios.bench import Conditions, Trials, fingerprint
 from fpirhc.studies.scenarios.draws import COMPARING
@@ -31,7 +32,7 @@ from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number
 from fpirhc.symbolic.paths import names_in
-from fpirhc.task.cases import Cases
+from fpirhc.task.cases import PARAMETERS, START, Cases
 from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ LEDGER = "sweep.jsonl"
 _MOST = 2  # settings of a map
 _LOG = "log"
 _FORM = "PATH=LOW:HIGH:COUNT, or PATH=LOW:HIGH:COUNT:log"
-_OF_PARAMETERS = "exact", "approximate", "known"
 
 
 @dataclass(frozen=True)
@@ -169,6 +169,16 @@ class Sweep(Study):
             raise InvalidName(f"no map of '{controller}'.{nearest(controller, found)}")
         return found[controller]
 
+    def run_command(self, controller: str) -> str:
+        """Return the beginning of the command that runs a controller; settings and seed follow."""
+        task = shlex.split(self.command)[2] if self.command else self.problem
+        return shlex.join(["fpirhc", "run", task, controller])
+
+    @staticmethod
+    def set_texts(axis: Axis) -> list[str]:
+        """Return what stands behind --set in the command of a run, for every value of a setting."""
+        return [shlex.quote(f"{axis.path}={value:.10g}") for value in axis.values]
+
     @cached_property
     def winners(self) -> np.ndarray:
         """Place of the controller with the best number among `maps`, per cell; -1 where all failed, or the best are equal."""
@@ -241,10 +251,10 @@ def sweep(
     begin = time.perf_counter()
     chosen = select(task, controllers)
     check_gains(task, chosen)
-    axes = tuple(replace(axis, path=_canonical(task, axis.path)) for axis in over)
-    of_problem = _checked_axes(replace(task, controllers=chosen), axes)
+    axes = tuple(replace(axis, path=of_problem(task.problem, axis.path) or axis.path) for axis in over)
+    of_cases = _checked_axes(replace(task, controllers=chosen), axes)
     aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
-    grid = _Grid(axes, of_problem, seed)
+    grid = _Grid(axes, of_cases, seed)
     measured = [m for m in task.metrics if m.name in ("rms_error", aim.metric.name if aim.metric else "")]
     task = replace(task, controllers=chosen, cases=grid.cases, metrics=measured)
     conditions = Conditions(seed, COMPARING, 0.0, compiled, named=True)
@@ -255,13 +265,6 @@ def sweep(
 
 
 # --- The grid ------------------------------------------------------------------------------------------------------------
-
-
-def _canonical(task: Task, path: str) -> str:
-    """'m1.exact' is 'exact.m1'."""
-    name, _, word = path.rpartition(".")
-    named = word in _OF_PARAMETERS and (name in task.problem.plant.parameters or name in task.problem.moved.parameters)
-    return f"{word}.{name}" if named else path
 
 
 def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
@@ -276,12 +279,12 @@ def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
         )
     if len({axis.path for axis in axes}) < len(axes):
         raise InvalidValue(f"'{axes[0].path}' is given twice")
-    words = {f.name for f in fields(task.problem)} | {*_OF_PARAMETERS, "start"}
-    of_problem = frozenset(axis.path for axis in axes if axis.path.partition(".")[0] in words)
+    words = {f.name for f in fields(task.problem)} | {*PARAMETERS, START}
+    of_cases = frozenset(axis.path for axis in axes if of_problem(task.problem, axis.path))
     mistakes = Mistakes("sweep")
     for axis in axes:
         try:
-            if axis.path in of_problem:
+            if axis.path in of_cases:
                 ends = (axis.values[0], axis.values[-1])
                 Cases({f"{axis.path} = {number(v)}": {axis.path: v} for v in ends}).check(task.problem)
             else:
@@ -289,7 +292,7 @@ def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
         except FpirhcError as error:
             mistakes.add(str(error))
     mistakes.raise_if_any()
-    return of_problem
+    return of_cases
 
 
 def _check_controllers(task: Task, axis: Axis, words: Collection[str]) -> None:
@@ -321,9 +324,9 @@ def _of_problem(problem: Problem, path: str) -> float | None:
     word, _, name = path.partition(".")
     if word == "exact":
         return problem.moved.parameters[name].exact
-    if word in _OF_PARAMETERS:
+    if word in PARAMETERS:
         return problem.plant.parameters[name].approximate
-    if word == "start":
+    if word == START:
         return float(problem.start_state[problem.plant.state.elements.index(name)])
     try:
         return float(current_setting(problem, path))

@@ -28,8 +28,8 @@ from fpirhc.task.problem import Problem
 
 EVERY = "all"  # the pattern of every case
 _GROUP, _SEED, _CASE = "group", "seed", "case"  # what a case has beside its changes; the column of the names
-_EXACT, _APPROXIMATE, _KNOWN, _START = "exact", "approximate", "known", "start"
-_PARAMETERS = {
+_EXACT, _APPROXIMATE, _KNOWN, START = "exact", "approximate", "known", "start"
+PARAMETERS = {
     _EXACT: "what moves",
     _APPROXIMATE: "what the controllers know",
     _KNOWN: "both: what moves has it, and the controllers know it",
@@ -223,7 +223,7 @@ def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
     for path, value in sorted(_joined(problem, of_fields).items(), key=lambda one: one[0].count(".")):
         problem = changed_at(problem, path, _number_of(problem, path, value))
     model = {name: value for word in (_APPROXIMATE, _KNOWN) for name, value in _named(changes, word).items()}
-    start = _named(changes, _START)
+    start = _named(changes, START)
     if model:
         parameters = {
             name: replace(one, approximate=float(model[name])) if name in model else one
@@ -292,13 +292,13 @@ def _check_change(problem: Problem, changes: Mapping[str, object], path: str) ->
         InvalidValue: no number, or one outside the range of a parameter or a state.
     """
     word, _, name = path.partition(".")
-    if word == _START:
-        _check_name(f"'{_START}.NAME' has a state", name, problem.plant.state.elements)
+    if word == START:
+        _check_name(f"'{START}.NAME' has a state", name, problem.plant.state.elements)
         _check_number(changes[path], problem.plant.ranges.get(name))
         return
-    if word in _PARAMETERS:
+    if word in PARAMETERS:
         settable = {n: one for n, one in _parametric(problem, changes, word).parameters.items() if not one.outside}
-        _check_name(f"'{word}.NAME' has a parameter of {_PARAMETERS[word]}", name, settable)
+        _check_name(f"'{word}.NAME' has a parameter of {PARAMETERS[word]}", name, settable)
         _check_number(changes[path], settable[name].bounds, settable[name].unit)
         return
     paths = [f.name for f in fields(problem) if f.name not in _OWN]
@@ -319,10 +319,10 @@ def _meant(problem: Problem, path: str) -> str:
     """What to write for the name of a parameter, a state or an input alone."""
     if path in problem.plant.parameters or path in problem.moved.parameters:
         return (
-            " It is a parameter: " + ", ".join(f"'{word}.{path}' is {what}" for word, what in _PARAMETERS.items()) + "."
+            " It is a parameter: " + ", ".join(f"'{word}.{path}' is {what}" for word, what in PARAMETERS.items()) + "."
         )
     if path in problem.plant.state.elements:
-        return f" It is a state: '{_START}.{path}' is its first value."
+        return f" It is a state: '{START}.{path}' is its first value."
     return f" It is an input: 'limits.inputs.{path}' are its limits." if path in problem.plant.inputs else ""
 
 
@@ -419,4 +419,4 @@ def _cell(column: str, cell: str, words: Mapping[str, float] | None) -> object:
         raise ValueError(f"expected {what}, got '{cell}'") from None
 
 
-_WORDS = (*_PARAMETERS, _START)
+_WORDS = (*PARAMETERS, START)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import casadi as ca
@@ -211,6 +212,29 @@ def test_the_command_line_sets_numbers(tmp_path, monkeypatch, capsys):
     ):
         assert main(["run", "line.py", "C", "--set", text]) == 2
         assert words in capsys.readouterr().err
+    check_numbers_of_the_problem(capsys)
+
+
+def check_numbers_of_the_problem(capsys):
+    """Parameters, the start and the duration are the problem's, in one run and in a comparison of all controllers."""
+    own = ["--set", "m.exact=1.6", "--set", "start.q=0.2", "--set", "duration=0.3", "--no-compile"]
+    assert main(["run", "line.py", "C", "--set", "deformation.gain=-0.7", *own]) == 0
+    task = fp.load_problem("line.py")
+    problem = replace(task.problem.with_exact(np.array([1.6])), start={"q": 0.2}, duration=0.3)
+    controller = replace(task.controllers["C"], deformation=fp.Affine(gain=-0.7))
+    expected = fp.simulate(problem, controller, seed=0, compiled=False)
+    np.testing.assert_array_equal(fp.load_run(Path("results/line/C.npz"))["state"], expected["state"])
+    assert main(["compare", "line.py", "--set", "deformation.gain=-0.7", *own]) == 0
+    [row] = json.loads(Path("results/line/results.json").read_text())["controllers"].values()
+    assert row["rms_error"]["q"] == pytest.approx(fp.measure(problem, expected).rms_error["q"], rel=1e-12)
+    capsys.readouterr()
+    for words, why in (
+        (["run", "line.py", "C", "--set", "exact.mm=1"], "there is no 'mm'. Did you mean 'm'?"),
+        (["compare", "line.py", "--set", "deformation.gian=1"], "gain"),
+        (["compare", "line.py", "--set", "start.q=1", "--scenarios", "2"], "--set cannot be combined with --scenarios"),
+    ):
+        assert main(words) == 2
+        assert why in capsys.readouterr().err
 
 
 def jumps(controller, numbers, signal):

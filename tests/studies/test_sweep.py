@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,6 +20,7 @@ from fpirhc.cli.output import table_writer
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError, OutputError
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.report.figures import sweep_figure, sweep_panels
 from fpirhc.studies.scenarios.bench import Bench, ranges, relative_error
 from fpirhc.studies.sweep import Axis, Sweep, sweep
 
@@ -206,3 +210,30 @@ def test_the_command_writes_table_page_picture_and_facts(tmp_path: Path, capsys:
     assert "Over deformation.gain and exact.m1" in page
     assert "data:image/png;base64," in page
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
+    # The command of a cell makes its run, also of one without the setting.
+    cells = json.loads(page.partition("const SWEEP=")[2].partition(";\n")[0])
+    assert [panel["centres"][1][1] > panel["centres"][1][0] for panel in cells["panels"]] == [True] * 3
+    for law, place in ((0, (0, 1)), (1, (1, 0))):
+        one, settings = cells["maps"][law], [axis["set"][k] for axis, k in zip(cells["axes"], place, strict=True)]
+        kept = [text for text in settings if text.partition("=")[0] not in one["without"]]
+        command = shlex.split(one["run"] + "".join(f" --set {text}" for text in kept) + cells["seed"])
+        assert command[0] == "fpirhc"
+        assert main([*command[1:], "--no-compile", "--out", str(tmp_path)]) == 0
+        run = fp.load_run(tmp_path / f"{''.join(c if c.isalnum() else '_' for c in one['controller'])}.npz")
+        problem, cell = fp.load_problem("two_mass").problem, 2 * place[0] + place[1]
+        error = relative_error(fp.measure(problem, run), ranges(problem))
+        assert facts["maps"][law]["values"][cell] == pytest.approx(error, rel=1e-9)
+        assert one["cells"][cell].startswith("relative error ")
+
+
+def test_a_cell_of_the_picture_is_where_the_page_looks_for_it(tmp_path: Path) -> None:
+    """Cells that failed are grey there, and no other ones."""
+    found = swept(tmp_path, "exact.b=10:90:5", "deformation.map.gain=-1.2:-0.4:3")
+    figure = sweep_figure(found)
+    pixels = plt.imread(io.BytesIO(figure._repr_png_()))
+    for panel, one in zip(sweep_panels(figure, found), found.maps, strict=False):
+        for place in np.ndindex(one.values.shape):
+            x, y = (panel["centres"][k][i] for k, i in enumerate(place))
+            colour = pixels[round((1 - y) * pixels.shape[0]), round(x * pixels.shape[1]), :3]
+            assert (np.ptp(colour) < 0.01) == (one.outcomes[place] != "finished"), (one.controller, place)
+    assert 0 < found.of("law").failed < 1

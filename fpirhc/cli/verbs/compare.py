@@ -19,6 +19,8 @@ from fpirhc.cli.options import (
     add_processes,
     add_scenarios,
     add_seed,
+    add_set,
+    numbers,
     shard,
 )
 from fpirhc.cli.output import publish, reproducing, results_folder, resumable, table_writer
@@ -72,6 +74,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lab", action="store_true", help=text)
     text = "use the settings in a file that 'fpirhc tune' wrote, and name them in the report"
     parser.add_argument("--tuned", metavar="FILE", help=text)
+    add_set(parser, "; every controller that has it takes it")
     _add_scenarios(parser)
 
 
@@ -81,7 +84,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
 
 def _run_once(options: argparse.Namespace) -> ExitCode:
-    from fpirhc.problem_files.problem_file import load_problem
+    from fpirhc.problem_files.problem_file import load_problem, with_numbers_of_all
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.html import render
@@ -92,6 +95,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     task = with_tuned(task, tuned.values) if tuned else task
+    task = with_numbers_of_all(task, numbers(options.settings)) if options.settings else task
     controllers = options.controllers
     if options.optimisers:
         named = list(select(task, controllers)) if controllers else None
@@ -149,11 +153,16 @@ def _check(options: argparse.Namespace) -> None:
     """
     from fpirhc.errors import InvalidValue
 
-    changed = [n for n in ("scenarios", "cases", "tuned", "optimisers") if getattr(options, n)]
+    changed = [n for n in ("scenarios", "cases", "tuned", "optimisers") if getattr(options, n)] + ["set"] * bool(
+        options.settings
+    )
     if options.lab and changed:
         raise InvalidValue(
             f"--lab has the controllers of the problem file in one run; leave --{changed[0]} out, or --lab"
         )
+    if options.settings and (options.scenarios is not None or options.cases):
+        way = "--cases" if options.cases else "--scenarios"
+        raise InvalidValue(f"--set cannot be combined with {way}; write the number into the problem file")
     if options.scenarios is not None and options.cases:
         raise InvalidValue("--cases and --scenarios are two comparisons; give one of them")
     if options.cases and options.mismatch:

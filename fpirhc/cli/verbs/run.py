@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fpirhc.cli.options import add_no_compile, add_out, add_problem, add_seed
+from fpirhc.cli.options import add_no_compile, add_out, add_problem, add_seed, add_set, numbers
 from fpirhc.cli.output import results_folder
 from fpirhc.cli.verb import ExitCode, Verb
 
@@ -27,8 +27,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, "the noise")
     add_no_compile(parser)
     parser.add_argument("--case", metavar="NAME", help="run the problem in this case of the problem file")
-    text = "another number for a setting, such as deformation.gain=-1.2 or limits.inputs.Q1=-50,20; or a set-point, setpoints.q1=2"
-    parser.add_argument("--set", action="append", default=[], dest="settings", metavar="PATH=NUMBER", help=text)
+    add_set(parser, "; or a set-point, setpoints.q1=2")
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -67,29 +66,6 @@ def _run(options: argparse.Namespace) -> ExitCode:
     return ExitCode.FINISHED if run.stop is None else ExitCode.ENDED_EARLY
 
 
-def numbers(settings: Sequence[str]) -> dict[str, float | tuple[float, ...]]:
-    """Return numbers by path from texts 'PATH=NUMBER', or 'PATH=LOWER,UPPER' for an interval.
-
-    Raises:
-        InvalidValue: a text of another form.
-    """
-    from fpirhc.errors import InvalidValue
-
-    values: dict[str, float | tuple[float, ...]] = {}
-    for text in settings:
-        path, _, value = text.partition("=")
-        try:
-            if not path.strip():
-                raise ValueError
-            parts = tuple(float(part) for part in value.split(","))
-        except ValueError:
-            raise InvalidValue(
-                f"--set {text}: expected PATH=NUMBER, such as deformation.gain=-1.2, or PATH=LOWER,UPPER for an interval"
-            ) from None
-        values[path.strip()] = parts if len(parts) > 1 else parts[0]
-    return values
-
-
 def by_kind(
     values: Mapping[str, float | tuple[float, ...]],
 ) -> tuple[dict[str, float | tuple[float, ...]], dict[str, float] | None]:
@@ -117,13 +93,17 @@ def _simulated(
     **run: Any,
 ) -> tuple[Problem, Controller, Run]:
     """Problem and controller with these settings, and their run; live ones, which need no compiler, where they can be."""
-    from fpirhc.controllers.live_settings import live_settings
+    from fpirhc.controllers.live_settings import OF_PROBLEM, live_settings
     from fpirhc.errors import NotSupported
-    from fpirhc.problem_files.settings import is_whole, with_settings
+    from fpirhc.problem_files.settings import as_declared, of_problem, with_numbers, with_settings
     from fpirhc.simulation.simulate import simulate
     from fpirhc.simulation.trials import with_recommended_gain
 
     run["setpoints"] = setpoints
+    own = {p: word for p in settings if (word := of_problem(problem, p)) and not _has(controller, p)}
+    data = {p: word for p, word in own.items() if word.partition(".")[0] not in OF_PROBLEM}
+    problem = with_numbers(problem, {word: settings[p] for p, word in data.items()})
+    settings = {p: v for p, v in settings.items() if p not in data}
     if not settings:
         return problem, controller, simulate(problem, controller, **run)
     with with_recommended_gain(problem, _with_gains(controller, settings)):
@@ -132,12 +112,16 @@ def _simulated(
             changed, ready, _ = live_settings(problem, controller, list(settings)).changed(settings)
             return changed, ready, live
         except NotSupported:
-            values: dict[str, Any] = {
-                p: v if isinstance(v, tuple) or v % 1 or not is_whole(controller, p) else int(v)
-                for p, v in settings.items()
-            }
-            rebuilt = with_settings(controller, values)
-            return problem, rebuilt, simulate(problem, rebuilt, **run)
+            changed = with_numbers(problem, {own[p]: v for p, v in settings.items() if p in own})
+            rebuilt = with_settings(
+                controller, as_declared(controller, {p: v for p, v in settings.items() if p not in own})
+            )
+            return changed, rebuilt, simulate(changed, rebuilt, **run)
+
+
+def _has(controller: Controller, path: str) -> bool:
+    """Whether a path begins with a field of the controller that it has."""
+    return getattr(controller, path.partition(".")[0], None) is not None
 
 
 def _with_gains(controller: Controller, settings: Mapping[str, Any]) -> Controller:
@@ -171,6 +155,7 @@ VERB = Verb(
             'fpirhc run two_mass "RHC+FPI" --set deformation.gain=-1.2',
             "another gain; other numbers of it need no compiler",
         ),
+        ('fpirhc run two_mass "RHC+FPI" --set exact.m1=1.4 --set start.q1=2', "another plant and another start"),
         ('fpirhc run my_arm.py "RHC+FPI" --case heavy', "the problem in a case of its file"),
         ('fpirhc run my_arm.py "RHC+FPI" --out results --seed 3', "another folder, other noise"),
     ),
