@@ -156,14 +156,6 @@ class Trajectory(Reference):
         results = self._scaled(plant)(t, nominal(self.scale))
         return ca.Function("fpirhc_reference", [t], list(results), ["t"], ["state", "response"])
 
-    def derivatives(self, coordinate: str, order: int) -> ca.Function:
-        if nominal(self.scale) == 1:
-            return super().derivatives(coordinate, order)
-        t = ca.SX.sym("t")
-        return ca.Function(
-            "fpirhc_reference_derivatives", [t], [self._derivatives(coordinate, order)(t, nominal(self.scale))]
-        )
-
     def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
         """The scale where it is live."""
         del plant, stages
@@ -180,7 +172,7 @@ class Trajectory(Reference):
 
     def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
         live = self.own(plant, stages)
-        return self._derivatives(coordinate, order) if live else super().chain(plant, stages, coordinate, order)
+        return self._derivatives(plant, coordinate, order) if live else super().chain(plant, stages, coordinate, order)
 
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
         if not self.own(plant, 0):
@@ -202,10 +194,10 @@ class Trajectory(Reference):
             results.append(ca.densify(place + scale * (one - place)))
         return ca.Function("fpirhc_reference_scaled", [t, scale], results)
 
-    def _derivatives(self, coordinate: str, order: int) -> ca.Function:
+    def _derivatives(self, plant: Plant, coordinate: str, order: int) -> ca.Function:
         """Function (t, scale) -> the coordinate's value and its derivatives up to `order`."""
         t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
-        values = Trajectory(self.motion).derivatives(coordinate, order)
+        values = Trajectory(self.motion).chain(plant, 0, coordinate, order)
         place = ca.vertcat(values(ca.SX(0))[0], ca.SX.zeros(order))
         return ca.Function("fpirhc_reference_chain", [t, scale], [ca.densify(place + scale * (values(t) - place))])
 
