@@ -12,10 +12,13 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance import check_plant
-from fpirhc.errors import InvalidProblem
+from fpirhc.controllers.contract import Controller
+from fpirhc.errors import FpirhcError, InvalidProblem
+from fpirhc.members import examples
 from fpirhc.probing.recording import read_recording
 from fpirhc.review.grid import review_grid
 from fpirhc.review.questions.slew import effect
+from fpirhc.simulation.run import Run
 from fpirhc.task.external_plant import Body
 
 JOINTS = ("shoulder", "elbow")
@@ -62,13 +65,41 @@ SHARED = joints(JOINTS, ("input shoulder", "coordinate shoulder", "shoulder rate
 OTHER = joints(("M1", "M2"), ("M1", "shoulder", "M1"))
 
 
-def test_a_run_is_that_of_other_names():
-    """Every signal of the run is bit for bit that of motors with names of their own."""
-    shared, other = (fp.simulate(one, CONTROLLER, seed=0, compiled=False) for one in (SHARED, OTHER))
+FORMS = {
+    "late": lambda one: replace(one, dead_time=fp.DeadTime(measurement=0.01)),
+    "encoder": lambda one: replace(one, sensing=fp.Sensing(estimator=fp.PositionDifference())),
+    "another plant": lambda one: replace(one, reality=fp.Reality(one.plant)),
+}
+MAPS = examples("deformations", fp.Affine(gain=-0.3))
+
+
+@pytest.mark.parametrize(
+    "form", [None, *FORMS, *MAPS], ids=lambda one: one if isinstance(one, str) else type(one).__name__
+)
+def test_a_run_is_that_of_other_names(form):
+    """Every signal of the run is bit for bit that of motors with names of their own, in every form; what is refused is, too."""
+    controller = (
+        CONTROLLER if form is None or isinstance(form, str) else fp.ComputedTorque(fp.Exponential(rate=3.0), form)
+    )
+    pair = [SHARED, OTHER]
+    if isinstance(form, str):
+        pair = [FORMS[form](one) for one in pair]
+    shared, other = (outcome(one, controller) for one in pair)
+    if isinstance(shared, type) or isinstance(other, type):
+        assert shared is other
+        return
     assert shared.layout.names == other.layout.names
     for name in other.layout.names:
         if not name.endswith("_time"):  # wall time
             assert np.array_equal(shared[name], other[name], equal_nan=True), name
+
+
+def outcome(problem: fp.Problem, controller: Controller) -> Run | type[FpirhcError]:
+    """The run, or the class of the refusal."""
+    try:
+        return fp.simulate(problem, controller, seed=0, compiled=False)
+    except FpirhcError as error:
+        return type(error)
 
 
 def test_disturbances_act_where_they_are_said_to():
