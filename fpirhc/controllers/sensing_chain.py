@@ -87,14 +87,12 @@ def seeing_blocks(problem: Problem) -> list[Block]:
     raw = raw_signal(problem)
     if raw is None:
         return []
-    believing, (start, _) = _believing(problem), first_estimates(problem)
+    believing, plant = _believing(problem), problem.plant
     if believing is not None:
-        return [believing.block]
-    if problem.sensing.measured is not None:
-        return _estimating_part(problem, raw, start)
-    plant = problem.plant
-    block = problem.sensing.estimator.block(plant, problem.period, start, raw)
-    return with_steps_ahead(plant, block) if problem.sensing.estimator.of_steps else [block]
+        return with_steps_ahead(plant, believing.block)
+    selecting, seen = ([], raw) if problem.sensing.measured is None else _selecting(problem, raw)
+    start = first_estimates(problem)[0]
+    return [*selecting, *with_steps_ahead(plant, problem.sensing.estimator.block(plant, problem.period, start, seen))]
 
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
@@ -132,14 +130,13 @@ def _believing(problem: Problem) -> Believing | None:
     return Believing(problem, raw, first_estimates(problem)[0])
 
 
-def _estimating_part(problem: Problem, raw: Signal, start: np.ndarray) -> list[Block]:
-    """The estimator behind a block that leaves out what it does not need."""
-    plant, estimator = problem.plant, problem.sensing.estimator
-    names = estimator.measures(plant)
+def _selecting(problem: Problem, raw: Signal) -> tuple[list[Block], Signal]:
+    """A block that leaves out what the estimator does not need, and what it needs."""
+    names = problem.sensing.estimator.measures(problem.plant)
     places = [raw.elements.index(n) for n in names]
     needed = Signal("_needed", names)
     select = Block("select", Layout((raw,)), Layout((needed,)), lambda s: {needed.name: getattr(s, raw.name)[places]})
-    return [select, estimator.block(plant, problem.period, start, needed)]
+    return [select], needed
 
 
 _MEASURED, _PAST, _COUNT = "_differences", "outputs_expected", "outputs_measured"
@@ -159,7 +156,7 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
 
     Args:
         plant: a map, or any other plant, whose estimator then stays alone.
-        estimate: writes the signal of the outputs.
+        estimate: writes the signal of the outputs, and of the state where it is believed.
     """
     if not response_age(plant) * (max(plant.chains.values()) - 1):
         return [estimate]

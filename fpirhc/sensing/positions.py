@@ -165,6 +165,10 @@ class StepDifference(_Finite):
     def of_steps(self) -> bool:
         return True
 
+    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
+        """State elements that are measured: the differences are those of earlier cycles."""
+        return DerivativeEstimator.known(self, plant, measured)
+
     def coefficients(self, order: int) -> Array:
         rows = np.zeros((order + 1, order + 1))
         for s in range(order + 1):

@@ -82,11 +82,6 @@ def check_maps(model: Plant, reality: Reality | ExternalPlant | None, sensing: S
             f"sensing: {type(sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
             "have; leave the estimator out, and differences of its steps are taken"
         )
-    if max(model.chains.values()) > 1 and (sensing.observer is not None or sensing.measured is not None):
-        mistakes.add(
-            "sensing: believed states are not covered where an output of a map has an order above 1, because its next values are "
-            "predicted from measured states; leave measured and observer out"
-        )
 
 
 def _instant(plant: Plant) -> tuple[str, ...]:

@@ -110,21 +110,15 @@ WRONG_SIGN = "has the wrong sign, so every cycle enlarges the error"
 WRONG_PAIR = "so the iteration converges only for effective gains below 0"
 BY_TIME = "a derivative with respect to time, and {}; use ComputedTorque with a deformation"
 AT_ONCE_SAID, STEPS_SAID = BY_TIME.format("y is of order 0"), BY_TIME.format("a map has differences of its steps")
-NOT_AT_ONCE = (
-    "DisturbanceKalman: y'' is estimated {} cycles late, and the filter needs it at once; measure states alone"
-)
+NO_FILTER = "no stationary gain makes the filter stable; give noise={'a': ...}, or measure more states"
+IN_STEPS = "map", "believed map"
 REFUSED: dict[tuple[str, str], str] = {
     **{("Sigmoid 11", form): WRONG_SIGN for form in FORMS},
     **{("Sigmoid 12", form): WRONG_SIGN for form in FORMS},
     **{("FullSpaceFixedPoint 2", form): "serves problems without limits only (it is a baseline)" for form in FORMS},
-    **{("Paired 15", form): WRONG_PAIR for form in ("map", "encoder", "believed")},
-    (
-        "Estimating",
-        "states",
-    ): "no stationary gain makes the filter stable; give noise={'a': ...}, or measure more states",
-    ("Estimating", "map"): NOT_AT_ONCE.format("2"),
-    ("Estimating", "encoder"): NOT_AT_ONCE.format("0.5"),
-    ("Estimating", "believed"): NOT_AT_ONCE.format("0.5"),
+    **{("Paired 15", form): WRONG_PAIR for form in ("map", "encoder", "believed", "believed map")},
+    ("Estimating", "states"): NO_FILTER,
+    ("Estimating", "believed"): NO_FILTER,
     ("ADRC", "at once"): "ADRC observes a chain of integrators, and the command moves 'y' at once (order 0)",
     ("IntelligentPID", "at once"): "'y' is moved at once (order 0); it needs an order from 1 to the window",
     ("L1Adaptive", "at once"): "predicts a derivative below the response, and the command moves 'y' at once (order 0)",
@@ -132,10 +126,10 @@ REFUSED: dict[tuple[str, str], str] = {
     ("Slotted", "at once"): "the command moves 'y' at once (order 0), so a slot has no derivative to prescribe",
     ("BacksteppingMRAC", "at once"): "rates=()): expected positive numbers, 1/s",
     ("LyapunovMRAC", "at once"): f"proves that errors vanish by {AT_ONCE_SAID}",
-    ("LyapunovMRAC", "map"): f"proves that errors vanish by {STEPS_SAID}",
+    **{("LyapunovMRAC", form): f"proves that errors vanish by {STEPS_SAID}" for form in IN_STEPS},
     ("ResolvedAccelerationRate", "at once"): f"prescribes {AT_ONCE_SAID}",
-    ("ResolvedAccelerationRate", "map"): f"prescribes {STEPS_SAID}",
-    ("ModelReferenced 3", "map"): "a map has no lag, and no dead time of parts of a cycle",
+    **{("ResolvedAccelerationRate", form): f"prescribes {STEPS_SAID}" for form in IN_STEPS},
+    **{("ModelReferenced 3", form): "a map has no lag, and no dead time of parts of a cycle" for form in IN_STEPS},
     ("ExactModel", "reality"): "no coordinate y, which the model has: it cannot be the exact model of this controller",
     ("ExactModel", "outside"): "a foreign reality has no equations that could be the exact model; leave ExactModel out",
 }

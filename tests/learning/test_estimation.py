@@ -353,12 +353,6 @@ TWO_TASK = fp.Problem(
             "RecursiveLeastSquares learns from the response, which needs y', and no sensor shows it",
         ),
         (
-            task(spring(), sensing=fp.Sensing(estimator=fp.PositionDifference())),
-            fp.DisturbanceKalman({"y": 1.0}, {"y": 1e-3, "y''": 1.0}),
-            NotSupported,
-            "y'' is estimated 0.5 cycles late",
-        ),
-        (
             task(spring()),
             fp.DisturbanceKalman({"y": 1.0}, {"y'''": 1.0}),
             InvalidProblem,

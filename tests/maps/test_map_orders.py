@@ -157,3 +157,65 @@ def test_poles_that_do_not_fit_are_refused(what: str) -> None:
     make, message = BAD[what]
     with pytest.raises(FpirhcError, match=message):
         fp.simulate(task(chain(2)), fp.ComputedTorque(make()), seed=0, compiled=False)
+
+
+def believed(observer: Any) -> dict[str, Any]:
+    """Settings of a problem in which the output alone is measured."""
+    return {"sensing": fp.Sensing(estimator=fp.StepDifference(), measured=("y",), observer=observer)}
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_states_behind_an_output_of_several_steps_are_believed(order: int) -> None:
+    """By the exact model the run is that of measured states; the output's next values follow from the believed ones."""
+    law = fp.ComputedTorque(fp.Exponential(rate=0.5 / T), fp.ModelReferenced(fp.Affine(gain=-0.5)))
+    runs = [
+        fp.simulate(task(chain(order), **settings), law, seed=0, compiled=False)
+        for settings in ({}, believed(fp.ModelStates()))
+    ]
+    np.testing.assert_allclose(runs[1]["command"], runs[0]["command"], atol=1e-12)
+    np.testing.assert_allclose(runs[1]["output"], runs[0]["output"], atol=1e-12)
+    assert np.ptp(runs[0]["command"]) > 0.1
+
+
+def test_believed_states_of_a_wrong_map_are_corrected() -> None:
+    """A fifth of the wrong model's error is left with a filter of the output, and no more than with measured states."""
+    measured = task(chain(2, 0.95))
+    problem = task(chain(2, 0.95), **believed(fp.KalmanFilter(measured={"y": 1e-3}, noise={"x1": 1e-2, "x2": 1e-2})))
+    law = fp.Exponential(rate=0.3 / T, integral=False)
+    form = fp.ModelReferenced(fp.Affine(gain=-0.5))
+    plain, adapted, seen = (
+        float(np.sqrt(np.mean(error_of(p, fp.ComputedTorque(law, d))[150:] ** 2)))
+        for p, d in ((problem, fp.Identity()), (problem, form), (measured, form))
+    )
+    assert adapted < 0.2 * plain
+    assert adapted < 1.1 * seen
+
+
+def test_a_filter_of_late_responses_is_the_recursion_by_hand() -> None:
+    """The response of order 2 is that of two cycles ago, to the state and the command of then; the disturbance is found."""
+    filtering = fp.DisturbanceKalman({"x2": 0.02}, {"x1": 1e-2, "x2": 1e-2, "y''": 1e-4})
+    plant = chain(2)
+    problem = task(plant, duration=600.0, measure_from=0.0, disturbances={"x2": fp.Step(0.0, 0.005)})
+    run = fp.simulate(
+        problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(rate=0.3 / T)), filtering), seed=0, compiled=False
+    )
+    modelled = fp.Estimating(fp.ComputedTorque(fp.Exponential(rate=0.3 / T)), filtering).inner_problem(problem)
+    gain = filtering.gain(modelled)
+
+    def after(x: np.ndarray, u: float, w: float) -> np.ndarray:
+        return np.array([x[1], 0.4 * x[0] + 0.1 * x[1] ** 2 + 2.0 * u + T * w])
+
+    def response(x: np.ndarray, u: float, w: float) -> float:
+        later = after(x, u, w)
+        return float((after(later, u, w)[0] - 2 * later[0] + x[0]) / T**2)
+
+    state, disturbance, estimates = run["state"][0], 0.0, [0.0, 0.0]
+    for k in range(2, run.cycles):
+        x, u = run["state"][k - 2], float(run["command"][k - 2, 0])
+        missing = np.append(x - state, run["realised"][k, 0] - response(state, u, disturbance))
+        step = gain @ missing
+        state, disturbance = state + step[:2], disturbance + float(step[2])
+        estimates.append(disturbance)
+        state = after(state, u, disturbance)
+    np.testing.assert_allclose(run["estimate"][:, 0], estimates, atol=1e-12)
+    assert run["estimate"][-1, 0] == pytest.approx(0.005, rel=1e-3)

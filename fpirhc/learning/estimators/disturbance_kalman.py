@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NoAnswer, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NoAnswer
 from fpirhc.fields.kinds import Deviation, finite_number
 from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
 from fpirhc.plant.disturbed import disturbance_name, disturbed
@@ -64,9 +64,10 @@ class DisturbanceKalman(ParameterEstimator):
             outputs also output (y), for a disturbance that adds to it, or response of an output (y'' for order 2), for one that
             adds to the response alone, which is what a deformation sees.
         measured: state (q1, q1', ...), output (y, y', ...) or response (q1'' for order 2) -> deviation of its measurement noise, in
-            its unit. A response shows its disturbance at once, and a deformation has it; an estimator that is late cannot serve the
-            filter. Of responses alone the filter has no state of its own: it evaluates the model at the measured one, and moves the
-            disturbance by the gain L times the innovation, as a model-referenced deformation of gain L does.
+            its unit. A response shows its disturbance at once, and a deformation has it; behind an estimator, late, and on maps the
+            whole filter is as late as the response. Of responses alone the filter has no state of its own: it evaluates the model
+            at the measured one, and moves the disturbance by the gain L times the innovation, as a model-referenced deformation
+            of gain L does.
         noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.
         frequencies: of sines in every disturbance, rad per unit of time; each drifts as the constant does.
 
@@ -127,19 +128,11 @@ class DisturbanceKalman(ParameterEstimator):
         Raises:
             InvalidProblem: unknown names; more disturbances than measured quantities.
             NoAnswer: the rank condition is not met, or no stationary gain exists.
-            NotSupported: a measured response that is estimated late.
         """
         mistakes = Mistakes("DisturbanceKalman")
-        plant = problem.plant
-        mistakes.unknown("measured: state, output or response", self.measured, quantities(plant))
+        mistakes.unknown("measured: state, output or response", self.measured, quantities(problem.plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
         mistakes.raise_if_any()
-        late = problem.sensing.delay(plant, problem.period) + response_age(plant)
-        if self._responses(plant) and late > 0:
-            raise NotSupported(
-                f"DisturbanceKalman: {', '.join(self._responses(plant))} is estimated {late:.4g} cycles late, and the filter needs "
-                "it at once; measure states alone, or give the sensing VelocityDifference() or an accelerometer"
-            )
         self._check_rank(problem)
         self.gain(problem)
 
@@ -202,6 +195,7 @@ class DisturbanceKalman(ParameterEstimator):
         advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
         fixed = ca.DM(self.gain(problem)) if self.following(problem) is None else None
         shown, follows = self._shown_function(model), self._has_state(model)
+        foresees = self._foresees(model)
         places = [model.parameter.elements.index(n) for n in self.learned()]
         moves, adds = self.modes(problem).of(len(places))
 
@@ -211,18 +205,24 @@ class DisturbanceKalman(ParameterEstimator):
             return parameters
 
         def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
-            before = memory["observed_disturbance"]
-            predicted = seen.state
-            if follows:
-                predicted = advance(memory["observed_state"], seen.command, disturbed_by(before, seen), no_forcing)
-            moved = moves @ before
+            before, observed = memory["observed_disturbance"], memory["observed_state"]
+            predicted, moved = seen.state if not follows else observed, before
+            if not foresees:
+                moved = moves @ before
+                predicted = (
+                    advance(observed, seen.command, disturbed_by(before, seen), no_forcing) if follows else predicted
+                )
             innovation = self._measured(model, seen) - shown(predicted, seen.command, disturbed_by(moved, seen))
             gain = _gain(fixed, seen, len(self.measured))
             on_state, on_disturbance = gain[: model.state.size, :], gain[model.state.size :, :]
             running = seen.valid > 0.5
             state = ca.if_else(running, predicted + on_state @ innovation, seen.state)
             disturbance = ca.if_else(running, moved + on_disturbance @ innovation, 0)
-            return adds @ disturbance, {"observed_state": state, "observed_disturbance": disturbance}
+            change = adds @ disturbance
+            if foresees:
+                later = advance(state, seen.command, disturbed_by(disturbance, seen), no_forcing)
+                state, disturbance = ca.if_else(running, later, seen.state), moves @ disturbance
+            return change, {"observed_state": state, "observed_disturbance": disturbance}
 
         return correct
 
@@ -241,6 +241,10 @@ class DisturbanceKalman(ParameterEstimator):
             return {"observed_state": later, "observed_disturbance": moves @ memory["observed_disturbance"]}
 
         return wait
+
+    def _foresees(self, plant: Plant) -> bool:
+        """Whether it remembers the next state: a map's response is to the command that acts after the state, and not before."""
+        return bool(self._responses(plant)) and response_age(plant) > 0
 
     def _responses(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured responses."""
