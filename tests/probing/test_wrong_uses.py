@@ -1,0 +1,148 @@
+"""Twenty wrong uses of an external plant, of cases and of a probe, as a newcomer makes them, each with its whole message."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from bodies import RHC, Body, body_problem
+
+import fpirhc as fp
+
+PROBLEM = body_problem(1.0)
+MEASURES = {"q": "m", "q'": "m/s", "q''": "m/s^2"}
+
+
+class Silent(Body):
+    """Its reset returns nothing."""
+
+    def reset(self, seed: int) -> Any:
+        del seed
+
+
+def body(kind: type[Body] = Body) -> Body:
+    return kind(np.array([[1.0]]))
+
+
+def outside(**settings: Any) -> Any:
+    """The task with another external plant."""
+    given = {"body": body(), "measures": MEASURES} | settings
+    return replace(PROBLEM, reality=fp.ExternalPlant(**given))
+
+
+def case(changes: Any) -> Any:
+    return fp.Cases({"heavy": changes}).problem("heavy", PROBLEM)
+
+
+def run(problem: fp.Problem) -> Any:
+    return fp.simulate(problem, RHC, seed=0, compiled=False)
+
+
+def probed(**settings: Any) -> Any:
+    return fp.probe(PROBLEM, RHC, **settings)
+
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "a class for a body": (
+        lambda: outside(body=Body),
+        "ExternalPlant: its body is the class Body; write Body() for an object of it",
+    ),
+    "a function for a body": (
+        lambda: outside(body=lambda command: command),
+        "ExternalPlant: its body function has no method reset(...); it needs reset and step",
+    ),
+    "no measures": (
+        lambda: outside(measures={}),
+        "problem: reality: 3 mistakes\n  1. it does not measure q (m), which the sensing of the problem needs; "
+        "add it to measures, or choose an estimator that does without: Sensing(estimator=...)\n  2. it does "
+        "not measure q' (m/s), which the sensing of the problem needs; add it to measures, or choose an "
+        "estimator that does without: Sensing(estimator=...)\n  3. it does not measure q'' (m/s^2), which the "
+        "sensing of the problem needs; add it to measures, or choose an estimator that does without: "
+        "Sensing(estimator=...)",
+    ),
+    "names alone": (
+        lambda: outside(measures=["q", "q'", "q''"]),
+        "ExternalPlant.measures: expected {name: a text}, got ['q', \"q'\", \"q''\"]",
+    ),
+    "another unit": (
+        lambda: outside(measures=MEASURES | {"q": "mm"}),
+        "problem: reality: it measures q in mm, the model has it in m; write both in one unit",
+    ),
+    "an unknown quantity": (
+        lambda: outside(measures=MEASURES | {"angle": "rad"}),
+        "problem: reality: measures: quantity 'angle' is unknown. Valid: q, q', q''.",
+    ),
+    "parameters of a body that stands": (
+        lambda: outside(parameters={"b": fp.Parameter(1.0, 1.0, "1")}),
+        "ExternalPlant: a body that stands cannot take parameters; write make=lambda parameters, seed: body",
+    ),
+    "a dead time without its input": (
+        lambda: outside(dead_time=0.02),
+        "ExternalPlant.dead_time: expected {name: a finite number of at least 0}, got 0.02; give it a name: "
+        "{'name': ...}",
+    ),
+    "a start that returns nothing": (
+        lambda: run(outside(body=body(Silent))),
+        "reality: reset of Silent returned None, expected 3 numbers: q, q', q''",
+    ),
+    "exact parameters of a body that stands": (
+        lambda: outside().reality.with_exact(np.array([1.0])),
+        "the external plant has no exact parameters that a study could draw; state them, "
+        "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare without scenarios",
+    ),
+    "no case": (lambda: fp.Cases({}), 'cases: there is none; expected {"heavy": {"exact.mass": 2.0}}'),
+    "a parameter without its word": (
+        lambda: case({"b": 2.0}),
+        "cases: case 'heavy', 'b': a case has no 'b'. It is a parameter: 'exact.b' is what moves, "
+        "'approximate.b' is what the controllers know, 'known.b' is both: what moves has it, and the "
+        "controllers know it.",
+    ),
+    "a parameter that is not there": (
+        lambda: case({"approximate.mass": 2.0}),
+        "cases: case 'heavy', 'approximate.mass': 'approximate.NAME' has a parameter of what the controllers "
+        "know, and there is no 'mass'. Valid: b.",
+    ),
+    "a field that is misspelt": (
+        lambda: case({"limit.inputs.u": (-1.0, 1.0)}),
+        "cases: case 'heavy', 'limit.inputs.u': a case has no 'limit.inputs.u'. Did you mean 'limits'? Valid: "
+        "exact, approximate, known, start, reference, period, duration, limits, disturbances, dead_time, "
+        "sensing, horizon, cost, integrator, measure_from, judged, input_before, reality, signals.",
+    ),
+    "a text for a number": (
+        lambda: case({"start.q": "0.1"}),
+        "cases: case 'heavy', 'start.q': expected a finite number, got the text '0.1'",
+    ),
+    "too few cycles": (
+        lambda: probed(cycles=20),
+        "probe: 20 cycles are too few to tell a gain from noise; expected at least 40, 300 are usual",
+    ),
+    "a negative amplitude": (
+        lambda: probed(amplitude=-1.0),
+        "probe(amplitude=-1.0): expected a number of at least 0, in the unit of the signal",
+    ),
+    "the amplitude of an input": (
+        lambda: probed(amplitude={"u": 1.0}),
+        "probe(amplitude=...): 'u' is unknown. Valid: q.",
+    ),
+    "the chatter of a coordinate": (
+        lambda: probed(chatter={"q": 1.0}),
+        "probe(chatter=...): 'q' is unknown. Valid: u.",
+    ),
+    "a record that is not there": (
+        lambda: probed(recording="run1.csv"),
+        "recording 'run1.csv' cannot be read: No such file or directory",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_use_is_told_in_one_message(name, tmp_path, monkeypatch):
+    """What, where, what was expected, the nearest name, and how to mend it; the place in the file comes before it."""
+    monkeypatch.chdir(tmp_path)
+    use, message = WRONG[name]
+    with pytest.raises(fp.FpirhcError) as caught:
+        use()
+    assert re.sub(r"^\S+\.py, line \d+: ", "", str(caught.value)) == message
