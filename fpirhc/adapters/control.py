@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import control
@@ -74,16 +75,10 @@ def plant_of(
         return lambda x, p: rows["C"](x, states, p)[k]
 
     seen = {name: Output(unit, shown(k)) for k, (name, unit) in enumerate(outputs.items())}
-    common: dict[str, Any] = {
-        "states": states,
-        "inputs": inputs,
-        "parameters": parameters,
-        "outputs": seen,
-        "time_unit": time_unit,
-    }
+    make: Callable[..., Plant] = partial(Plant.of_states, rates=moved)
     if model.dt:
-        return Plant.discrete(next=moved, step=float(model.dt), **common)
-    return Plant.of_states(rates=moved, **common)
+        make = partial(Plant.discrete, next=moved, step=float(model.dt))
+    return make(states=states, inputs=inputs, parameters=parameters, outputs=seen, time_unit=time_unit)
 
 
 def _size(system: Any) -> str:
@@ -105,8 +100,7 @@ def _rows(
     """Function (view, names, parameters) -> the matrix times the column; its uncertain entries are added to the parameters."""
     for (row, column), value in np.ndenumerate(model if model.shape == true.shape else np.zeros((0, 0))):
         if value != true[row, column]:
-            unit = "1"
-            parameters[f"{name}_{row + 1}_{column + 1}"] = Parameter(float(value), float(true[row, column]), unit)
+            parameters[f"{name}_{row + 1}_{column + 1}"] = Parameter(float(value), float(true[row, column]), "1")
 
     def product(view: Any, names: Iterable[str], p: Any) -> list[Expression]:
         column = [getattr(view, n) for n in names]
@@ -136,12 +130,12 @@ def controller_system(problem: Problem, controller: Controller, *, compiled: boo
     """
     stepper = Stepper(problem, controller, compiled=compiled)
 
-    def stepped(time: float, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return stepper.step_measured(float(time), np.asarray(measured, dtype=float), np.asarray(memory, dtype=float))
+    def stepped(result: int, time: float, memory: np.ndarray, measured: np.ndarray, _: object) -> np.ndarray:
+        return stepper.step_measured(float(time), np.asarray(measured, float), np.asarray(memory, float))[result]
 
     system = control.NonlinearIOSystem(
-        lambda t, x, u, _: stepped(t, x, u)[1],
-        lambda t, x, u, _: stepped(t, x, u)[0],
+        partial(stepped, 1),
+        partial(stepped, 0),
         inputs=[_label(name) for name in stepper.measures],
         outputs=list(problem.plant.inputs),
         states=stepper.memory.size,

@@ -5,10 +5,12 @@ problem = fp.Problem(plant=model, reality=fmu_body("tank.fmu", model, period=1.0
 
 from __future__ import annotations
 
-import shutil
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -45,76 +47,60 @@ def fmu_body(
     fmpy = package("fmpy", "outside")
     described = fmpy.read_model_description(str(path))
     if described.coSimulation is None:
-        raise InvalidProblem(
-            f"fmu_body: {Path(path).name} is made for model exchange alone; export it for co-simulation"
-        )
-    units, mistakes = quantities(model), Mistakes("fmu_body")
-    references = {v.name: v.valueReference for v in described.modelVariables if v.type in ("Real", "Float64")}
+        name = Path(path).name
+        raise InvalidProblem(f"fmu_body: {name} is made for model exchange alone; export it for co-simulation")
+    units, mistakes, fixed = quantities(model), Mistakes("fmu_body"), parameters or {}
+    known = {v.name: v.valueReference for v in described.modelVariables if v.type in ("Real", "Float64")}
     mistakes.unknown("measures: quantity", measures, units)
-    mistakes.unknown("variable", measures.values(), references)
-    mistakes.unknown("parameters: variable", parameters or {}, references)
-    sent = counterparts(mistakes, "input", model.inputs, inputs or {}, references)
+    mistakes.unknown("variable", measures.values(), known)
+    mistakes.unknown("parameters: variable", fixed, known)
+    sent = counterparts(mistakes, "input", model.inputs, inputs or {}, known)
     mistakes.raise_if_any()
-    names = (list(parameters or {}), list(sent.values()), list(measures.values()))
-    fixed, commands, answers = ([references[n] for n in some] for some in names)
-    body = _Body(fmpy, str(path), described, period, (fixed, list((parameters or {}).values())), commands, answers)
+    folder = TemporaryDirectory()
+    make = partial(fmpy.instantiate_fmu, fmpy.extract(str(path), folder.name), described, fmi_type="CoSimulation")
+    references = [[known[name] for name in names] for names in (fixed, sent.values(), measures.values())]
+    body = _Body(make, described.fmiVersion, period, list(fixed.values()), references)
+    weakref.finalize(body, folder.cleanup)
     return ExternalPlant(body, measures={name: units[name] for name in measures})
 
 
+@dataclass(eq=False)
 class _Body:
     """An instance of the FMU, made anew for every run.
 
     Args:
-        fmpy: the package.
-        path: of the FMU.
-        described: its description.
+        make: returns an instance.
+        version: of FMI.
         period: of a step.
-        fixed: references of the parameters, and their values.
-        commands: references of the inputs.
-        answers: references of what is measured.
+        fixed: values of the parameters.
+        references: of the parameters, of the inputs, and of what is measured.
     """
 
-    def __init__(
-        self,
-        fmpy: Any,
-        path: str,
-        described: Any,
-        period: float,
-        fixed: tuple[list[int], list[float]],
-        commands: list[int],
-        answers: list[int],
-    ) -> None:
-        self._fmpy, self._described, self._folder = fmpy, described, fmpy.extract(path)
-        self._period, self._fixed, self._commands, self._answers = period, fixed, commands, answers
-        self._instance: Any = None
-        weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+    make: Callable[[], Any]
+    version: str
+    period: float
+    fixed: list[float]
+    references: list[list[int]]
+    unit: Any = None
 
     def reset(self, seed: int) -> np.ndarray:
         """Begin anew at time 0."""
         del seed
-        self._end()
-        self._instance = self._fmpy.instantiate_fmu(self._folder, self._described, fmi_type="CoSimulation")
-        new = self._described.fmiVersion.startswith("3")
+        if self.unit is not None:
+            self.unit.terminate()
+            self.unit.freeInstance()
+        unit = self.unit = self.make()
+        new = self.version.startswith("3")
+        self._set, self._get = (unit.setFloat64, unit.getFloat64) if new else (unit.setReal, unit.getReal)
         if not new:
-            self._instance.setupExperiment(startTime=0.0)
-        self._set, self._get = (
-            (self._instance.setFloat64, self._instance.getFloat64)
-            if new
-            else (self._instance.setReal, self._instance.getReal)
-        )
-        self._instance.enterInitializationMode()
-        self._set(*self._fixed)
-        self._instance.exitInitializationMode()
-        return np.array(self._get(self._answers))
+            unit.setupExperiment(startTime=0.0)
+        unit.enterInitializationMode()
+        self._set(self.references[0], self.fixed)
+        unit.exitInitializationMode()
+        return np.array(self._get(self.references[2]))
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
         """Hold the command for a communication step."""
-        self._set(self._commands, list(map(float, command)))
-        self._instance.doStep(currentCommunicationPoint=time, communicationStepSize=self._period)
-        return np.array(self._get(self._answers))
-
-    def _end(self) -> None:
-        if self._instance is not None:
-            self._instance.terminate()
-            self._instance.freeInstance()
-            self._instance = None
+        self._set(self.references[1], list(map(float, command)))
+        self.unit.doStep(currentCommunicationPoint=time, communicationStepSize=self.period)
+        return np.array(self._get(self.references[2]))
