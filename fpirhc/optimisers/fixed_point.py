@@ -22,6 +22,7 @@ from fpirhc.optimisers.base import Optimiser, first_plan, sane, stage_later
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
 from fpirhc.optimisers.plain import PlainSettings, plain_memory, plain_step, shifted_plain
+from fpirhc.optimisers.two_starts import of_two_starts
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import settled
@@ -48,6 +49,8 @@ class FixedPoint(Optimiser):
         most_iterations: of one call with limits of states in a loop. The call ends where the plan is solved, a remembered plan
             usually after a handful. A call that uses all of them is NOT_CONVERGED, and returns the better one of its plan and the
             plan in force.
+        second_start: whether a call also begins without the remembered plan, and takes the cheaper plan of both. An economic cost
+            has several minima, and a remembered plan stays in its own; a call takes twice as long.
     """
 
     iterations: Count
@@ -57,6 +60,7 @@ class FixedPoint(Optimiser):
     damping: NotNegative = 0.0
     feasible: float = 1e-8
     most_iterations: Count = 100
+    second_start: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def in_data(self) -> tuple[str, ...]:
@@ -96,13 +100,16 @@ class FixedPoint(Optimiser):
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         if ocp.bounds_states:
-            return limited_step(ocp, self._limited(self.most_iterations))
-        return plain_step(ocp, self._plain(converging=False))
+            return self._begun(ocp, limited_step(ocp, self._limited(self.most_iterations)))
+        return self._begun(ocp, plain_step(ocp, self._plain(converging=False)))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
         if ocp.bounds_states:
-            return limited_step(ocp, self._limited(_MOST_LIMITED))
-        return plain_step(ocp, self._plain(converging=True))
+            return self._begun(ocp, limited_step(ocp, self._limited(_MOST_LIMITED)))
+        return self._begun(ocp, plain_step(ocp, self._plain(converging=True)))
+
+    def _begun(self, ocp: OptimalControl, one: ca.Function) -> ca.Function:
+        return of_two_starts(one, self.memory(ocp)) if self.second_start else one
 
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:
         if ocp.bounds_states:

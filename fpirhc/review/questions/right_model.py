@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from fpirhc.summary import beside
 from fpirhc.task.problem import Problem
 
 FORM = "Is it the form of the iteration that the problem wants?"
+SIMILAR = 1.1  # ratio of errors, up to which two forms are equally good
 LATE = 1.0  # cycles of an estimator's delay, beyond which what the model is wrong by is known too late
 
 
@@ -55,13 +57,19 @@ def form_of(deformation: Deformation) -> str:
     return PLAIN if deformation.iteration.pairing is None else "paired"
 
 
-def right_form(problem: Problem, deformation: Deformation, harm: Callable[[Deformation], str]) -> Answer:
-    """Whether the form in use is the recommended one, or runs speak against that one alone; advice, so never no.
+def right_form(
+    problem: Problem,
+    deformation: Deformation,
+    harm: Callable[[Deformation], str],
+    error: Callable[[Deformation], tuple[float, str, str]] | None = None,
+) -> Answer:
+    """Whether the form in use is the recommended one, or runs show that it is as good; advice, so never no.
 
     Args:
         problem: the problem.
         deformation: in use.
         harm: what runs show against a deformation; empty where it does no harm.
+        error: relative error of a run with a deformation (NaN without one), a coordinate, its error as text; None: nothing is run.
     """
     form, why = recommended_form(problem)
     used = form_of(deformation)
@@ -75,8 +83,26 @@ def right_form(problem: Problem, deformation: Deformation, harm: Callable[[Defor
     if against:
         change = "Keep the form that a comparison shows to be better."
         return Answer(FORM, Verdict.UNKNOWN, f"{text}; but here {against}", change)
-    change = "Try another form." if proposed is None else f"Try {as_written(proposed)}."
-    return Answer(FORM, Verdict.UNKNOWN, text, change)
+    if proposed is None or error is None:
+        change = "Try another form." if proposed is None else f"Try {as_written(proposed)}."
+        return Answer(FORM, Verdict.UNKNOWN, text, change)
+    (own, of, size), (other, _, other_size) = error(deformation), error(proposed)
+    if math.isfinite(own + other):
+        text += f"; in a run of at most {TRIED} cycles the rms error of {of} is {size} with the form in use, {other_size} with that"
+    if own <= SIMILAR * other:
+        return Answer(FORM, Verdict.YES, text)
+    return Answer(FORM, Verdict.UNKNOWN, text, f"Try {as_written(proposed)}.")
+
+
+def _tried_error(case: Case, deformation: Deformation) -> tuple[float, str, str]:
+    """The error of a run on the plant, all coordinates together as shares of their ranges, and that of the first one as text."""
+    trial = case.trial(deformation)
+    pair = None if isinstance(trial, str) else trial[0]
+    if pair is None:
+        return math.nan, "", ""
+    shares = [e / max(pair.ranges[n], 1e-300) for n, e in pair.adapted.items()]
+    name, first = next(iter(pair.adapted.items()))
+    return math.hypot(*shares), name, f"{first:.3g}{pair.unit(name)}"
 
 
 PLAIN, INCREMENT, REFERENCED = "plain", "increment", "model-referenced"
@@ -318,5 +344,7 @@ RIGHT_MODEL = ControllerQuestion(leaves_right_model_alone, NULL_TEST, order=15, 
 QUESTIONS = (
     ControllerQuestion(pays, PAYS, order=14),
     RIGHT_MODEL,
-    ControllerQuestion(lambda case: right_form(case.problem, case.controller.deformation, case.harm), FORM, order=13),
+    ControllerQuestion(
+        lambda c: right_form(c.problem, c.controller.deformation, c.harm, partial(_tried_error, c)), FORM, order=13
+    ),
 )
