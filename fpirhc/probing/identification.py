@@ -265,13 +265,18 @@ class Estimates:
     @property
     def refused(self) -> str:
         """Why nothing may be adapted; empty where something may."""
-        edges = [one.edge for one in self.channels if one.edge]
         if self.largest_real <= 0:
             return "the sign of the gain is wrong: the plant answers against its model; turn the sign of an input in the model"
         if np.linalg.eigvals(self.gains).real.min() <= 0:
             return "an eigenvalue of the gains has the wrong sign: an input of the model has, or is paired with the wrong output"
         if self.uncertain:
             return "the sign of a gain is not certain: excite more or longer (amplitude=, cycles=)"
+        return ""
+
+    @property
+    def unbounded(self) -> str:
+        """What the record is too short to bound, so that nothing may be adapted untried; empty where it bounds everything."""
+        edges = [one.edge for one in self.channels if one.edge]
         return f"the record is too short for the {edges[0]}: take more cycles" if edges else ""
 
     @cached_property

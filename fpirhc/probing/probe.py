@@ -19,7 +19,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count, Seed
 from fpirhc.probing.identification import Estimates, Interval, identify
 from fpirhc.probing.recording import Record, excited, read_recording
-from fpirhc.probing.rule import Rule, mean_ratio
+from fpirhc.probing.rule import DARING, Predicted, Rule, mean_ratio
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
@@ -149,19 +149,22 @@ def probe(
         )
     bare = without_deformation(resolved(problem, controller))
     estimates, notes = _recorded(problem, bare, cycles, amplitude, recording, seed)
-    estimated, candidates, why = None, {}, estimates.refused
+    trying = trials and recording is None
+    estimated, shortlist, results = None, {}, {}
+    why = estimates.refused or ("" if trying else estimates.unbounded)
     if not why:
+        notes += [estimates.unbounded] if estimates.unbounded else []
         try:
             rule = Rule(problem, bare, estimates, chatter)
             estimated = rule.problem
-            candidates = {name: one.deformation for name, one in rule.shortlist().items()}
-            why = "" if candidates else "no setting that keeps its margins makes the error clearly less"
+            shortlist = rule.shortlist()
+            why = "" if shortlist else "no setting that keeps its margins makes the error clearly less"
         except FpirhcError as error:
             why = f"the plant as estimated cannot be run ({error})"
-    try_them = trials and recording is None and bool(candidates)
-    outcomes = tried(problem, bare, candidates, seed=seed + 1) if try_them else {}
-    results = {name: one for name, one in outcomes.items() if isinstance(one, Trial)}
-    notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
+    try_them = trying and bool(shortlist)
+    if try_them:
+        results = _trials(problem, bare, rule, shortlist, notes, seed + 1)
+    candidates = {name: one.deformation for name, one in shortlist.items()}
     name = best(results) if try_them else "cautious" if "cautious" in candidates else None
     if try_them and not results:
         why = "the loop refuses every candidate"
@@ -178,6 +181,34 @@ def probe(
         why = f"{name}{tests}"
     chosen = None if name is None else candidates[name]
     return _answer(problem, estimates, chosen, why, results, candidates, estimated, notes)
+
+
+def _trials(
+    problem: Problem, bare: Controller, rule: Rule, shortlist: dict[str, Predicted], notes: list[str], seed: int
+) -> dict[str, Trial]:
+    """Trials of the shortlist, then of the shares beside the best one, which are added to it, as long as one is better."""
+    results: dict[str, Trial] = {}
+    new: Mapping[str, Predicted] = shortlist
+    while new:
+        outcomes = tried(problem, bare, {name: one.deformation for name, one in new.items()}, seed=seed)
+        notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
+        results |= {name: one for name, one in outcomes.items() if isinstance(one, Trial)}
+        name = best(results)
+        if name is None or name not in new:
+            break
+        known = [one.deformation for one in shortlist.values()]
+        form = name.partition(",")[0]
+        beside = {f"{form}, share {share:g}": one for share, one in rule.beside(shortlist[name]).items()}
+        new = {title: one for title, one in beside.items() if one.deformation not in known}
+        shortlist |= new
+    while (name := best(results)) and name.startswith(DARING):
+        chosen = shortlist[name].deformation
+        louder = tried(problem, bare, {name: chosen.with_effective_gain(_MARGIN * chosen.effective_gain())}, seed=seed)
+        if isinstance(outcome := louder[name], Trial) and outcome.passes:
+            break
+        notes.append(f"{name} is not kept: on the plant it does not bear {_MARGIN:g} times its gain")
+        del results[name]
+    return results
 
 
 def _recorded(
@@ -264,6 +295,8 @@ def _interval(one: Interval) -> str:
 LONGEST = 2000  # cycles
 _WORSE = 1.03  # largest ratio of any coordinate's error to that of the controller alone
 _WORTH = 0.95
+_MARGIN = 1.4  # times its gain that such a candidate has to bear in a trial
+_DARED = 0.9  # ratio of errors, from which a candidate that is stable at the estimate alone is kept
 
 
 @dataclass(frozen=True)
@@ -313,6 +346,7 @@ def tried(
 
 
 def best(trials: Mapping[str, Trial]) -> str | None:
-    """Return the name of the best trial that passes; None where none does."""
-    passing = {name: one.error for name, one in trials.items() if one.passes}
+    """Return the name of the best trial that passes, a daring one where it is clearly better; None where none does."""
+    factors = {name: 1 / _DARED if name.startswith(DARING) else 1.0 for name in trials}
+    passing = {name: factors[name] * one.error for name, one in trials.items() if one.passes}
     return min(passing, key=lambda name: passing[name]) if passing else None

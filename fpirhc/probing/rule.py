@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.affine import Affine
@@ -148,7 +149,10 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
     return plant, signals
 
 
-SHARES = (0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
+DARING = "daring"
+"""Name of the candidate that keeps its margins at the estimate alone: trials have to show them."""
+
+SHARES = (0.05, 0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
 _RINGING = (4.0, 1.0)  # g / (1 - pole) of the filters
 _FIRST, _LONG = 0.2, 0.2  # shares with which forms are compared, and of the candidate with a long lag
 _FORMS = 2  # model-referenced ones that are searched in full, beside the plain one
@@ -198,6 +202,10 @@ class Setting:
 
     def _largest(self, estimates: Estimates) -> float:
         return estimates.largest_weighted if self.weighted else estimates.largest
+
+    def with_share(self, share: float) -> Setting:
+        """Return the same form with another share, whose filter rings alike."""
+        return replace(self, share=share, pole=max(1 - share * (1 - self.pole) / self.share, 0.0) if self.pole else 0.0)
 
     @property
     def paths(self) -> tuple[str, str]:
@@ -276,8 +284,8 @@ class Rule:
             "cautious": next(
                 (
                     one
-                    for one in _one_filter_each(calm)
-                    if self._margins.safe(one.deformation, rough=True) and self._safe(one)
+                    for one in _few_filters(calm)
+                    if self._margins.safe(one.deformation, self._margins.far) and self._safe(one)
                 ),
                 None,
             ),
@@ -287,6 +295,7 @@ class Rule:
             "matrix": self._first(one for one in calm if one.setting.weighted),
             "long lag": self._long(),
             "bold": min(safe, key=lambda one: one.steps, default=None),
+            DARING: next(filter(self._daring, _few_filters(calm)), None),
         }
         different: dict[str, Predicted] = {}
         for name, candidate in chosen.items():
@@ -294,12 +303,36 @@ class Rule:
                 different[name] = candidate
         return different
 
+    def beside(self, one: Predicted) -> dict[float, Predicted]:
+        """Return by share the next smaller and the next larger share of the same form, safe where this one is."""
+        at = SHARES.index(one.setting.share)
+        others = (SHARES[k] for k in (at - 1, at + 1) if 0 <= k < len(SHARES))
+        found = [self._predicted(one.setting.with_share(share)) for share in others]
+        safe = self._safe(one)
+        return {
+            other.setting.share: other
+            for other in found
+            if other.steps <= 1 and (self._safe(other) if safe else self._accepted(other))
+        }
+
+    def _daring(self, one: Predicted) -> bool:
+        """Whether it keeps its margins at the estimate alone."""
+        return self._accepted(one) and self._margins.safe(one.deformation, self._margins.middle)
+
     def _first(self, settings: Iterable[Predicted]) -> Predicted | None:
         """The first safe one."""
-        return next(filter(self._safe, _one_filter_each(settings)), None)
+        return next(filter(self._safe, _few_filters(settings)), None)
 
     def _safe(self, one: Predicted) -> bool:
-        return self._margins.safe(one.deformation)
+        return self._accepted(one) and self._margins.safe(one.deformation)
+
+    def _accepted(self, one: Predicted) -> bool:
+        """Whether the loop of the problem takes its gain, which it judges by the model."""
+        try:
+            checked(self._given, self.bare.with_deformation(one.deformation))
+        except FpirhcError:
+            return False
+        return True
 
     def _mirrors(self, one: Predicted) -> bool:
         """Whether the model is late and lags as the plant at most does."""
@@ -382,12 +415,12 @@ def _around(form: Setting) -> Iterator[Setting]:
             yield replace(form, share=share, pole=pole)
 
 
-def _one_filter_each(settings: Iterable[Predicted]) -> Iterator[Predicted]:
-    """The first of those that differ in their filter alone: the best one, where they are in the order of their errors."""
+def _few_filters(settings: Iterable[Predicted]) -> Iterator[Predicted]:
+    """The best of those that differ in their filter alone, and the one without a filter; they are in the order of their errors."""
     passed = set()
     for one in settings:
         form = replace(one.setting, pole=0.0)
-        if form not in passed:
+        if form not in passed or form == one.setting:
             passed.add(form)
             yield one
 
@@ -421,6 +454,7 @@ class Corner:
 Case: TypeAlias = tuple[
     Corner, float, int
 ]  # a corner, a factor of the gains, and the number of a draw; 0: the estimate
+Cases: TypeAlias = tuple[Case, ...]
 
 
 class Margins:
@@ -431,24 +465,31 @@ class Margins:
         self._problem, self._bare, self._estimates = problem, bare, estimates
         self._problems: dict[Corner, Problem] = {}
         self._loops: dict[tuple[Corner, Deformation | None], _Loop] = {}
-        self._judged: dict[tuple[Deformation, bool], bool] = {}
+        self._judged: dict[tuple[Deformation, Cases], bool] = {}
 
-    def safe(self, deformation: Deformation, *, rough: bool = False) -> bool:
+    def safe(self, deformation: Deformation, within: Cases | None = None) -> bool:
         """Return whether the whole loop is stable in every case in which the controller alone is.
 
         Args:
             deformation: of the controller.
-            rough: whether twice the gain and a slower plant are asked; else the gain margin of a review.
+            within: the cases: `near` (the default), `far`, or `middle`.
         """
-        if (deformation, rough) not in self._judged:
-            cases = self._far if rough else self._near
-            self._judged[deformation, rough] = all(
+        cases = self.near if within is None else within
+        if (deformation, cases) not in self._judged:
+            self._judged[deformation, cases] = all(
                 self._stable(deformation, case) for case in cases if self._stable(None, case)
             )
-        return self._judged[deformation, rough]
+        return self._judged[deformation, cases]
 
     @cached_property
-    def _near(self) -> tuple[Case, ...]:
+    def middle(self) -> Cases:
+        """A gain margin of 1.4 to both sides of the estimate alone, and a command that is a cycle later."""
+        dead, lag = self._estimates.dead[1], self._estimates.lag[1]
+        there = Corner(tuple(dead), tuple(lag))
+        return (there, 1.4, 0), (there, 0.6, 0), (Corner(tuple(dead + 1), tuple(lag)), 1.0, 0)
+
+    @cached_property
+    def near(self) -> Cases:
         """A gain margin of 1.4 to both sides of the estimate and of a draw, and a command that is a cycle later."""
         dead, lag = self._estimates.dead, self._estimates.lag
         corners = dict.fromkeys(Corner(tuple(dead[i]), tuple(lag[j])) for i in (2, 0) for j in (0, 2))
@@ -456,8 +497,8 @@ class Margins:
         return late, *((corner, *case) for case in ((1.4, 0), (0.6, 0), (1.4, 1)) for corner in corners)
 
     @cached_property
-    def _far(self) -> tuple[Case, ...]:
-        """A lag is only a picture of what is slow: half as long again, and a command that is a cycle later."""
+    def far(self) -> Cases:
+        """Twice the gain, and a plant slower by half, because a lag is only a picture of what is slow; a command a cycle later."""
         dead, slow = self._estimates.dead[2], 1.5 * np.maximum(self._estimates.lag[2], 0.25 * self._problem.period)
         later = Corner(tuple(dead + 1), tuple(slow))
         return (later, 1.4, 0), (later, 1.4, 1), *((Corner(tuple(dead), tuple(slow)), 2.0, k) for k in (0, 1))

@@ -157,6 +157,35 @@ def test_trials_keep_none_that_is_worse():
     assert wild.error > 1
     assert best({"wild": wild}) is None
     assert best({"a": Trial(0.5, 1.04), "b": Trial(0.7, 1.0), "c": Trial(0.97, 0.97)}) == "b"
+    assert (
+        best({"bold": Trial(0.5, 1.0), "daring, share 0.4": Trial(0.48, 1.0)}) == "bold"
+    )  # a tenth is no reason to dare
+    assert best({"bold": Trial(0.5, 1.0), "daring": Trial(0.4, 1.0)}) == "daring"
+
+
+def test_no_neighbour_of_the_choice_is_better():
+    """On a plant with limits that the estimate lacks the best predicted share is four times too large; trials walk to the best."""
+    task = fp.load_problem("van_der_pol")
+    controller = task.controllers["RHC"]
+    found = fp.probe(task.problem, controller, cycles=400)
+    assert ", share " in found.why
+    assert found.deformation is not None
+    gain = found.deformation.effective_gain()
+    others = {f"{f:g}": found.deformation.with_effective_gain(f * gain) for f in (0.6, 1.6)}
+    outcomes = tried(task.problem, controller, {"chosen": found.deformation, **others}, seed=1)
+    errors = {name: one.error for name, one in outcomes.items() if isinstance(one, Trial)}
+    assert len(errors) == 3
+    assert errors["chosen"] == min(errors.values())
+
+
+def test_what_a_record_does_not_bound_is_adapted_by_trials_alone():
+    """Forty cycles are a tenth of what a lag of .3 s takes: nothing is proposed untried."""
+    problem = replace(body_problem(1.0, 0, 0.3, 0.05), duration=4.0)
+    untried, found = (fp.probe(problem, RHC, cycles=60, trials=trials) for trials in (False, True))
+    assert untried.why == "the record is too short for the lag: take more cycles"
+    assert untried.deformation is None
+    assert untried.why in found.notes
+    assert found.deformation is None or found.trials[found.why.partition(":")[0]].passes
 
 
 def test_the_budget_of_chatter_is_kept():

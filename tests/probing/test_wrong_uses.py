@@ -29,7 +29,7 @@ def body(kind: type[Body] = Body) -> Body:
 
 def outside(**settings: Any) -> Any:
     """The task with another external plant."""
-    given = {"body": body(), "measures": MEASURES} | settings
+    given: dict[str, Any] = {"body": body(), "measures": MEASURES} | settings
     return replace(PROBLEM, reality=fp.ExternalPlant(**given))
 
 
