@@ -108,6 +108,25 @@ def test_the_limit_is_that_of_the_theory(gain):
         assert bool(late < early) is settles, (share, early, late)
 
 
+@pytest.mark.parametrize("gain", [0.5, 1.0])
+def test_the_plain_form_bears_every_slope_below_two_over_the_gain(gain):
+    """Shift = F (1 - gain slope) shift with F a lag of gain one: |1 - gain slope| < 1 is enough where it is right."""
+    plain = fp.Cascade(STATIC, affine(gain), fp.ThroughModel(lag=5.0, plain=True))
+    for share, settles in ((0.97, True), (1.5, False)):  # the lag damps what is beyond the bound by less than a third
+        problem = linear(share * 2 / gain, dead_time=fp.DeadTime(inputs={"u": 8.0}), period=1.0, duration=900.0)
+        run = fp.simulate(problem, plain, seed=1, compiled=False)
+        early, late = (np.abs(run["error.y"][k : k + 100]).max(initial=0.0) for k in (100, 800))
+        assert bool(run.stop is None and late < early) is settles, (share, early, late)
+
+
+def test_the_plain_form_begins_at_what_is_in_force():
+    """From a start at rest away from the reference, the first target is the output itself and not the reference."""
+    plain = fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=5.0, plain=True))
+    run = fp.simulate(linear(1.0), plain, seed=1, compiled=False)
+    assert run["target.y"][0] == pytest.approx(0.0, abs=1e-12)
+    assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_a_right_model_leaves_the_target_alone():
     """The model's target in force is the output, so there is nothing to iterate on."""
     run = fp.simulate(linear(1.0), fp.Cascade(STATIC, affine(0.8)), seed=1, compiled=False)

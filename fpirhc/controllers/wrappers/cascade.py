@@ -143,10 +143,13 @@ class ThroughModel(Checked):
             controlled coordinate, 0 settles within a cycle. None: the slowest one of the model at the start, with the command held;
             0 for outputs of order 0, which the model moves at once.
         dead_time: from a target to its measured output; None: that of the problem, for the slowest input.
+        plain: whether the output is compared with the reference, as in the published form, and the next target begins at the one in
+            force. It corrects a right model too, while that is under way, and is quiet at gains that limit-cycle otherwise.
     """
 
     lag: NotNegative | tuple[NotNegative, ...] | None = field(default=None, metadata={"structure": True})
     dead_time: NotNegative | None = field(default=None, metadata={"structure": True})
+    plain: bool = field(default=False, metadata={"setting": "where given", "structure": True})
 
     def stated(self, problem: Problem) -> ThroughModel:
         """Return the pairing with the lag as a number; one that cannot be known stays open, for `decays` to refuse."""
@@ -154,7 +157,7 @@ class ThroughModel(Checked):
             lag = _own_lags(problem) if self.lag is None else self.lag
         except InvalidValue:
             return self
-        return ThroughModel(lag, self.dead_time)
+        return replace(self, lag=lag)
 
     def _late(self, late: DeadTime) -> float:
         return largest((0.0, *late.inputs.values())) + late.measurement if self.dead_time is None else self.dead_time
@@ -205,6 +208,10 @@ class ThroughModel(Checked):
         """Return the target that was in force when the output of this cycle was measured; `wanted` is the reference of now."""
         queue = self.queue(problem)
         return queue.delayed(queue.pushed(s.references_sent, wanted), wanted.numel()) + s.shift_in_force
+
+    def undeformed(self, s: Signals, in_force: Expression) -> Expression:
+        """Return the target without its shift: of the shift that was in force, or in the model-referenced form of the last one."""
+        return in_force - (s.shift_in_force if self.plain else s.shift_last)
 
     def remembered(self, problem: Problem, s: Signals, wanted: Expression, shift: Expression) -> dict[str, Expression]:
         """Return the memory one cycle later."""
@@ -431,7 +438,9 @@ class Cascade(Controller):
         first = self._numbers(plant, _first_reference(problem), "to")
         start, own = tuple(map(float, begun)), self.deformation.memory(names)
         lower, upper = (ca.DM([self.units.get(n, _SAME).bounds[end] for n in names]) for end in (0, 1))
-        last = Signal("shift_last", names), Signal("target_last", names, start=start), scalar("shift_cycles")
+        # The plain form begins at the target in force from its first cycle on, and moves it once samples count.
+        held = tuple(map(float, begun - first)) if pairing is not None and pairing.plain else ()
+        last = Signal("shift_last", names, start=held), Signal("target_last", names, start=start), scalar("shift_cycles")
         response, steepness = plant.equations.controlled_response, self._steepness(plant)
         memory = Layout((*last, *(pairing.memory(problem, first, begun - first) if pairing else ()))) + own
 
@@ -439,7 +448,7 @@ class Cascade(Controller):
             shown, before = getattr(s, seen.name)[places], s.shift_last
             wanted, output = (self._units(plant, one, s.parameters, "to") for one in (s.reference[places], shown))
             in_force = pairing.in_force(problem, s, wanted) if pairing else s.target_last
-            undeformed = in_force - before if pairing else wanted
+            undeformed = pairing.undeformed(s, in_force) if pairing else wanted
             remembered = {m: getattr(s, m) for m in own.names}
             request, after = self.deformation.step(in_force, output, undeformed, remembered)
             change = request - undeformed

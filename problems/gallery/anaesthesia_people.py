@@ -1,0 +1,283 @@
+"""Depth of anaesthesia in 101 patients: a pump that aims at a concentration, and who may move its target.
+
+A pump for target-controlled infusion has a model of the drug's way: three compartments after Schnider et al. (Anesthesiology 88,
+1998) from age, weight, height and sex, and an effect site. It gives the dose with which this model's effect site follows a target.
+What a concentration does is the patient's own,
+
+    Ce' = ke0 (C1 - Ce),        bis = E0 - Emax / (1 + (C50 / Ce)^steepness),
+
+behind a dead time of up to 150 s. A monitor shows the bis with coloured noise of deviation 3. Surgery adds 10 from 20 to 35 min.
+
+The table anaesthesia_people.csv has three sets. A: 44 patients; settings were chosen on every second one. B: the same people with
+curves for other kinetics, those of Eleveld et al. (Br. J. Anaesth. 120, 2018; with opioids), by which their drug moves while the
+pump believes in Schnider's. C: 13 patients of another source. The model of all controllers has the medians of A: a lag, a dead time
+of 39 s, and one curve.
+
+Task: the patient is awake; the bis is to be 50, with a target every 5 s. Errors and shares of the time count from 10 min on. For
+the patient of medians:
+
+    rms error, seed 0                  bis [1]
+    pump alone                             5.4
+    PID                                    3.4
+    RHC offset-free                        3.5
+    cascade in mg/l, model-referenced      3.5
+    cascade                                  4
+    cascade in mg/l                        3.5
+
+What counts is who fares worst: the worst patient's share of the time from 40 to 60 in %, the lowest bis of anybody with the
+induction, and then the mean share (`fpirhc compare anaesthesia_people --cases all`), seed 0:
+
+    worst, lowest, mean                A tuned             A unseen            B                   C
+    pump alone                         0    35.4   67.1    0    26.7   59.5    0    28.9   64.9    0    14.7   52.4
+    PID                                92   39.8   99.1    95   39.6   98.9    93   38.9   98.9    100  42.3  100.0
+    RHC offset-free                    89   39.3   98.4    93   38.9   98.1    82   36.1   98.1    98   40.0   99.7
+    cascade in mg/l, model-referenced  90   35.5   98.1    94   39.2   98.4    83   32.8   98.3    98   29.7   99.7
+    cascade                            90   39.6   97.9    94   39.4   97.8    88   38.7   98.1    96   41.5   99.3
+    cascade in mg/l                    91   39.9   98.6    95   40.0   98.9    91   38.5   98.8    98   41.6   99.9
+
+Of the settings that were tried on "A tuned" those were taken with which nobody there is in the range for less than 90 % of the
+time, and of these the one with the highest lowest bis; with the best worst share where there are none.
+
+It is a draw of `cascade in mg/l` with a PID law on the pump's target, which needs no curve. Both add up the error, and both begin
+with little drug. What makes the difference to the other rows:
+
+- The form. A plain cascade begins at the target that is in force, and awake that is none. The model-referenced one begins with the
+  target that its model has for 50, as the pump alone does, and sensitive patients go as low in the induction.
+- The unit. The slope of the curve changes along it and from patient to patient, and with it the gain from a target to the bis. In
+  mg/l, through the model's curve, nobody fares worse, and patients of set B fare better.
+- What is corrected. The offset-free plan adds its estimate to the bis, at a slope that is not the patient's. In set B, where the
+  kinetics are not the pump's, it is the least safe one but the model-referenced.
+"""
+
+from dataclasses import replace
+
+import casadi as ca
+
+import fpirhc as fp
+
+CYCLE = 1 / 12  # min
+LARGEST = 400.0  # mg/min, of the pump
+PARTS = 5  # Runge-Kutta steps of a cycle
+SITES = ("C1", "C2", "C3", "Ce")
+LEAST, MOST = 0.5, 12.0  # mg/l
+
+
+def schnider(p):
+    """Volumes and clearances of the three compartments, l and l/min."""
+    ratio = (p.weight / p.height) ** 2
+    lean = ca.if_else(p.sex > 0.5, 1.07 * p.weight - 148.0 * ratio, 1.1 * p.weight - 128.0 * ratio)
+    cleared = 1.89 + 0.0456 * (p.weight - 77.0) - 0.0681 * (lean - 59.0) + 0.0264 * (p.height - 177.0)
+    return (4.27, 18.9 - 0.391 * (p.age - 53.0), 238.0), (cleared, 1.29 - 0.024 * (p.age - 53.0), 0.836)
+
+
+def fat_free(age, weight, height, sex):
+    """Mass without fat after Al-Sallami et al., kg."""
+    index = weight / (height / 100) ** 2
+    men = (0.88 + 0.12 / (1 + (age / 13.4) ** -12.7)) * 9270 * weight / (6680 + 216 * index)
+    women = (1.11 - 0.11 / (1 + (age / 7.1) ** -1.1)) * 9270 * weight / (8780 + 244 * index)
+    return ca.if_else(sex > 0.5, women, men)
+
+
+def eleveld(p):
+    """The same after Eleveld et al., with opioids, arterial samples."""
+    weeks, usual = p.age * 365.25 / 7 + 40, 35 * 365.25 / 7 + 40
+    central = p.weight / (p.weight + 33.6) * (70 + 33.6) / 70
+    second = p.weight / 70 * ca.exp(-0.0156 * (p.age - 35))
+    third = fat_free(p.age, p.weight, p.height, p.sex) / fat_free(35.0, 70.0, 170.0, 0.0) * ca.exp(-0.0138 * p.age)
+
+    def mature(w):
+        return w**9.06 / (w**9.06 + 42.3**9.06)
+
+    def full(w):
+        return w / (w + 68.3)
+
+    cleared = ca.if_else(p.sex > 0.5, 2.10, 1.79) * (p.weight / 70) ** 0.75 * mature(weeks) / mature(usual)
+    fast = 1.75 * second**0.75 * (1 + 1.30 * (1 - full(weeks)))
+    slow = 1.11 * third**0.75 * full(weeks) / full(usual)
+    return (6.28 * central, 25.5 * second, 273 * third), (cleared * ca.exp(-0.00286 * p.age), fast, slow)
+
+
+def moved(now, infusion, kinetics, ke0):
+    """Concentrations one cycle later, by the classic Runge-Kutta formula."""
+    (V1, V2, V3), (cleared, fast, slow) = kinetics
+
+    def slopes(c):
+        c1, c2, c3, ce = c
+        return (
+            (infusion - cleared * c1 - fast * (c1 - c2) - slow * (c1 - c3)) / V1,
+            fast / V2 * (c1 - c2),
+            slow / V3 * (c1 - c3),
+            ke0 * (c1 - ce),
+        )
+
+    def along(by, rates):
+        return tuple(c + by * r for c, r in zip(now, rates, strict=True))
+
+    h = CYCLE / PARTS
+    for _ in range(PARTS):
+        a = slopes(now)
+        b = slopes(along(h / 2, a))
+        c = slopes(along(h / 2, b))
+        d = slopes(along(h, c))
+        now = along(h / 6, [w + 2 * x + 2 * y + z for w, x, y, z in zip(a, b, c, d, strict=True)])
+    return now
+
+
+KE0, APPROACH = 0.309, 1.5  # 1/min
+
+
+def dose(now, target, kinetics):
+    """Infusion of the pump, mg/min: its model's effect site follows the target with two rates of 1.5/min."""
+    (V1, _, _), (cleared, fast, slow) = kinetics
+    c1, c2, c3, ce = now
+    rate = KE0 * (c1 - ce)
+    bent = APPROACH**2 * (target - ce) - 2 * APPROACH * rate
+    wanted = V1 * (bent / KE0 + rate) + cleared * c1 + fast * (c1 - c2) + slow * (c1 - c3)
+    return ca.fmin(ca.fmax(wanted, 0), LARGEST)
+
+
+def person(x, u, p):
+    """A cycle of pump and patient."""
+    pump, own = (tuple(x[f"{who}_{n}"] for n in SITES) for who in ("pump", "own"))
+    believed, other = schnider(p), eleveld(p)
+    real = [
+        tuple(ca.if_else(p.eleveld > 0.5, e, s) for e, s in zip(*both, strict=True))
+        for both in zip(other, believed, strict=True)
+    ]
+    infusion = dose(pump, u.target, believed)
+    later = {"pump": moved(pump, infusion, believed, KE0), "own": moved(own, infusion, real, p.ke0)}
+    return {f"{who}_{n}": c for who, all_ in later.items() for n, c in zip(SITES, all_, strict=True)} | {
+        "infusion": infusion,
+        "surgery": p.surgery,
+    }
+
+
+def depth(x, p):
+    """The patient's bis."""
+    return x.surgery + p.E0 - p.Emax / (1 + (p.C50 / ca.fmax(x.own_Ce, 1e-6)) ** p.steepness)
+
+
+def same(value, unit, low, high):
+    return fp.Parameter(approximate=value, exact=value, unit=unit, bounds=(low, high))
+
+
+patient = fp.Plant.discrete(
+    states={f"{who}_{n}": "mg/l" for who in ("pump", "own") for n in SITES} | {"infusion": "mg/min", "surgery": "1"},
+    inputs={"target": "mg/l"},
+    next=person,
+    step=CYCLE,
+    outputs={"bis": fp.Output("1", depth)},
+    time_unit="min",
+    parameters={
+        "age": same(61.0, "year", 1, 110),
+        "height": same(175.0, "cm", 50, 230),
+        "weight": same(77.0, "kg", 3, 300),
+        "sex": same(0.0, "1", 0, 1),
+        "eleveld": same(0.0, "1", 0, 1),
+        "E0": same(92.0, "1", 50, 100),
+        "Emax": same(92.0, "1", 50, 100),
+        "ke0": same(0.309, "1/min", 0.01, 12),
+        "C50": same(4.53, "mg/l", 0.5, 20),
+        "steepness": same(1.57, "1", 0.5, 10),
+        "surgery": fp.outside(nominal=0.0, unit="1"),
+    },
+)
+
+
+def concentration(bis, p):
+    """At which the model's curve has a bis, mg/l; the bis is kept inside the curve."""
+    inside = ca.fmin(ca.fmax(bis, 2.0), p.E0 - 0.5)
+    return p.C50 * (p.E0 / inside - 1) ** (1 / p.steepness)
+
+
+def curve(c, p):
+    """The model's bis at a concentration."""
+    return p.E0 / (1 + (ca.fmax(c, 1e-3) / p.C50) ** p.steepness)
+
+
+def settling(x, u, p):
+    """A cycle of the model."""
+    kept = ca.exp(-CYCLE / p.lag)
+    return {"bis": kept * x.bis + (1 - kept) * curve(u.target, p)}
+
+
+def needed_target(x, r, p):
+    """The target for a wanted change of the bis; that of the curve's end where the curve does not reach so far."""
+    kept = ca.exp(-CYCLE / p.lag)
+    return {"target": concentration(x.bis + CYCLE * r.bis / (1 - kept), p)}
+
+
+model = fp.Plant.discrete(
+    states={"bis": "1"},
+    inputs={"target": "mg/l"},
+    next=settling,
+    step=CYCLE,
+    time_unit="min",
+    parameters={
+        "lag": same(1.5, "min", 0.1, 60),
+        "E0": same(92.0, "1", 50, 100),
+        "C50": same(4.53, "mg/l", 0.5, 20),
+        "steepness": same(1.57, "1", 0.5, 10),
+    },
+)
+model = replace(model, inverse=needed_target)
+
+
+def surgery(t):
+    """What surgery adds to the bis; t in min."""
+    return 10 / (1 + ca.exp(4 * (20 - t))) - 10 / (1 + ca.exp(4 * (35 - t)))
+
+
+problem = fp.Problem(
+    plant=model,
+    reality=fp.Reality(
+        patient, start={f"{who}_{n}": 0.0 for who in ("pump", "own") for n in SITES} | {"infusion": 0.0, "surgery": 0.0}
+    ),
+    reference=fp.Trajectory(lambda t: {"bis": 50.0 + 0 * t}),
+    start={"bis": 92.0},
+    period=CYCLE,
+    duration=60.0,
+    dead_time=fp.DeadTime(inputs={"target": 0.65}, longest={"target": 2.6}),
+    limits=fp.Limits(inputs={"target": (LEAST, MOST)}),
+    input_before={"target": LEAST},
+    signals={"surgery": fp.Unknown(surgery)},
+    sensing=fp.Sensing(sensors={"bis": fp.Sensor(noise=fp.ColouredNoise(3.0, correlation_time=0.1))}),
+    horizon=fp.Horizon(stages=20, step=0.25),
+    cost=fp.Quadratic(states={"bis": 1.0}, rate={"target": 6000.0}),
+    measure_from=10.0,
+)
+pump = fp.FeedforwardOnly()
+late, paired = 0.65, fp.ThroughModel(lag=1.2, dead_time=0.65, plain=True)  # min
+slow = fp.Filtered(fp.Affine(gain=-0.8), pole=0.85)
+unit = fp.TargetUnit(concentration, curve, bounds=(LEAST, MOST))
+plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2))
+filter = fp.DisturbanceKalman(drift={"bis": 1.0}, measured={"bis": 3.0})
+controllers = {
+    "pump alone": pump,
+    "PID": fp.PID({"bis": -0.04}, {"bis": -0.0235}, bumpless=False),
+    "RHC offset-free": fp.Predicted(
+        fp.Estimating(plan, filter, dead_time=fp.DeadTime(inputs={"target": late})), inputs=late
+    ),
+    "cascade in mg/l, model-referenced": fp.Cascade(
+        pump, fp.Affine(gain=-0.08), fp.ThroughModel(lag=2.5, dead_time=late), units={"bis": unit}
+    ),
+    "cascade": fp.Cascade(
+        pump, fp.Filtered(fp.Affine(gain=-0.6), pole=0.85), fp.ThroughModel(lag=1.3, dead_time=late, plain=True)
+    ),
+    "cascade in mg/l": fp.Cascade(pump, slow, paired, units={"bis": unit}),
+}
+headline = ("pump alone", "cascade in mg/l")
+NEEDED = [*(f"exact.{n}" for n in patient.parameters if n != "surgery"), "dead_time.inputs.target"]
+WORDS = {"exact.sex": {"m": 0.0, "f": 1.0}}
+cases = fp.Cases.from_csv("anaesthesia_people.csv", needed=NEEDED, words=WORDS)
+BIS = "plant_state.bis"
+
+
+def lowest(problem, run):
+    """The lowest bis of the whole run, the induction with it."""
+    return float(run[BIS].min())
+
+
+metrics = (fp.figures.InBand(BIS, 40.0, 60.0), fp.Metric("lowest", lowest, better="larger", headline=True, finite=True))
+headline_metric = "in_band"
+pictures = (fp.Band("Depth", what=BIS, target=(40.0, 60.0)),)
