@@ -3,6 +3,7 @@ beside what somebody writes by hand in C, numpy, numba and JAX.
 
     python benchmarks/batch.py [--write] [--many]      --write puts the tables into docs/performance.md
                                                        --many runs a million plants for 500 cycles, and 100 000 for 100 plans
+                                                       --device NAME runs 65 536 plants on an OpenCL device, too
 
 Processor time in one process, in turn, the smallest of five; the ordinary runs keep their log and are measured by the same errors,
 the loops written by hand keep nothing but sums of squares. numba and JAX are left out where they are not installed.
@@ -193,6 +194,19 @@ def many(name: str, ready: Simulator, count: int, cycles: int) -> list[str]:
     return [name, f"{count:,}".replace(",", " "), str(cycles), f"{spent:.1f}", f"{spent / 2:.1f}"]
 
 
+def on_device(name: str) -> str:
+    """Microseconds per cycle and plant of a device by the clock on the wall, and times those of the lanes of all cores."""
+    ready = fp.simulator(by_hand.TASK.problem, by_hand.CONTROLLER)
+    exact, walls = plants(ready, 65_536), {}
+    for where in (None, name):
+        run_many(ready, exact[:8], device=where)
+        begun = time.perf_counter()
+        run_many(ready, exact, device=where)
+        walls[where] = 1e6 * (time.perf_counter() - begun) / len(exact) / ready.problem.cycles
+    times = walls[name] / walls[None]
+    return f"device '{name}': {walls[name]:.4f} us per cycle and plant, {times:.2f} times the lanes of all cores"
+
+
 def main() -> None:
     """Measure and print, and write the tables where it is asked for."""
     tasks = {name: fp.load_problem(name) for name in LOOPS}
@@ -207,6 +221,8 @@ def main() -> None:
     write_table(
         "batch", ["two_mass, CTC+FPI (eq 6)", "us per cycle and plant", "times the lanes", "apart"], by_others()
     )
+    if "--device" in sys.argv:
+        print(on_device(sys.argv[sys.argv.index("--device") + 1]))
     if "--many" in sys.argv:
         rows = [
             many("two_mass, CTC+FPI (eq 6)", fp.simulator(by_hand.TASK.problem, by_hand.CONTROLLER), MANY, 500),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -113,7 +113,7 @@ def within_its_arrays(pair_of: Pair, calls: Iterator[tuple[np.ndarray, ...]]) ->
     return os.waitpid(child, 0)[1] == 0
 
 
-def in_lanes(graph: ca.Function, calls: list[tuple[np.ndarray, ...]]) -> list[list[np.ndarray]]:
+def in_lanes(graph: ca.Function, calls: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]]:
     """Results of calls that run side by side, as many as there are lanes at a time."""
     (own, *drivers), callee = written_in_lanes(graph)
     sizes = [[graph.numel_in(k) for k in range(graph.n_in())], [graph.numel_out(k) for k in range(graph.n_out())]]

@@ -1,7 +1,5 @@
-/* The closed loop over LANES plants side by side. Defined before: STEP, one cycle, with its ROOM, the sizes MEMORY, TRACE, READS, ERRORS
+/* The closed loop over LANES plants side by side, or in each work item of a device. Defined before: STEP, one cycle, with its ROOM, the sizes MEMORY, TRACE, READS, ERRORS
    and STATUSES, the places FIRST_ERROR and STATUS in the trace, TABLES, the addresses of what a cycle reads, and the ranges that end a run. */
-#include <stdint.h>
-#include <stdlib.h>
 
 /* Which lanes have numbers that end a run. */
 static M ended(const V* memory, const V* trace) {
@@ -13,15 +11,17 @@ static M ended(const V* memory, const V* trace) {
   return bad;
 }
 
+#define FIGURES (2 * ERRORS + STATUSES + 1)
+
 /* Results of a lane: sums of squares and largest sizes of the errors, cycles with each status, whether it ended. */
-static void run_group(long cycles, long first, const double* start, const double* reads, double* results, V* w) {
-  V a[MEMORY], b[MEMORY], trace[TRACE], now[READS + 1], found[2 * ERRORS + STATUSES + 1], *memory = a, *next = b, *other;
+static void run_group(long cycles, long first, GLOBAL const double* start, GLOBAL const double* reads, GLOBAL double* results, V* w) {
+  V a[MEMORY], b[MEMORY], trace[TRACE], now[READS + 1], found[FIGURES], *memory = a, *next = b, *other;
   V *sums = found, *sizes = found + ERRORS, *counts = found + 2 * ERRORS;
   M bad = NO;
   long k;
   int i;
-  memcpy(a, start, sizeof a);
-  memset(found, 0, sizeof found);
+  for (i = 0; i < MEMORY; ++i) a[i] = fetched(start + i * LANES);
+  for (i = 0; i < FIGURES; ++i) found[i] = ALL(0.0);
   for (k = 0; k < cycles; ++k) {
     const V* arg[] = {memory, TABLES};
     V* res[] = {next, trace};
@@ -37,9 +37,19 @@ static void run_group(long cycles, long first, const double* start, const double
       for (i = 1; i < STATUSES; ++i) counts[i] += truth(trace[STATUS] == i);
     other = memory, memory = next, next = other;
   }
-  found[2 * ERRORS + STATUSES] = truth(bad);
-  memcpy(results, found, sizeof found);
+  found[FIGURES - 1] = truth(bad);
+  for (i = 0; i < FIGURES; ++i) stored(results + i * LANES, found[i]);
 }
+
+#ifdef __OPENCL_VERSION__
+__kernel void run_lanes(long cycles, long first, __global const double* start, __global const double* reads, __global double* results) {
+  size_t g = get_global_id(0);
+  V w[ROOM + 1];
+  run_group(cycles, first, start + g * MEMORY, reads, results + g * FIGURES, w);
+}
+#else
+#include <stdint.h>
+#include <stdlib.h>
 
 /* Returns whether there was room. */
 int run_lanes(long groups, long cycles, long first, const double* start, const double* reads, double* results) {
@@ -47,7 +57,8 @@ int run_lanes(long groups, long cycles, long first, const double* start, const d
   V* w = (V*)(room + sizeof(V) - (uintptr_t)room % sizeof(V));
   long g;
   for (g = 0; room && g < groups; ++g)
-    run_group(cycles, first, start + g * MEMORY * LANES, reads, results + g * (2 * ERRORS + STATUSES + 1) * LANES, w);
+    run_group(cycles, first, start + g * MEMORY * LANES, reads, results + g * FIGURES * LANES, w);
   free(room);
   return room != 0;
 }
+#endif

@@ -18,16 +18,17 @@ import numpy as np
 from fpirhc.errors import CompileError, InvalidShape, InvalidValue, NoCode
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.metrics.base import measured_errors
+from fpirhc.simulation.opencl import loaded_kernel
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.simulate import Simulator, run_tables
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.dataflow import SIDE_BY_SIDE
-from fpirhc.symbolic.lanes import lanes_library, written_in_lanes
+from fpirhc.symbolic.dataflow import SIDE_BY_SIDE, Callee
+from fpirhc.symbolic.lanes import lanes_library, written_for_devices, written_in_lanes
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.task.problem import Problem
 
-_GROUPS = 256  # of lanes in one call
+_GROUPS, _ITEMS = 256, 65_536  # of lanes in one call, and of a device
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,7 @@ class ManyRuns:
         max_error: the same, largest sizes.
         statuses: cycles with each status that occurred, by its name, shape (plants,).
         stops: why the runs of some plants ended early, by number of the plant.
-        lanes: plants that ran side by side in one register; 0: one after the other by the ordinary loop.
+        lanes: plants that ran side by side in one register, or work item of a device; 0: one after the other by the ordinary loop.
         why: no lanes; empty where there are some.
     """
 
@@ -51,17 +52,21 @@ class ManyRuns:
     why: str
 
 
-def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0) -> ManyRuns:
+def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str | None = None) -> ManyRuns:
     """Run one loop for many plants, which differ in their exact parameters.
 
     Args:
         ready: from `fp.simulator`.
         exact: parameters of the plants, shape (plants, parameters), in the order of the plant's parameters.
         seed: of the noise of disturbances and sensors, the same for every plant.
+        device: part of the name of an OpenCL device ('': the first graphics processor, else the first one), for loops that are
+            scalar code; None: the vector registers of this machine.
 
     Raises:
+        InvalidName: no device has this name.
         InvalidShape: another number of parameters.
         InvalidValue: a parameter that is not finite.
+        NotInstalled: pyopencl (pip install 'fpirhc[opencl]'), or a device with double precision.
     """
     exact = np.atleast_2d(np.asarray(exact, dtype=float))
     if exact.ndim != 2 or exact.shape[1] != ready.problem.plant.parameter.size:
@@ -71,11 +76,11 @@ def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0) -> ManyRuns:
         raise InvalidValue(
             f"run_many: parameters of plant {int(np.argmin(np.isfinite(exact).all(axis=1)))} are not finite"
         )
-    why = _why_no_lanes(ready)
+    why = _why_no_lanes(ready, device)
     library: _Library | None = None
     if not why:
         try:
-            library = _built(ready)
+            library = _built(ready) if device is None else _on_device(ready, device)
         except (CompileError, NoCode) as error:
             why = str(error)
     judged, problem = ready.loop.trace["error"].elements, ready.problem
@@ -103,20 +108,29 @@ def _first(problem: Problem) -> int:
     return max(0, math.ceil(problem.measure_from / problem.period - 0.5))
 
 
-def _why_no_lanes(ready: Simulator) -> str:
+def _why_no_lanes(ready: Simulator, device: str | None) -> str:
     if ready.problem.foreign is not None:
         return "a plant outside is run one after the other"
     if ready.problem.cycles <= _first(ready.problem):
         return "no cycle is measured"
-    return "" if find_compiler() else "there is no C compiler"
+    return "" if device is not None or find_compiler() else "there is no C compiler"
 
 
 @dataclass(frozen=True, eq=False)
 class _Library:
-    """The compiled loop over lanes."""
+    """The compiled loop over lanes.
+
+    Args:
+        run: function of (groups, cycles, first that is measured, first memories, what cycles read, results).
+        lanes: plants of a group.
+        batch: groups of a call.
+        threads: calls at a time.
+    """
 
     run: Callable[..., int]
     lanes: int
+    batch: int
+    threads: int
 
     def results(self, ready: Simulator, exact: np.ndarray, seed: int) -> tuple[np.ndarray, ...]:
         """Sums of squares and largest sizes of the errors, and cycles by status, a row per plant; which are to be run again."""
@@ -130,12 +144,11 @@ class _Library:
         found = np.ones((groups, 2 * count + len(Status) + 1, self.lanes))
 
         def call(begin: int) -> None:
-            end = min(begin + _GROUPS, groups)
-            pieces = (memory[begin:end], reads, found[begin:end])
-            self.run(end - begin, problem.cycles, _first(problem), *(p.ctypes.data_as(ctypes.c_void_p) for p in pieces))
+            end = min(begin + self.batch, groups)
+            self.run(end - begin, problem.cycles, _first(problem), memory[begin:end], reads, found[begin:end])
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(call, range(0, groups, _GROUPS)))
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(call, range(0, groups, self.batch)))
         rows = found.transpose(0, 2, 1).reshape(groups * self.lanes, -1)[: len(exact)]
         sums, sizes, counts, left = np.split(rows, np.cumsum([count, count, len(Status)]), axis=1)
         return sums.copy(), sizes.copy(), counts.copy(), left.ravel() != 0
@@ -162,8 +175,19 @@ def _built(ready: Simulator) -> _Library:
     """
     library, lanes = lanes_library(lanes_sources(ready.problem, ready.loop))
     run = library.run_lanes
-    run.argtypes, run.restype = [ctypes.c_long] * 3 + [ctypes.c_void_p] * 3, ctypes.c_int
-    return _Library(run, lanes)
+    run.argtypes, run.restype = [ctypes.c_long] * 3 + [np.ctypeslib.ndpointer(float)] * 3, ctypes.c_int
+    return _Library(run, lanes, _GROUPS, os.cpu_count() or 1)
+
+
+def _on_device(ready: Simulator, device: str) -> _Library:
+    """Build the loop for an OpenCL device.
+
+    Raises:
+        InvalidName, NotInstalled: no such device.
+        NoCode: a part of the loop is not written for devices.
+    """
+    text, step = written_for_devices(ready.loop.function)
+    return _Library(loaded_kernel(text + _around(ready.problem, ready.loop, step), device), 1, _ITEMS, 1)
 
 
 def lanes_sources(problem: Problem, loop: Composite) -> tuple[str, ...]:
@@ -173,6 +197,11 @@ def lanes_sources(problem: Problem, loop: Composite) -> tuple[str, ...]:
         NoCode: a part of it is not written for lanes.
     """
     (text, *drivers), step = written_in_lanes(loop.function)
+    return text + _around(problem, loop, step), *drivers
+
+
+def _around(problem: Problem, loop: Composite, step: Callee) -> str:
+    """The text of a run, behind that of a cycle."""
     before = np.cumsum([0, *(loop.function.numel_in(k) for k in range(1, loop.function.n_in()))])
     errors = loop.trace.slice("true_error" if "true_error" in loop.trace.names else "error")
     defined = {
@@ -187,4 +216,4 @@ def lanes_sources(problem: Problem, loop: Composite) -> tuple[str, ...]:
     )
     head = "".join(f"#define {name} {value}\n" for name, value in defined.items())
     own = resources.files("fpirhc.simulation").joinpath("lanes.c").read_text(encoding="utf-8")
-    return text + head + own.replace("/* RANGES */", outside), *drivers
+    return head + own.replace("/* RANGES */", outside)

@@ -41,6 +41,10 @@ _SIDE_BY_SIDE = {
     ca.OP_AND: "truth(({0}!=0)&({1}!=0))", ca.OP_OR: "truth(({0}!=0)|({1}!=0))", ca.OP_IF_ELSE_ZERO: "where({0}!=0,{1})",
     ca.OP_NOT: "truth({0}==0)", ca.OP_SIGN: "either({0}<0, ALL(-1), either({0}>0, ALL(1), {0}))",
 }  # fmt: skip
+_ON_DEVICES = {  # OpenCL asks no number whether it is true
+    ca.OP_AND: "(({0}!=0)&&({1}!=0))", ca.OP_OR: "(({0}!=0)||({1}!=0))", ca.OP_NOT: "({0}==0)",
+    ca.OP_IF_ELSE_ZERO: "({0}!=0?{1}:0.)",
+}  # fmt: skip
 _ENDS = "(-INFINITY)", "INFINITY"
 _MOST = 4000  # instructions of scalar code that is written into its caller
 _SPLITS = (ca.OP_VERTSPLIT, ca.OP_HORZSPLIT)
@@ -72,6 +76,7 @@ class Words(NamedTuple):
 
 
 ONE = Words(SCALAR, side_by_side=False)
+DEVICE = Words({**SCALAR, **_ON_DEVICES}, side_by_side=False)
 SIDE_BY_SIDE = Words({**SCALAR, **_SIDE_BY_SIDE}, side_by_side=True)
 
 

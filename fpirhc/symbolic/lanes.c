@@ -34,6 +34,9 @@ INLINE int ANY(M m) {
   return some != 0;
 }
 INLINE int EVERY(M m) { return !ANY(~m); }
+#define GLOBAL
+INLINE V fetched(const double* from) { V a; memcpy(&a, from, sizeof a); return a; }
+INLINE void stored(double* to, V a) { memcpy(to, &a, sizeof a); }
 INLINE V truth(M m) { return (V)(m & (M)ALL(1.0)); }
 INLINE V where(M m, V a) { return (V)(m & (M)a); }
 INLINE V either(M m, V a, V b) { return (V)((m & (M)a) | (~m & (M)b)); }

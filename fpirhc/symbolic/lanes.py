@@ -15,7 +15,7 @@ from pathlib import Path
 import casadi as ca
 
 from fpirhc.errors import CompileError, NoCode
-from fpirhc.symbolic.dataflow import SIDE_BY_SIDE, Callee
+from fpirhc.symbolic.dataflow import DEVICE, SIDE_BY_SIDE, Callee, Words
 from fpirhc.symbolic.driver import SIGNATURE, driver_of, entry_of, is_driver
 from fpirhc.symbolic.flat_code import FlatCode
 from fpirhc.symbolic.native import shared_library
@@ -31,9 +31,22 @@ def written_in_lanes(function: ca.Function) -> tuple[tuple[str, ...], Callee]:
     Raises:
         NoCode: a part of it is not written for lanes.
     """
-    own = _File()
+    own = _File(SIDE_BY_SIDE)
     inner = own.flat.callee(function, always=True)
     return (own.text(), *map(_driver_file, own.drivers)), inner
+
+
+def written_for_devices(function: ca.Function) -> tuple[str, Callee]:
+    """Return a Function in OpenCL C, and how it is called: scalar code alone.
+
+    Raises:
+        NoCode: it has the loops of an optimiser, or tables.
+    """
+    own = _File(DEVICE)
+    inner = own.flat.callee(function, always=True)
+    if own.flat.tables:
+        raise NoCode("the loop has tables, which are not written for devices")
+    return own.text(), inner
 
 
 def lanes_library(sources: Sequence[str]) -> tuple[ctypes.CDLL, int]:
@@ -67,9 +80,10 @@ def _registers() -> tuple[int, tuple[str, ...]]:
 class _File:
     """The functions of one file."""
 
-    def __init__(self) -> None:
+    def __init__(self, words: Words) -> None:
+        self._words = words
         self.drivers: list[str] = []
-        self.flat = FlatCode(self._outside, SIDE_BY_SIDE)
+        self.flat = FlatCode(self._outside, words)
 
     def _outside(self, function: ca.Function) -> Callee:
         """How that is called which is no graph.
@@ -78,7 +92,7 @@ class _File:
             NoCode: it is not written for lanes.
         """
         name = function.name()
-        if is_driver(name) and driver_of(name).side_by_side:
+        if is_driver(name) and driver_of(name).side_by_side and self._words.side_by_side:
             if name not in self.drivers:
                 self.drivers.append(name)
             entry, room, in_place = entry_of(name)
@@ -87,18 +101,21 @@ class _File:
             known = {function.instruction_id(k) for k in range(function.n_instructions())} <= _KNOWN
             if known:
                 return self.flat.written(function)
-        raise NoCode(f"the loop has a part that is not written for lanes: {name}")
+        where = "lanes" if self._words.side_by_side else "devices"
+        raise NoCode(f"the loop has a part that is not written for {where}: {name}")
 
     def text(self) -> str:
         """The functions that are written so far, with what they need."""
         tables = [f"static const casadi_real flat_table_{k}{table}\n" for k, table in enumerate(self.flat.tables)]
         declared = [f"int {entry_of(name)[0]}{SIGNATURE};\n" for name in self.drivers]
-        return "".join([_words(), *tables, *declared, *self.flat.texts])
+        return "".join(
+            [_prelude("lanes.c" if self._words.side_by_side else "opencl.c"), *tables, *declared, *self.flat.texts]
+        )
 
 
 def _driver_file(name: str) -> str:
     """The loops of an optimiser, around leaves that are written for lanes."""
-    driver, own = driver_of(name), _File()
+    driver, own = driver_of(name), _File(SIDE_BY_SIDE)
     leaves = {key: own.flat.callee(leaf, always=True) for key, leaf in driver.leaves.items()}
     if own.drivers or any(leaf.room for leaf in leaves.values()):
         raise NoCode(f"the loop has a part that is not written for lanes: a stage of {name}")
@@ -107,5 +124,5 @@ def _driver_file(name: str) -> str:
 
 
 @cache
-def _words() -> str:
-    return resources.files("fpirhc.symbolic").joinpath("lanes.c").read_text(encoding="utf-8")
+def _prelude(name: str) -> str:
+    return resources.files("fpirhc.symbolic").joinpath(name).read_text(encoding="utf-8")

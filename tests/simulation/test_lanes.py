@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import casadi as ca
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotInstalled
 from fpirhc.simulation.lanes import run_many
 from fpirhc.simulation.metrics.base import measured_errors
 from fpirhc.simulation.simulate import Simulator
@@ -135,6 +136,49 @@ def test_errors_are_those_of_the_ordinary_loop(name):
         np.testing.assert_allclose([v[k] for v in many.max_error.values()], largest, rtol=close)
         counted = {status: int(count[k]) for status, count in many.statuses.items() if count[k]}
         assert counted == statuses
+
+
+def some_device() -> str:
+    """The name of an OpenCL device with double precision."""
+    cl = pytest.importorskip("pyopencl", reason="pyopencl is not installed: pip install 'fpirhc[opencl]'")
+    try:
+        every = [one for platform in cl.get_platforms() for one in platform.get_devices()]
+    except cl.LogicError:
+        every = []
+    able = [one.name for one in every if "cl_khr_fp64" in one.extensions]
+    return able[0] if able else pytest.skip("there is no OpenCL device with double precision")
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if not name.startswith("plans")])
+def test_a_device_has_the_errors_of_the_lanes(name):
+    """Its functions round otherwise again; statuses are the same, and so is a plant that runs away."""
+    ready, device = fp.simulator(*CASES[name]), some_device()
+    exact = plants(ready, 11, 0.05)
+    lanes, many = run_many(ready, exact), run_many(ready, exact, device=device)
+    assert many.lanes == 1, many.why
+    for one, other in ((many.rms_error, lanes.rms_error), (many.max_error, lanes.max_error)):
+        for coordinate, errors in one.items():
+            np.testing.assert_allclose(errors, other[coordinate], rtol=1e-9 if name == "lost samples" else 1e-12)
+    assert {s: list(v) for s, v in many.statuses.items()} == {s: list(v) for s, v in lanes.statuses.items()}
+    assert not many.stops
+
+
+def test_what_a_device_cannot_run_is_told():
+    """A loop with plans runs one after the other there; a name that no device has is wrong."""
+    device = some_device()
+    ready = fp.simulator(replace(TWO_MASS.problem, duration=0.5, measure_from=0.1), TWO_MASS.controllers["RHC"])
+    many = run_many(ready, plants(ready, 2), device=device)
+    assert many.lanes == 0
+    assert many.why.startswith("the loop has a part that is not written for devices: fpirhc_fixed_point_")
+    with pytest.raises(InvalidName, match="no OpenCL device is called 'abacus'"):
+        run_many(fp.simulator(*CASES["map"]), plants(fp.simulator(*CASES["map"]), 2), device="abacus")
+
+
+def test_a_device_needs_its_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyopencl", None)
+    ready = fp.simulator(TWO_MASS.problem, ADAPTIVE, compiled=False)
+    with pytest.raises(NotInstalled, match=r"a device needs pyopencl, .*pip install 'fpirhc\[opencl\]'"):
+        run_many(ready, plants(ready, 2), device="")
 
 
 def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():

@@ -1,0 +1,59 @@
+"""Devices that speak OpenCL, such as graphics processors: a kernel of double precision with a loop in each work item."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from fpirhc.errors import InvalidName, NoCode, NotInstalled, nearest, package
+
+
+def loaded_kernel(source: str, device: str) -> Callable[..., int]:
+    """Build the kernel `run_lanes` and return it as a function of (plants, cycles, first, start, reads, results).
+
+    Args:
+        source: OpenCL C.
+        device: part of the name of a device; '': the first graphics processor, else the first device.
+
+    Raises:
+        InvalidName: no device has this name.
+        NoCode: the device's compiler fails.
+        NotInstalled: pyopencl is not there, or no device with double precision.
+    """
+    cl = package("pyopencl", "opencl", "a device")
+    chosen = _device(cl, device)
+    context = cl.Context([chosen])
+    queue = cl.CommandQueue(context)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # compilers are chatty
+            kernel = cl.Program(context, source).build().run_lanes
+    except cl.RuntimeError as error:
+        raise NoCode(f"the compiler of '{chosen.name}' failed: {str(error).strip().splitlines()[0]}") from None
+
+    def run(plants: int, cycles: int, first: int, start: np.ndarray, reads: np.ndarray, results: np.ndarray) -> int:
+        given = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+        both = [cl.Buffer(context, given, hostbuf=np.append(v, 0.0)) for v in (start, reads)]  # none is empty
+        made = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, results.nbytes)
+        kernel(queue, (plants,), None, np.int64(cycles), np.int64(first), *both, made)
+        cl.enqueue_copy(queue, results, made)
+        return 1
+
+    return run
+
+
+def _device(cl: Any, name: str) -> Any:
+    try:
+        every = [one for platform in cl.get_platforms() for one in platform.get_devices()]
+    except cl.LogicError:  # no platform at all
+        every = []
+    able = [one for one in every if "cl_khr_fp64" in one.extensions]
+    found = [one for one in able if name.lower() in one.name.lower()]
+    if not able:
+        raise NotInstalled("no OpenCL device with double precision is here: install the vendor's OpenCL driver")
+    if not found:
+        raise InvalidName(f"no OpenCL device is called '{name}'.{nearest(name, [one.name for one in able])}")
+    return min(found, key=lambda one: one.type != cl.device_type.GPU)
