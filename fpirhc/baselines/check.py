@@ -53,6 +53,7 @@ def check_baseline(
     jobs = [Job(name, nominal(baseline.seed, compiled)) for name in names]
     results = measure_all(task, jobs, processes=processes, progress=progress)
     judgement = judge(baseline, settings_of(task), dict(zip(names, results, strict=True)), task.metrics)
+    judgement = replace(judgement, headline=task.headline_metric or "")
     return judgement if judgement.holds else replace(judgement, notes=(*judgement.notes, *_other_versions(baseline)))
 
 

@@ -92,6 +92,7 @@ class Judgement:
         date: date of the baseline.
         notes: further sentences.
         causes: settings that are not those of the baseline.
+        headline: name of the number by which the problem compares its controllers; '': the rms errors.
     """
 
     problem: str
@@ -102,6 +103,7 @@ class Judgement:
     date: str = ""
     notes: tuple[str, ...] = ()
     causes: tuple[Cause, ...] = ()
+    headline: str = ""
 
     @property
     def changed(self) -> tuple[Row, ...]:

@@ -19,7 +19,7 @@ from fpirhc.errors import OutputError
 from fpirhc.report.terminal import say, show_table
 from fpirhc.summary import Column, Table
 
-_ALWAYS = "rms_error."  # metrics that a summary shows also where they hold
+_ALWAYS = "rms_error"  # what a summary shows also where it holds, unless the problem has a headline metric
 _NAMED = 3  # consequences of a setting that are named
 _MOSTLY = 0.9  # share of a band; its digits are rounded
 _say = partial(say, wrap=False)
@@ -32,7 +32,7 @@ def show_check(judgements: Sequence[Judgement], unchecked: Mapping[str, str], ev
     Args:
         judgements: of the problems.
         unchecked: reasons why others are not checked, by name.
-        every: whether to print every metric, and not only those that changed and the rms errors.
+        every: whether to print every metric, and not only those that changed and the headline metric.
     """
     for one in judgements:
         name, (causes, rows) = clean(one.problem), explained(one)
@@ -40,7 +40,7 @@ def show_check(judgements: Sequence[Judgement], unchecked: Mapping[str, str], ev
             _say(f"{name}: {text}")
             if own and not every:
                 _say(f"  {_consequences(own)}")
-        shown = _by_size(one.rows) if every else [row for row in rows if in_summary(row)]
+        shown = _by_size(one.rows) if every else [row for row in rows if in_summary(row, one.headline)]
         if shown:
             table = Table(name, [Column(head, left=head == "verdict") for head in HEADS], names=2)
             for row in shown:
@@ -66,9 +66,15 @@ def explained(judgement: Judgement) -> tuple[list[tuple[str, list[Row]]], list[R
     return causes, _by_size(left)
 
 
-def in_summary(row: Row) -> bool:
-    """Whether a summary shows a row."""
-    return not row.holds or row.metric.startswith(_ALWAYS)
+def in_summary(row: Row, headline: str = "") -> bool:
+    """Whether a summary shows a row: what does not hold, and the headline metric; '': the rms errors."""
+    return not row.holds or _speaks(row.metric, headline)
+
+
+def _speaks(metric: str, headline: str) -> bool:
+    """Whether a metric is the headline's, or one of its coordinates."""
+    name = headline or _ALWAYS
+    return metric == name or metric.startswith(f"{name}.")
 
 
 def _by_size(rows: Sequence[Row]) -> list[Row]:
@@ -83,8 +89,8 @@ def _consequences(rows: Sequence[Row]) -> str:
     return f"{len(rows)} metrics changed with it ({largest}{more}); --all shows them"
 
 
-def show_baseline(baseline: Baseline, path: str) -> None:
-    """Print the metrics of an accepted baseline with their bands; only rms errors and metrics with loose bands."""
+def show_baseline(baseline: Baseline, path: str, headline: str = "") -> None:
+    """Print the headline metric of an accepted baseline ('': the rms errors), and what has a loose band, each with its band."""
     heads = ("controller", "metric", "value", "band", "made of")
     table = Table(f"{clean(baseline.problem)}, baseline", [Column(head, left=True) for head in heads], names=2)
     loose = []
@@ -94,7 +100,7 @@ def show_baseline(baseline: Baseline, path: str) -> None:
         for metric, value in one.metrics.items():
             if value.loose:
                 loose.append(f"{name}: {metric}")
-            if value.loose or metric.startswith("rms_error."):
+            if value.loose or _speaks(metric, headline):
                 band = f"\u00b1 {value.band:.2g}"
                 table.add([clean(name), clean(metric), number(value.value), band, _source(value)])
         for metric, why in one.not_compared.items():

@@ -234,6 +234,7 @@ def texts(capsys):
 def test_a_summary_says_what_changed():
     """A row in a sentence, a problem in one."""
     assert [in_summary(row) for row in BAD.rows] == [True, False, True, True]
+    assert in_summary(Row("PID", "rms_error.y", 1.0, 1.0, 0.1, HOLDS))
     assert headline(BAD) == "bad: 2 of 4 metrics changed"
     assert sentence(MUCH_WORSE) == "RHC+FPI: effort.u was 1, is 2 (+100 %, band \u00b1 0.1): worse"
     assert sentence(ENDED) == "PID: outcome was finished, is ended early: changed"

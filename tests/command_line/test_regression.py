@@ -33,6 +33,7 @@ from fpirhc.baselines.places import problems_here
 from fpirhc.baselines.printing import to_markdown
 from fpirhc.baselines.reading import read_baseline
 from fpirhc.cli.main import main
+from fpirhc.cli.verb import ExitCode
 from fpirhc.errors import BaselineError, InvalidName
 from fpirhc.simulation.metrics import known_metrics
 
@@ -121,6 +122,17 @@ def test_a_run_that_may_diverge_compares_only_how_it_ends(blessed):
     for outcome, holds in ((FINISHED, True), (DIVERGED, True), ("refused (NotSupported)", False)):
         fresh = {"CTC": Measurement(outcome, "", {"rms_error.y": 1e9})}
         assert judge(whole, settings_of(task), fresh).holds == holds
+
+
+@pytest.mark.parametrize("name", ["effort.u", "effort"])
+def test_a_summary_speaks_of_the_problems_headline_metric(folder, name, capsys):
+    """In place of the rms errors, where everything holds; one coordinate, or all of a metric's."""
+    file = folder / "line.py"
+    file.write_text(f"{file.read_text()}headline_metric = '{name}'\n")
+    assert main(["check", "line.py", "--no-compile"]) == ExitCode.FINISHED
+    shown = capsys.readouterr().out
+    assert "effort.u" in shown
+    assert "rms_error" not in shown
 
 
 def test_seeds_are_varied_only_where_there_is_noise(blessed):

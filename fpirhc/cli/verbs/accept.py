@@ -38,7 +38,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
             processes=options.processes,
             progress=progress,
         )
-    show_baseline(baseline, str(path))
+    show_baseline(baseline, str(path), task.headline_metric or "")
     return ExitCode.FINISHED
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("problems", nargs="*", metavar="PROBLEM", help="names or files (default: all of this folder)")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write Markdown, for a pull request")
-    text = "show every metric, not only those that changed and the rms errors"
+    text = "show every metric, not only those that changed and the headline metric (the rms errors, without one)"
     parser.add_argument("--all", action="store_true", help=text)
     text = "changes smaller than this share of the old value hold, such as 0.1%%; counts and outcomes are never ignored"
     parser.add_argument("--ignore-below", type=percent, default=0.0, metavar="PERCENT", help=text)
