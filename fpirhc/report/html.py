@@ -34,7 +34,7 @@ from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
 from fpirhc.simulation.log import responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import readable
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.summary import Column, Table
 from fpirhc.whole_file import write_whole
 

@@ -23,7 +23,7 @@ from rich.text import Text
 from fpirhc.simulation.metrics.measuring import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.summary import Column, Table, printable
 
 if TYPE_CHECKING:

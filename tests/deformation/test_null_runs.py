@@ -13,9 +13,9 @@ import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.model_as_plant import CYCLES, ModelAsPlant
 from fpirhc.simulation.simulate import simulator
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.studies.comparison.compare import compare
-from fpirhc.studies.comparison.null_test import null_test
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.pairwise import null_test
 from fpirhc.summary import in_percent
 
 PLAIN = fp.ComputedTorque(fp.Exponential(rate=6.0))

@@ -417,7 +417,7 @@ BUILDS = {
     "review/questions/right_model.py": {"Increment", "ModelReferenced"},  # the forms that are compared
     "review/prediction.py": {"Identity"},  # no adaptation
     "review/questions/noise.py": {"Filtered"},  # the suggested deformation
-    "studies/comparison/caveats.py": {"HeldInput"},  # the plant with nobody at it
+    "studies/comparison/causes.py": {"HeldInput"},  # the plant with nobody at it
     "simulation/linearise/asked_loop.py": {"Jump"},  # the entry of signals at the inputs
     "studies/operating_limits.py": {"Noise"},  # the noise of the sensors at which a controller fails is sought
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum

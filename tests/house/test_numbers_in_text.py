@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.studies.comparison.null_test import NullTest
+from fpirhc.studies.comparison.changes import Finding, Outcome
 from fpirhc.studies.comparison.optimality import gap
-from fpirhc.studies.comparison.outcome import Finding, Outcome
+from fpirhc.studies.comparison.pairwise import NullTest
 from fpirhc.summary import in_percent, numbers_written_out, written_out
 
 

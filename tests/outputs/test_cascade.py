@@ -12,7 +12,7 @@ from test_outputs import OPTIMISER, hill, planned, sedated
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive, NotSupported
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.task.set_point import Setpoint
 
 TASK = fp.load_problem("problems/heat_exchanger.py")

@@ -21,7 +21,7 @@ import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem
 from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.plant.disturbed import disturbed
-from fpirhc.studies.comparison.information import information
+from fpirhc.studies.comparison.entry import information
 
 LAW = fp.ComputedTorque(fp.Exponential(rate=1.0))
 STATES = {"C": 0.01, "E": 0.01}

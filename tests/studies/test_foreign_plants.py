@@ -26,7 +26,7 @@ from fpirhc.errors import InvalidProblem
 from fpirhc.review.answer import Verdict
 from fpirhc.review.questions.convergence import box_converges
 from fpirhc.review.review import predict
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.summary import written_out
 
 QUICK = ("cruise", "conical_tank", "magnet", "masses", "stocking")

@@ -9,7 +9,7 @@ import casadi as ca
 import pytest
 
 import fpirhc as fp
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.changes import Outcome
 
 MASSES = 0.6, 0.2, 0.2  # kg: cart, lower, upper
 LENGTHS = 0.5, 0.5  # m

@@ -15,7 +15,7 @@ from fpirhc.errors import InvalidField, InvalidValue
 from fpirhc.review.answer import Verdict
 from fpirhc.review.questions.convergence import CONVERGES
 from fpirhc.review.questions.right_model import NULL_TEST
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.summary import written_out
 
 K, TAU, LAG, LATE, PERIOD, RATE, GAIN, POLE = 2.0, 10.0, 0.5, 10, 0.1, 0.2, 0.1, 0.95  # GAIN: half of the map's own

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.studies.comparison.caveats import error_left_alone, yardstick_of
+from fpirhc.studies.comparison.causes import error_left_alone, yardstick_of
 from fpirhc.studies.comparison.changes import ranges
 from fpirhc.studies.scenarios.bench import held
 

@@ -14,7 +14,7 @@ from test_verdict_sentences import EFFORT, entry, first, no_difference
 import fpirhc as fp
 from fpirhc.report.html import render
 from fpirhc.review.questions.gain import recommended_for, reviewed_gain
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.changes import Outcome
 
 SLOW = "Its gain is too small: the effective gain is 0.1. Use gain = -3 or more."
 GENTLE = "RHC+FPI, gentle"

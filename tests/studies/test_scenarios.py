@@ -30,10 +30,10 @@ from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import is_late, scaled
 from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error
+from fpirhc.studies.scenarios.cluster import DEATHS, Workers
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger, Records
 from fpirhc.studies.scenarios.paired import median_interval, middle, share_interval, summarise, verdict
-from fpirhc.studies.scenarios.processes import DEATHS, Workers
 
 LINE = line_text(
     "period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}", bounds="(0.5, 2.4)", more=EXACT

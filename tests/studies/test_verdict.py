@@ -19,10 +19,10 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import asset, css_class
 from fpirhc.report.terminal import STYLES
 from fpirhc.simulation.metrics import Metrics, known_metrics
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.studies.comparison.compare import _pair, compare
 from fpirhc.studies.comparison.entry import Entry
-from fpirhc.studies.comparison.harm import partners
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.pairwise import partners
 from fpirhc.studies.comparison.timing import CycleTime, Price, measure_price, price_of
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.studies.scenarios.paired import ConfidenceInterval, Summary, verdict

@@ -12,9 +12,9 @@ import fpirhc as fp
 from fpirhc.report.html import css_class, render
 from fpirhc.report.terminal import STYLES
 from fpirhc.review.questions.margins import SLOWER
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.comparison import Comparison
-from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.view import to_json
 
 

@@ -14,9 +14,9 @@ import fpirhc as fp
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
-from fpirhc.studies.comparison.caveats import Yardstick
+from fpirhc.studies.comparison.causes import Yardstick
+from fpirhc.studies.comparison.changes import Finding, Outcome
 from fpirhc.studies.comparison.entry import Entry, no_bound_because
-from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.timing import CycleTime, Price
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.studies.tuning.objective import Objective

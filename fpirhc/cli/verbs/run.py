@@ -38,7 +38,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.studies.comparison.compare import check_gains, select
-    from fpirhc.studies.comparison.harm import harm_of_adaptation
+    from fpirhc.studies.comparison.pairwise import harm_of_adaptation
 
     task = in_case(task, options.case) if options.case else task
     name = options.controller

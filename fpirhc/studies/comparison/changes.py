@@ -1,24 +1,56 @@
-"""Changes of errors between two controllers: which coordinates count, and what their changes amount to.
+"""Outcomes of a comparison, findings, and changes of errors: which coordinates count, and what their changes amount to.
 
-An error counts relative to a scale of its coordinate. The scale is the range of the reference, the start included; for a set-point
-held from the start it is 1 / sqrt(w) with the cost's weight w, else the width of the limits, else 1 in the coordinate's unit.
-
-A coordinate that the cost of a planning controller does not weigh is not judged, because nobody asked the plan for it. Neither is
-one whose relative errors stay below 1 % of the largest relative error, or below 1e-9, which is rounding.
+An error counts relative to a scale of its coordinate: the range of the reference, the start included; for a set-point held from the
+start 1 / sqrt(w) with the cost's weight w, else the width of the limits, else 1. What a plan's cost does not weigh is not judged,
+nor what stays below 1 % of the largest relative error, or below 1e-9, which is rounding.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 
+from fpirhc.by_name import FoundByName
 from fpirhc.plant.motion import followed_units
-from fpirhc.studies.comparison.outcome import Outcome
-from fpirhc.summary import written_out
+from fpirhc.summary import numbers_written_out, written_out
 from fpirhc.task.problem import Problem
+
+
+class Outcome(StrEnum):
+    """The effect of adaptation on one pair of controllers; words and colours of every output follow from it."""
+
+    BETTER = "better"
+    WORSE = "worse"
+    MIXED = "mixed"
+    DOUBTFUL = "doubtful"  # a smaller error, and a reason why it is no success
+    NO_DIFFERENCE = "no difference"
+    NOT_COMPARABLE = "not comparable"
+
+
+@dataclass(frozen=True)
+class Finding(FoundByName):
+    """One sentence of a verdict.
+
+    Args:
+        text: the sentence.
+        outcome: of the pair that it is about; None for a remark.
+        pair: names of the controllers without and with adaptation, where it is about a pair.
+        ratios: rms error with adaptation over that without, by judged coordinate, largest first; NaN where both are zero.
+    """
+
+    text: str
+    outcome: Outcome | None = None
+    pair: tuple[str, str] | None = None
+    ratios: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text", numbers_written_out(self.text))
+        super().__post_init__()
+
 
 HELPS = 0.9  # an rms error below this share of the pair's counts as lower
 HURTS = 1.1

@@ -29,16 +29,19 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import judged_run, simulator
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import weighed
-from fpirhc.studies.comparison.caveats import yardstick_of
-from fpirhc.studies.comparison.changes import scales
+from fpirhc.studies.comparison.causes import yardstick_of
+from fpirhc.studies.comparison.changes import Finding, Outcome, scales
 from fpirhc.studies.comparison.comparison import Comparison
-from fpirhc.studies.comparison.entry import Contraction, Entry, has_exact_model, plan_every
-from fpirhc.studies.comparison.harm import partners
-from fpirhc.studies.comparison.information import information, sentences
-from fpirhc.studies.comparison.null_test import NullTest
+from fpirhc.studies.comparison.entry import Contraction, Entry, has_exact_model, information, plan_every, sentences
 from fpirhc.studies.comparison.optimality import measure_optimality
-from fpirhc.studies.comparison.outcome import Finding, Outcome
-from fpirhc.studies.comparison.pairwise import Built, beside_each_other, null_tests, with_reviewed_causes
+from fpirhc.studies.comparison.pairwise import (
+    Built,
+    NullTest,
+    beside_each_other,
+    null_tests,
+    partners,
+    with_reviewed_causes,
+)
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.studies.tuning.objective import objective

@@ -13,10 +13,10 @@ from fpirhc.simulation.metrics import Metric, Metrics
 from fpirhc.simulation.metrics.measuring import Column as Number
 from fpirhc.simulation.metrics.measuring import columns, in_report
 from fpirhc.simulation.pictures.base import Picture
+from fpirhc.studies.comparison.changes import Finding, Outcome
 from fpirhc.studies.comparison.entry import Entry
-from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import gap
-from fpirhc.studies.comparison.outcome import Finding, Outcome
+from fpirhc.studies.comparison.pairwise import NullTest
 from fpirhc.studies.view import Study, View, status_shares
 from fpirhc.summary import Column, Table, in_percent, line, numbers_written_out, written_out
 

@@ -27,7 +27,7 @@ from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.studies.comparison.caveats import error_left_alone
+from fpirhc.studies.comparison.causes import error_left_alone
 from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
 from fpirhc.task.problem import Problem
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fpirhc.by_name import FoundByName
 from fpirhc.simulation.metrics import Metric, known_metrics
-from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.studies.tuning.objective import Objective
 from fpirhc.summary import in_percent
 

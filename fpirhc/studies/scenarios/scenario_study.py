@@ -20,11 +20,10 @@ from fpirhc.simulation.metrics import Metric
 from fpirhc.simulation.metrics.measuring import Column
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint, scenario_numbers
-from fpirhc.studies.scenarios.cluster import Cluster
+from fpirhc.studies.scenarios.cluster import Cluster, Workers
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger, header_of
 from fpirhc.studies.scenarios.paired import Record, Summary, noun, summarise, verdict
-from fpirhc.studies.scenarios.processes import Workers
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import with_tuned

@@ -21,7 +21,7 @@ from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
 from fpirhc.studies.comparison.compare import select
-from fpirhc.studies.comparison.harm import harm_of_adaptation
+from fpirhc.studies.comparison.pairwise import harm_of_adaptation
 from fpirhc.studies.scenarios.bench import Conditions, Trials, fingerprint, scenario_numbers
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger

@@ -1,12 +1,56 @@
-"""Errors of the judged coordinates: reference minus the plant's state, from `measure_from` on."""
+"""Errors of the judged coordinates, from `measure_from` on, the time at which a run settled, and its stage cost."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.simulation.metrics.base import Metric, by_name, coordinate_unit, measured_errors
+from fpirhc.simulation.metrics.base import Metric, by_name, coordinate_unit, measured_cycles, measured_errors
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
+
+
+def cost(problem: Problem, run: Run) -> dict[str, float]:
+    """Return the sum of the problem's stage cost by term, and 'total', from `measure_from` on; empty for a run that ended early."""
+    if "cost" not in run.layout or run.stop is not None:
+        return {}
+    terms = by_name(run.layout["cost"].elements, run["cost"][measured_cycles(problem, run)].sum(axis=0))
+    return {**terms, "total": sum(terms.values())}
+
+
+_COST = (Metric("cost", cost, by="term", shown=("total",), finite=True, order=70),)
+
+
+SETTLED = 0.02  # half width of the band, as a share of the reference's range or of the first error, whichever is larger
+
+
+def settling(problem: Problem, run: Run) -> dict[str, float]:  # noqa: ARG001 -- every metric is given the problem
+    """Return the time from which |error| stays within the band; 0 where it always is, NaN where the run ends outside it."""
+    return {name: _settling(run, name) for name in run.layout["error"].elements}
+
+
+def _settling(run: Run, coordinate: str) -> float:
+    if run.stop is not None or not run.cycles:
+        return float("nan")
+    error, reference = np.abs(run[f"true_error.{coordinate}"]), run[f"reference.{coordinate}"]
+    band = SETTLED * max(float(np.ptp(reference)), float(error[0]), 1e-12)
+    outside = np.flatnonzero(error > band)
+    if not outside.size:
+        return 0.0
+    last = int(outside[-1])
+    return float(run.time[last + 1]) if last + 1 < run.cycles else float("nan")
+
+
+_SETTLING = (
+    Metric(
+        "settling",
+        settling,
+        by="coordinate",
+        unit=lambda problem, _: problem.time_unit,
+        title="settled",
+        step=lambda period, _: period,
+        order=40,
+    ),
+)
 
 
 def rms_error(problem: Problem, run: Run) -> dict[str, float]:
@@ -26,6 +70,8 @@ def iae(problem: Problem, run: Run) -> dict[str, float]:
 
 
 METRICS = (
+    *_SETTLING,
+    *_COST,
     Metric(
         "rms_error", rms_error, by="coordinate", unit=coordinate_unit, short="rms", headline=True, finite=True, order=10
     ),
