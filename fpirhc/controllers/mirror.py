@@ -3,7 +3,7 @@
     commands -> believed dead time -> believed actuator lag -> model -> [sensors' quanta -> late samples -> estimator] -> modelled
 
 Where the response itself is measured, the model's response is that of this instant, f^(x_k, u_{k-1}), with u_{k-1} the input that
-acted according to the beliefs. Where the response is estimated from samples, a twin of the plant produces them (`twin`).
+acted according to the beliefs. Where the response is estimated from samples, a twin of the plant produces them (`_twin`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -54,8 +54,8 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
         return [instant_mirror(path)], []
     path = replace(path, counts=True)
     if problem.plant.outputs:
-        return [twin_of_outputs(path)], []
-    return [twin_block(path)], [Delay(problem.plant.response_signal(BEFORE), "_deformation")]
+        return [_twin(path, _Outputs(path))], []
+    return [_twin(path, _States(path))], [Delay(problem.plant.response_signal(BEFORE), "_deformation")]
 
 
 def believed_path(problem: Problem, deformation: Deformation, owner: str = "mirror") -> CommandPath:
@@ -153,50 +153,78 @@ def instant_mirror(path: CommandPath, answers: Answers | None = None, *, lost: b
 
 
 BEFORE = "_deformation_before"
+_STATE, _OFFSET, _ACTED = "mirror_state", "mirror_offset", "mirror_acted"
 
 
-def twin_block(path: CommandPath) -> Block:
-    """Block (measured state, last command, last deformation, parameters) -> the twin's estimated response and the deformation's."""
+Kept: TypeAlias = Callable[[Expression], dict[str, Expression]]  # of a move of the estimate: what the twin remembers
+
+
+def _twin(path: CommandPath, motion: _States | _Outputs) -> Block:
+    """Block (what is measured, last command, parameters) -> the model's response behind the estimator.
+
+    The motion shows a sample, the estimator makes a state and a response of it, and whatever separates this state from the measured
+    one moves the motion and what the estimator remembers, so that the samples stay on one path.
+    """
     problem, plant = path.problem, path.problem.plant
-    start, names = problem.start_state, problem.sensing.estimator.measures(plant)
-    estimate = problem.sensing.estimator.block(plant, problem.period, start, Signal("_seen", names))
+    estimator = problem.sensing.estimator
+    estimate = estimator.block(plant, problem.period, motion.start, Signal("_seen", estimator.measures(plant)))
     own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
-    twin = Signal("mirror_state", plant.state.elements, plant.state.units, tuple(map(float, start)))
-    seen, controlled = _seen(problem, names, response_names(plant)), controlled_places(plant)
-    resting = np.asarray(seen(start, problem.inputs_before, plant.approximate, 0).full()).ravel()
-    late = (Signal("mirror_sample", names, start=tuple(map(float, resting))),) if path.fraction else ()
-    advance, moves, past = (
-        problem.integrator.step(plant, problem.period),
-        _Moves(problem, names, path),
-        _Deformations(path),
-    )
+    moves = memory_moves(problem, estimator.measures(plant))
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
         parameters, signals = path.parameters(s)
-        acting, answered, next_deformations = past.seen(s)
         waits = path.cycles(s) < path.late + 0.5  # the samples still show the start
-        at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, -acting))
-        sample = seen(at, end, parameters, -acting[controlled])
-        arrived = (1 - path.fraction) * sample + path.fraction * s.mirror_sample if late else sample
-        state, response, *memories = estimate.function(arrived, *(getattr(s, m.name) for m in own))
-        away = getattr(s, MEASURED) - state
-        # What is not finite must not be remembered.
-        move = ca.if_else(is_finite(away), away, 0)
-        remembered |= {"mirror_state_next": at + moves.state @ move, **next_deformations, **signals}
-        if late:
-            remembered["mirror_sample_next"] = sample + moves.sample @ move
-        for signal, value, matrix in zip(own, memories, moves.memory, strict=True):
+        sample, more, kept = motion.sample(s, end, mean, parameters, waits)
+        shown, response, *memories = estimate.function(sample, *(getattr(s, m.name) for m in own))
+        away = getattr(s, motion.reads[0].name) - shown
+        move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
+        remembered |= kept(move) | signals
+        for signal, value, matrix in zip(own, memories, moves, strict=True):
             remembered[f"{signal.name}_next"] = value + matrix @ move
-        return {"_modelled": response + answered, **remembered}
+        return {"_modelled": response if more is None else response + more, **remembered}
 
-    writes, memory = (
-        Layout((plant.response_signal("_modelled"),)),
-        Layout((*path.memory, past.memory, twin, *late, *own)),
-    )
-    reads = Layout((measured_state(plant), *path.reads, plant.response_signal(BEFORE)))
+    reads, memory = Layout((*motion.reads, *path.reads)), Layout((*path.memory, *motion.memory, *own))
+    writes = Layout((plant.response_signal("_modelled"),))
     block = Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
-    return replace(block, waits=unseen(block, (MEASURED,)))
+    return replace(block, waits=unseen(block, (MEASURED, MEASURED_OUTPUT)))
+
+
+class _States:
+    """A model that goes on by itself under the commands and the deformations of the past.
+
+    The deformation acts on it as a forcing with the other sign, so that it moves as the plant would if the model were right.
+    """
+
+    def __init__(self, path: CommandPath) -> None:
+        self._path, problem, plant = path, path.problem, path.problem.plant
+        names = problem.sensing.estimator.measures(plant)
+        self.start = problem.start_state
+        self.reads = measured_state(plant), plant.response_signal(BEFORE)
+        self._seen, self._controlled = _seen(problem, names, response_names(plant)), controlled_places(plant)
+        self._advance, self._past = problem.integrator.step(plant, problem.period), _Deformations(path)
+        resting = np.asarray(self._seen(self.start, problem.inputs_before, plant.approximate, 0).full()).ravel()
+        late = (Signal("mirror_sample", names, start=tuple(map(float, resting))),) if path.fraction else ()
+        state = Signal(_STATE, plant.state.elements, plant.state.units, tuple(map(float, self.start)))
+        self.memory = self._past.memory, state, *late
+        self._ahead = ca.DM(drift(plant.output, path.fraction * problem.period))
+        places = {e: k for k, e in enumerate(plant.state.elements)}
+        rows = [np.asarray(self._ahead)[places[n]] if n in places else np.zeros(plant.state.size) for n in names]
+        self._shown = ca.DM(np.array(rows))
+
+    def sample(
+        self, s: Signals, end: Expression, mean: Expression, parameters: Expression, waits: Expression
+    ) -> tuple[Expression, Expression | None, Kept]:
+        """Return the sample of the cycle, what it adds to the estimated response, and what is remembered after a move."""
+        acting, answered, next_deformations = self._past.seen(s)
+        at = ca.if_else(waits, s.mirror_state, self._advance(s.mirror_state, mean, parameters, -acting))
+        sample, part = self._seen(at, end, parameters, -acting[self._controlled]), self._path.fraction
+
+        def kept(move: Expression) -> dict[str, Expression]:
+            late = {"mirror_sample_next": sample + self._shown @ move} if part else {}
+            return {f"{_STATE}_next": at + self._ahead @ move, **next_deformations, **late}
+
+        return (1 - part) * sample + part * s.mirror_sample if part else sample, answered, kept
 
 
 class _Deformations:
@@ -245,18 +273,6 @@ def _seen(problem: Problem, names: Sequence[str], shifted: Sequence[str]) -> ca.
     return ca.Function("fpirhc_mirror_seen", [x, u, p, shift], [ca.densify(ca.vertcat(*shown))])
 
 
-class _Moves:
-    """Matrices that turn a move of the estimated state into moves of the twin and of what its estimator remembers."""
-
-    def __init__(self, problem: Problem, names: Sequence[str], path: CommandPath) -> None:
-        plant, period = problem.plant, problem.period
-        self.state = ca.DM(drift(plant.output, path.fraction * period))
-        places = {e: k for k, e in enumerate(plant.state.elements)}
-        rows = [np.asarray(self.state)[places[n]] if n in places else np.zeros(plant.state.size) for n in names]
-        self.sample = ca.DM(np.array(rows))
-        self.memory = memory_moves(problem, names)
-
-
 def memory_moves(problem: Problem, names: Sequence[str]) -> list[ca.DM]:
     """Return the matrices that turn a move of the estimated state, or outputs, into moves of what the estimator remembers.
 
@@ -289,74 +305,54 @@ def drift(motion: Signal, time: float) -> np.ndarray:
     return drift
 
 
-_STATE, _OFFSET, _ACTED = "mirror_state", "mirror_offset", "mirror_acted"
+class _Outputs:
+    """A model that moves over a cycle from the state that is given, x_{k-1}, to x^ = F(x_{k-1}, u), and shows its outputs there.
 
-
-def twin_of_outputs(path: CommandPath) -> Block:
-    """Block (state, outputs, last command, parameters) -> the model's response behind the estimator.
-
-    The model moves over a cycle from the state that is given, x_{k-1}, to x^ = F(x_{k-1}, u), and shows its outputs there. Outputs
-    that the model computes are not the measured ones, so the twin has an offset o, a polynomial in y ... y^(r-1) as the plans have:
-
-        y~_k = y^(x^) + o_k.
-
-    After each cycle the offset is moved to where the estimate of the twin is the controller's, and it takes up the difference
-    between x^ and the state that is given next, so that the samples stay on one path.
+    Outputs that the model computes are not the measured ones, so it has an offset o, a polynomial in y ... y^(r-1) as the plans
+    have: y~_k = y^(x^) + o_k. After each cycle the offset is moved to where the estimate of the twin is the controller's, and it
+    takes up the difference between x^ and the state that is given next.
 
     Behind a fraction phi of a cycle the state that is given is interpolated, and moves as the plant does with the mean of the
     commands that acted; see `fpirhc.controllers.observed_state.sample_path`.
-
-    Args:
-        path: of the commands to the model.
     """
-    problem, plant, part = path.problem, path.problem.plant, path.fraction
-    names = problem.sensing.estimator.measures(plant)
-    estimate = problem.sensing.estimator.block(plant, problem.period, problem.start_output, Signal("_seen", names))
-    own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
-    moves, ahead = memory_moves(problem, names), ca.DM(drift(plant.output, problem.period))
-    advance, chain, shown = (
-        problem.integrator.step(plant, problem.period),
-        _chain(problem),
-        _seen(problem, names, plant.output.elements),
-    )
-    calm = np.zeros(len(plant.names))
-    acted = Signal(_ACTED, (*(f"{e}.end" for e in plant.input.elements), *(f"{e}.mean" for e in plant.input.elements)))
-    before = (replace(acted, start=tuple(map(float, [*problem.inputs_before] * 2))),) if part else ()
 
-    def step(s: Signals) -> dict[str, Expression]:
-        end, mean, remembered = path.acted(s)
-        parameters, signals = path.parameters(s)
-        waits = path.cycles(s) < path.late + 0.5  # the samples still show the start
+    def __init__(self, path: CommandPath) -> None:
+        self._path, problem, plant = path, path.problem, path.problem.plant
+        names, inputs = problem.sensing.estimator.measures(plant), plant.input.elements
+        self.start = problem.start_output
+        self.reads = measured_output(plant), measured_state(plant)
+        self._ahead = ca.DM(drift(plant.output, problem.period))
+        self._advance, self._chain = problem.integrator.step(plant, problem.period), _chain(problem)
+        self._seen, self._calm = _seen(problem, names, plant.output.elements), np.zeros(len(plant.names))
+        rest = tuple(map(float, [*problem.inputs_before] * 2))
+        acted = Signal(_ACTED, (*(f"{e}.end" for e in inputs), *(f"{e}.mean" for e in inputs)), start=rest)
+        self.memory = (*_starts(problem), *((acted,) if path.fraction else ()))
+
+    def sample(
+        self, s: Signals, end: Expression, mean: Expression, parameters: Expression, waits: Expression
+    ) -> tuple[Expression, Expression | None, Kept]:
+        """Return the sample of the cycle, nothing that it adds to the response, and what is remembered after a move."""
+        path, part, remembered = self._path, self._path.fraction, dict[str, Expression]()
         if part:
             whole = path.cycles(s) > path.late + 1.5
             remembered[f"{_ACTED}_next"] = ca.vertcat(end, mean)
             both = (1 - part) * ca.vertcat(end, mean) + part * getattr(s, _ACTED)
-            end, mean = ca.vertsplit(ca.if_else(whole, both, ca.vertcat(end, mean)), plant.input.size)
-            older = (1 - part) * parameters + part * path.parameters_before(s)
-            parameters = ca.if_else(whole, older, parameters) if signals else parameters
-        later = advance(s.mirror_state, mean, parameters, calm)
+            end, mean = ca.vertsplit(ca.if_else(whole, both, ca.vertcat(end, mean)), path.last.size)
+            if path.signalled:
+                older = (1 - part) * parameters + part * path.parameters_before(s)
+                parameters = ca.if_else(whole, older, parameters)
+        later = self._advance(s.mirror_state, mean, parameters, self._calm)
         later = ca.if_else(whole, later, s.mirror_state + (1 - part) * (later - s.mirror_state)) if part else later
         at = ca.if_else(waits, s.mirror_state, later)
-        offset = ca.if_else(waits, s.mirror_offset, ahead @ s.mirror_offset)
-        sample = shown(at, end, parameters, offset)
-        motion, response, *memories = estimate.function(sample, *(getattr(s, m.name) for m in own))
-        away = getattr(s, MEASURED_OUTPUT) - motion
-        move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
-        measured = getattr(s, MEASURED)
-        measured = ca.if_else(is_finite(measured), measured, at)
-        turn = chain(at, end, parameters) - chain(measured, end, parameters)
-        remembered |= {f"{_STATE}_next": measured, f"{_OFFSET}_next": offset + move + turn, **signals}
-        for signal, value, matrix in zip(own, memories, moves, strict=True):
-            remembered[f"{signal.name}_next"] = value + matrix @ move
-        return {"_modelled": response, **remembered}
+        offset = ca.if_else(waits, s.mirror_offset, self._ahead @ s.mirror_offset)
 
-    memory = Layout((*path.memory, *_starts(problem), *own, *before))
-    reads, writes = (
-        Layout((measured_state(plant), *path.reads, measured_output(plant))),
-        Layout((plant.response_signal("_modelled"),)),
-    )
-    block = Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
-    return replace(block, waits=unseen(block, (MEASURED, MEASURED_OUTPUT)))
+        def kept(move: Expression) -> dict[str, Expression]:
+            measured = getattr(s, MEASURED)
+            measured = ca.if_else(is_finite(measured), measured, at)
+            turn = self._chain(at, end, parameters) - self._chain(measured, end, parameters)
+            return {f"{_STATE}_next": measured, f"{_OFFSET}_next": offset + move + turn, **remembered}
+
+        return self._seen(at, end, parameters, offset), None, kept
 
 
 def _starts(problem: Problem) -> tuple[Signal, Signal]:

@@ -172,6 +172,11 @@ class CommandPath:
         """Return the input that acted one cycle earlier, without lag."""
         return self._arrived(s, self._column)[0]
 
+    @property
+    def signalled(self) -> bool:
+        """Whether signals from outside are among the model's parameters."""
+        return bool(self._known.places)
+
     def parameters(self, s: Signals) -> tuple[Expression, dict[str, Expression]]:
         """Return the model's parameters with the signals from outside that acted, and what is remembered."""
         return self._known.acted(s, self.late, self._oldest, f"{self.owner}_signals")
