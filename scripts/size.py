@@ -119,7 +119,7 @@ def _calls(build: Callable[[], object]) -> list[str]:
 
     def profile(frame: object, event: str, _: object) -> None:
         file = frame.f_code.co_filename  # type: ignore[attr-defined]
-        if event == "call" and file.startswith(str(PACKAGE)):
+        if event == "call" and file.startswith(str(Path(fp.__file__).parent)):
             seen.append(file)
 
     sys.setprofile(profile)
