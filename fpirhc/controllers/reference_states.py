@@ -15,7 +15,6 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction.large_errors import step_for_basin
 from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
 from fpirhc.horizon.nominal import known_on_reference, nominal_run
@@ -206,6 +205,8 @@ def _recovery(problem: Problem, law: Tracking | None) -> float:
     rates = [(len(one.gains), one.rate) for one in laws if one is not None and one.rate is not None and one.gains]
     if not rates:
         return 0.0
+    from fpirhc.contraction.large_errors import step_for_basin  # of laws with one rate alone
+
     error = _largest_error(problem)
     return max(step_for_basin(error, poles, rate, problem.period) for poles, rate in rates)
 

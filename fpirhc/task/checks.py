@@ -22,7 +22,6 @@ from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
 from fpirhc.plant.maps import over
 from fpirhc.plant.motion import followed_units, outside_of
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.positions import StepDifference
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.live import nominal
@@ -58,6 +57,8 @@ def settled_maps(
             if any(length % 1 for length in horizon.lengths):
                 mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {horizon.lengths}")
         if sensing.estimator.measures_all and not _instant(plant):
+            from fpirhc.sensing.positions import StepDifference  # of maps alone
+
             settled["sensing"] = replace(sensing, estimator=StepDifference())
     elif integrator.steps_maps:
         settled["integrator"] = USUAL

@@ -22,7 +22,6 @@ from fpirhc.plant.maps import check_time, over, unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
-from fpirhc.symbolic.roots import Equations
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,6 +382,8 @@ def settled(
         parameters: shape (np,).
         free: places of the entries that settle.
     """
+    from fpirhc.symbolic.roots import Equations  # of a start that must settle alone
+
     places = list(free)
     held, u, p = plant.symbols()
     x = ca.SX(held)
