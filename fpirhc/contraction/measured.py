@@ -82,7 +82,7 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
     advance = problem.real_integrator.step(plant, problem.period)
     after = advance(x, u, exact, calm)
     later = matrix.sym("later", model.input.size)
-    if model.step is not None:
+    if problem.integrator.steps_maps:
         response = _differences(problem, advance, after, (later, exact, calm))
     else:
         response = problem.truth.function(response_names(model), seen=True)(after, u, exact, calm)

@@ -76,7 +76,7 @@ def inner_motion(
 
 def _moved(problem: Problem, places: Sequence[int], draws: np.ndarray, times: np.ndarray) -> list[np.ndarray | None]:
     start = problem.start_state[list(places)]
-    if problem.plant.step is not None:
+    if problem.integrator.steps_maps:
         step = _cycle(problem, list(places))
         return [_motion_of_map(step, problem.period, start, row, times) for row in draws]
     steps = _integrator(problem, list(places), times)

@@ -203,7 +203,7 @@ def _judge_block(plant: Plant) -> Block:
 
     def step(s: Any) -> dict[str, Expression]:
         first, last = (respond(x, s.command, s._exact) for x in (s.state, s._state_after))
-        if plant.step is not None:  # a map has one response over the whole cycle
+        if response_age(plant):  # a map has one response over the whole cycle
             return {"response_error": first - s.desired, "response_force": first - s.desired}
         own = inverse(s.state, s.desired, s.parameters)
         of_model = 0.5 * (s.desired + respond(s._state_after, own, s.parameters))

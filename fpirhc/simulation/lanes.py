@@ -109,7 +109,7 @@ def _first(problem: Problem) -> int:
 
 
 def _why_no_lanes(ready: Simulator, device: str | None) -> str:
-    if ready.problem.foreign is not None:
+    if not ready.problem.equations_known:
         return "a plant outside is run one after the other"
     if ready.problem.cycles <= _first(ready.problem):
         return "no cycle is measured"

@@ -60,7 +60,7 @@ def _with_lag(problem: Problem, mirror: Mirror) -> Problem:
 
 def _behind(problem: Problem, lags: Sequence[float]) -> Problem:
     plant = problem.plant
-    if not any(lags) or plant.step is not None or plant.algebraic is not None:
+    if not any(lags) or problem.integrator.steps_maps or plant.algebraic is not None:
         return problem
     plant = behind_actuators(plant, lags)
     finer = problem.integrator.finer(math.ceil(problem.period / min(t for t in lags if t)))

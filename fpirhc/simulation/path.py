@@ -536,7 +536,7 @@ def disturbance_values(problem: Problem, times: np.ndarray, seed: int) -> np.nda
     ]
     by_name = dict(zip(problem.disturbances, values, strict=True))
     for name, k in disturbance_columns(problem):
-        if k and problem.plant.step is not None:
+        if k and problem.integrator.steps_maps:
             values.append(np.diff(by_name[name], prepend=by_name[name][:1]) / problem.period)
         elif k:
             values.append(problem.disturbances[name].derivative(times, k))

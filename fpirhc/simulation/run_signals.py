@@ -60,7 +60,7 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
     states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
     gain, model = controller.deformation.effective_gain(), controller.plant_model(problem)
     iteration = controller.deformation.iteration
-    if problem.foreign is not None:
+    if not problem.equations_known:
         shown = (
             np.nan
             if problem.response_delay

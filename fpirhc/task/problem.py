@@ -199,6 +199,11 @@ class Problem(Checked):
         return self.reality.foreign if self.reality is not None else None
 
     @property
+    def equations_known(self) -> bool:
+        """Whether what moves has equations, so that it can be run again to answer a question."""
+        return self.reality is None or self.reality.symbolic is not None
+
+    @property
     def moves(self) -> Reality | ExternalPlant:
         """What a run moves: the reality, or the model itself with its exact parameters."""
         return self.reality or self.truth

@@ -66,7 +66,7 @@ def jumps(problem: Problem) -> list[Jump]:
 def reference_free_of_jumps(grid: ReviewGrid) -> Answer:
     """Return whether a state of the reference jumps, where, and what to use instead; a map has differences instead."""
     problem = grid.problem
-    if problem.plant.step is not None:
+    if problem.integrator.steps_maps:
         text = "a map follows differences of the reference over its cycles, which a jump does not hide"
         return Answer(JUMPS, Verdict.YES, text, "", {"jumps": 0.0})
     detected = jumps(problem)

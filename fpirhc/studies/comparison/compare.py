@@ -136,7 +136,7 @@ def compare(
         pictures=task.pictures,
         nulls=nulls,
         time_unit=task.problem.time_unit,
-        steps=task.problem.real_plant.step is not None,
+        steps=task.problem.real_integrator.steps_maps,
         information=(*sentences(task.problem, {e.name: e.information for e in entries if e.information}), *broken),
     )
 

@@ -328,7 +328,7 @@ def _harm(
     sizes, model, counted = scales(problem), ModelAsPlant(problem, seed=seed), weighed(problem, loops[1].controller)
     losses: list[str] = []
     cured: Mapping[str, float] = dict.fromkeys(problem.judged_names, 0.0)
-    if problem.foreign is None:
+    if problem.equations_known:
         plain, adaptive = (_entry(problem, n, one, seed, metrics) for n, one in zip(pair, loops, strict=True))
         yardstick = yardstick_of(problem, seed=seed)
         finding = judge(plain, adaptive, yardstick)

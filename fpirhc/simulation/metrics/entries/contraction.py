@@ -77,7 +77,7 @@ def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
 
 def _differentiable(problem: Problem, run: Run) -> bool:
     """Whether its factors follow from equations."""
-    return _adapts(run) and problem.foreign is None
+    return _adapts(run) and problem.equations_known
 
 
 def _adapts(run: Run) -> bool:
