@@ -1,6 +1,6 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .baselines.check import accept, check_baseline
+from .baselines.check import check_baseline
 from .controllers import rivals
 from .controllers.computed_torque import ComputedTorque, FeedforwardOnly
 from .controllers.receding_horizon import Feedforward, HoldPlan, RecedingHorizon, StopRun
@@ -60,7 +60,7 @@ from .report.html import write_report
 from .review.answer import Answer
 from .review.limits_certificate import certify_limits
 from .review.questions.noise import suggest
-from .review.response_prediction import predict_response, state_margins, tightened
+from .review.response_prediction import predict_response, tightened
 from .review.review import review
 from .sensing import (
     LowPassDifference,
@@ -76,7 +76,6 @@ from .sensing import (
 from .sensing.observers.kalman_filter import KalmanFilter
 from .sensing.observers.model_states import ModelStates
 from .sensing.observers.moving_horizon_states import MovingHorizonStates
-from .simulation.lyapunov_view import lyapunov_view
 from .simulation.machine import RunMonitor
 from .simulation.metrics import Metric, figures, measure
 from .simulation.pictures.base import Quantity
@@ -241,7 +240,6 @@ __all__ = [
     "Uniform",
     "Unknown",
     "VelocityDifference",
-    "accept",
     "certify",
     "certify_limits",
     "check_baseline",
@@ -253,7 +251,6 @@ __all__ = [
     "linear_parameters",
     "load_problem",
     "load_run",
-    "lyapunov_view",
     "measure",
     "operating_limits",
     "outside",
@@ -265,7 +262,6 @@ __all__ = [
     "simulate",
     "simulator",
     "solve",
-    "state_margins",
     "suggest",
     "tightened",
     "tune",

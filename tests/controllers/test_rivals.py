@@ -16,6 +16,7 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
+from fpirhc.simulation.lyapunov_view import lyapunov_view
 from fpirhc.studies.comparison.compare import compare
 
 RATE = 6.0
@@ -303,7 +304,7 @@ VIEWED = (
 def test_surface_stays_within_its_bound():
     """|S| <= max(|S| at the start, sup|h| / rate), exactly; after the transient it is sup|h| / rate; a deformation lowers both."""
     problem = swing()
-    views: list[Any] = [fp.lyapunov_view(problem, c, simulate(problem, c)) for c in VIEWED]
+    views: list[Any] = [lyapunov_view(problem, c, simulate(problem, c)) for c in VIEWED]
     for view in views:
         assert view.largest <= view.bound * (1 + 1e-9) + 1e-12
         assert view.largest > 0.5 * view.ultimate
@@ -313,7 +314,7 @@ def test_surface_stays_within_its_bound():
 def test_bound_holds_before_the_transient_is_over():
     """Measured from early on, |S| begins above its ultimate bound; the sentence says so and does not call it a bound of the run."""
     problem = swing(start={"angle": 0.5}, measure_from=0.2)
-    view: Any = fp.lyapunov_view(problem, VIEWED[2], simulate(problem, VIEWED[2]))
+    view: Any = lyapunov_view(problem, VIEWED[2], simulate(problem, VIEWED[2]))
     assert view.ultimate < view.largest <= view.bound * (1 + 1e-9)
     assert view.text == (
         f"Lyapunov: |S| at most {view.largest:.3g} rad/s; ultimate bound sup|h| / rate = {view.ultimate:.3g} rad/s, to "

@@ -14,7 +14,7 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.review.response_prediction import _reached
+from fpirhc.review.response_prediction import _reached, state_margins
 
 LIMIT = 0.8
 
@@ -75,13 +75,13 @@ def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
 
 def test_with_the_right_model_there_is_no_margin():
     """Nothing deviates without adaptation; plain adaptation takes the drift within a cycle for an error of the model."""
-    margins = fp.state_margins(carriage(1.0, 1.0), plain(), passes=0)
+    margins = state_margins(carriage(1.0, 1.0), plain(), passes=0)
     assert set(margins) == {"q", "q'"}
     assert max(max(m) for m in margins.values()) < 1e-9
 
 
 def test_margins_grow_along_the_horizon_and_with_the_error_of_the_model():
-    near, far = (fp.state_margins(carriage(1.0, m), plain(), passes=0) for m in (1.1, 1.4))
+    near, far = (state_margins(carriage(1.0, m), plain(), passes=0) for m in (1.1, 1.4))
     for name in ("q", "q'"):
         assert np.all(np.diff(near[name]) >= 0)
         assert far[name][-1] > near[name][-1] > 0
@@ -97,7 +97,7 @@ def test_a_limit_that_the_wrong_model_breaks_is_kept_with_margins():
 
 
 def test_margins_for_a_box_of_parameters_are_at_least_those_of_the_plant():
-    own, boxed = (fp.state_margins(carriage(), adaptive(), mismatch=m, passes=0) for m in (None, 20.0))
+    own, boxed = (state_margins(carriage(), adaptive(), mismatch=m, passes=0) for m in (None, 20.0))
     assert boxed["q"][-1] >= own["q"][-1]
 
 
@@ -149,7 +149,7 @@ def test_mistakes_are_named():
         replace(adaptive(), margins={"p": (0.0,) * 20}).check(problem)
     for limits in (replace(problem.limits, soft={"q": 10.0}), replace(problem.limits, prices={"q": 10.0})):
         yielding = replace(problem, limits=limits)
-        assert set(fp.state_margins(yielding, adaptive(), passes=0)) == {"q'"}
+        assert set(state_margins(yielding, adaptive(), passes=0)) == {"q'"}
         with pytest.raises(InvalidProblem, match="margins of 'q': its limit is soft or has a price"):
             replace(adaptive(), margins={"q": (0.01,) * 20}).check(yielding)
 

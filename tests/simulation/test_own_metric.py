@@ -11,6 +11,7 @@ import pytest
 from blessed import LINE
 
 import fpirhc as fp
+from fpirhc.baselines.check import accept
 from fpirhc.cli.main import main
 from fpirhc.simulation.metrics import entries, measuring
 
@@ -86,7 +87,7 @@ def test_scenarios_have_it(task, tmp_path):
 def test_baselines_have_it(task, folder):
     """Blessed, it holds; leaving the band upwards is better where more is better; an unknown name is answered."""
     told: list[tuple[str, int, int]] = []
-    baseline, path = fp.accept(task, "first", compiled=False, working=folder, progress=lambda *one: told.append(one))
+    baseline, path = accept(task, "first", compiled=False, working=folder, progress=lambda *one: told.append(one))
     assert [done for _, done, _ in told] == list(range(told[0][2] + 1)), "from before the first run to the last"
     metrics = baseline.controllers["CTC"].metrics
     assert {"largest_lead.y", "share_inside"} <= set(metrics)
