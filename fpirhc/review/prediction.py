@@ -337,7 +337,10 @@ class NominalRuns:
 
 
 def _quiet(problem: Problem) -> Problem:
-    """The problem of the model without disturbances and noise; the same one for the same problem, so runs share what is built."""
+    """The problem of the model without noise; the same one for the same problem, so that runs share what is built.
+
+    It keeps disturbances, which runs on the model leave out, and so the loops of runs on the plant are those on the model.
+    """
     return _QUIET.of((problem,), (), lambda: _without_noise(problem.of_model))
 
 
@@ -346,4 +349,6 @@ _QUIET: Latest[Problem] = Latest(4)
 
 def _without_noise(problem: Problem) -> Problem:
     sensing = replace(problem.sensing, sensors={}) if problem.sensing.sensors else problem.sensing
-    return replace(problem, disturbances={}, sensing=sensing, signals=as_known(problem.plant, problem.signals))
+    signals = as_known(problem.plant, problem.signals) if problem.signals else problem.signals
+    same = sensing is problem.sensing and signals is problem.signals
+    return problem if same else replace(problem, sensing=sensing, signals=signals)
