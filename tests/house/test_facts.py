@@ -434,11 +434,19 @@ def contracts() -> tuple[type, ...]:
     return tuple(collected)
 
 
+def names_in(path: Path) -> dict[str, Any]:
+    """What a file imports or defines by name, imports inside of functions included."""
+    module = importlib.import_module(".".join(["fpirhc", *path.relative_to(PACKAGE).with_suffix("").parts]))
+    nodes = [n for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.ImportFrom)]
+    inside = [(n.module, a) for n in nodes if n.col_offset and str(n.module).startswith("fpirhc.") for a in n.names]
+    late = {a.asname or a.name: getattr(importlib.import_module(str(source)), a.name) for source, a in inside}
+    return late | vars(module)
+
+
 def named_members(path: Path, used: set[str]) -> set[str]:
     """Names in `used` that a file imports or defines and that are members of a family."""
-    module = importlib.import_module(".".join(["fpirhc", *path.relative_to(PACKAGE).with_suffix("").parts]))
-    families = contracts()
-    values = {name: getattr(module, name, None) for name in used}
+    families, known = contracts(), names_in(path)
+    values = {name: known.get(name) for name in used}
     return {n for n, v in values.items() if inspect.isclass(v) and issubclass(v, families) and v not in families}
 
 
@@ -491,8 +499,7 @@ def test_generic_code_names_no_members():
 
 def _is_foreign(path: Path, name: str) -> bool:
     """Whether a class is a concrete one of another part of the package than the file's."""
-    module = importlib.import_module(".".join(["fpirhc", *path.relative_to(PACKAGE).with_suffix("").parts]))
-    one: type = getattr(module, name)
+    one: type = names_in(path)[name]
     return not inspect.isabstract(one) and one.__module__.split(".")[1] != path.relative_to(PACKAGE).parts[0]
 
 
