@@ -15,6 +15,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import BRIDGED
+from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.c_text import portable
@@ -30,7 +31,6 @@ from fpirhc.task.problem import Problem
 _RAW = "fpirhc_native"  # name of the generated function, before it has its own
 _INSIDE = re.compile(r"if \((casadi_f\d+)\(arg1, res1, iw, w, 0\)\) return 1;")  # the call of scalar code
 _DRIVER = re.compile(r"\bfpirhc_(\w+_driver)\b")
-_SAMPLE = ("time", "state", "output", "realised", "measured", "taken")
 _C_WORDS = frozenset(
     re.findall(
         r"\w+",
@@ -71,7 +71,8 @@ class Device:
     @cached_property
     def inputs(self) -> Layout:
         """What a step is given: the time and the sample."""
-        return self._read(lambda name: name in _SAMPLE)
+        stays = {*self.data.names, *self.settings.names}
+        return self._read(lambda name: name not in stays)
 
     @cached_property
     def settings(self) -> Layout:
@@ -81,7 +82,8 @@ class Device:
     @cached_property
     def data(self) -> Layout:
         """What stays until somebody changes it: parameters and set-points."""
-        return self._read(lambda name: name not in _SAMPLE and not name.startswith(PREFIX))
+        stays = {"parameters", *(signal.name for signal in given_signals(self.problem))}
+        return self._read(lambda name: name in stays)
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:

@@ -35,6 +35,7 @@ from fpirhc.symbolic.dataflow import (
 )
 from fpirhc.symbolic.placement import Place, Placement
 
+_VARIABLE, _ASSIGNED = re.compile(r"\bv\d+\b"), re.compile(r"^ *(v\d+) = [^\n]*\n", re.MULTILINE)
 HEAD = "static int {}(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {{\n"
 
 
@@ -103,7 +104,7 @@ class _Writer:
         self._write(self._region, "  ")
         for k, value in enumerate(self._region.outputs):
             self._copy(value, Node(length(value), f"r{k}"), "  ")
-        body = "".join(self._lines)
+        body = _read_later("".join(self._lines))
         used = sorted(set(re.findall(r"\b[arvp]\d+\b", body)), key=lambda name: (name[0], int(name[1:])))
         heads = [_DECLARED[name[0]].format(name, name[1:]) for name in used] + ["casadi_int i"] * ("(i=0" in body)
         return "".join([*(f"  {head};\n" for head in heads), body, "  return 0;\n}\n\n"]), self._placed.room
@@ -216,6 +217,16 @@ class _Writer:
             place = _entry(target, at, "i")
             self._loop(size, place, f"either(first, {place}, {_entry(node, begin, 'i')})", indent)
             at += size
+
+
+def _read_later(body: str) -> str:
+    """The lines without variables that nothing reads: scalar code may leave an argument alone."""
+    while True:
+        named = Counter(_VARIABLE.findall(body))
+        kept = _ASSIGNED.sub(lambda line, named=named: line[0] if named[line[1]] > 1 else "", body)  # type: ignore[misc]
+        if kept == body:
+            return body
+        body = kept
 
 
 def _expression(step: Operation, at: int, index: str) -> str:

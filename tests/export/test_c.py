@@ -33,6 +33,7 @@ CASES = {
     "state limits": ("two_mass", "RHC+FPI"),
     "outputs": ("anaesthesia", "RHC+FPI"),
     "map": ("fishery", "RHC+FPI"),
+    "sensors": ("noisy_motor", "RHC+FPI"),
 }
 LIVE = ["deformation.gain", "limits.inputs.Q1"]
 

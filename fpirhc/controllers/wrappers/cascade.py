@@ -440,7 +440,11 @@ class Cascade(Controller):
         lower, upper = (ca.DM([self.units.get(n, _SAME).bounds[end] for n in names]) for end in (0, 1))
         # The plain form begins at the target in force from its first cycle on, and moves it once samples count.
         held = tuple(map(float, begun - first)) if pairing is not None and pairing.plain else ()
-        last = Signal("shift_last", names, start=held), Signal("target_last", names, start=start), scalar("shift_cycles")
+        last = (
+            Signal("shift_last", names, start=held),
+            Signal("target_last", names, start=start),
+            scalar("shift_cycles"),
+        )
         response, steepness = plant.equations.controlled_response, self._steepness(plant)
         memory = Layout((*last, *(pairing.memory(problem, first, begun - first) if pairing else ()))) + own
 
