@@ -221,6 +221,22 @@ def test_a_loop_with_an_emulated_processor_is_the_run(tmp_path):
     np.testing.assert_allclose(other["command"], run["command"], rtol=1e-10, atol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("qemu-system-arm") is None, reason="no QEMU (package qemu-system-arm)")
+@needs_compiler
+def test_a_loop_in_qemu_has_the_bits_of_this_machine(tmp_path):
+    """500 cycles of plans with the plant in Python: the commands of a Cortex-M7 and of C here are the same."""
+    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[cortex]'")
+    device = exported("plan", tmp_path / "m", "cortex-m")
+    exported("plan", tmp_path / "c", "c")
+    problem = replace(device.problem, duration=500 * device.problem.period, measure_from=0.0)
+    board = "qemu-system-arm -M mps2-an500 -display none -serial none -monitor none -semihosting-config enable=on,target=native"
+    emulator = [*board.split(), "-kernel", str(tmp_path / "m" / "arm_m7.elf")]
+    there, here = (fp.simulate(problem, Processor(one), seed=0) for one in (emulator, [program(tmp_path / "c")]))
+    np.testing.assert_array_equal(there["command"], here["command"])
+    assert len(there.time) == 500
+
+
 def test_what_is_no_image_is_named(tmp_path):
     file = tmp_path / "no.elf"
     file.write_bytes(b"\x7fELF\x02\x01" + bytes(80))
