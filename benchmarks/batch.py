@@ -182,11 +182,15 @@ def by_others() -> list[list[str]]:
     return [[name, f"{micro[name]:.3f}", f"{micro[name] / own:.1f}", f"{apart[name]:.1g}"] for name in ways] + left_out
 
 
+def shortened(ready: Simulator, cycles: int) -> Simulator:
+    """The loop of so many cycles."""
+    problem, span = ready.problem, cycles * ready.problem.period
+    return fp.simulator(replace(problem, duration=span, measure_from=0.2 * span), ready.controller)
+
+
 def many(name: str, ready: Simulator, count: int, cycles: int) -> list[str]:
     """Processor time of so many plants, and what two cores need where nothing else runs."""
-    problem = ready.problem
-    short = replace(problem, duration=cycles * problem.period, measure_from=0.2 * cycles * problem.period)
-    ready = fp.simulator(short, ready.controller)
+    ready = shortened(ready, cycles)
     exact, begun = plants(ready, count // 10), time.process_time()
     for _ in range(10):
         run_many(ready, exact)
@@ -196,7 +200,7 @@ def many(name: str, ready: Simulator, count: int, cycles: int) -> list[str]:
 
 def on_device(name: str) -> str:
     """Microseconds per cycle and plant of a device by the clock on the wall, and times those of the lanes of all cores."""
-    ready = fp.simulator(by_hand.TASK.problem, by_hand.CONTROLLER)
+    ready = shortened(fp.simulator(by_hand.TASK.problem, by_hand.CONTROLLER), 500)
     exact, walls = plants(ready, 65_536), {}
     for where in (None, name):
         run_many(ready, exact[:8], device=where)
