@@ -25,6 +25,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.dataflow import SIDE_BY_SIDE, Callee
 from fpirhc.symbolic.lanes import lanes_library, written_for_devices, written_in_lanes
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.task.problem import Problem
 
@@ -80,7 +81,7 @@ def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str 
     library: _Library | None = None
     if not why:
         try:
-            library = _built(ready) if device is None else _on_device(ready, device)
+            library = _LIBRARIES.of((ready,), (device,), lambda: _built(ready, device))
         except (CompileError, NoCode) as error:
             why = str(error)
     judged, problem = ready.loop.trace["error"].elements, ready.problem
@@ -166,28 +167,24 @@ def _starts(ready: Simulator, exact: np.ndarray) -> np.ndarray:
     return np.array([start_memory(ready.loop, ready.problem.with_exact(one), ready.controller) for one in exact])
 
 
-def _built(ready: Simulator) -> _Library:
+def _built(ready: Simulator, device: str | None) -> _Library:
     """Compile the loop.
 
     Raises:
         CompileError: the compiler fails.
-        NoCode: a part of the loop is not written for lanes.
+        InvalidName, NotInstalled: no such device.
+        NoCode: a part of the loop is not written for lanes, or for devices.
     """
+    if device is not None:
+        text, step = written_for_devices(ready.loop.function)
+        return _Library(loaded_kernel(text + _around(ready.problem, ready.loop, step), device), 1, _ITEMS, 1)
     library, lanes = lanes_library(lanes_sources(ready.problem, ready.loop))
     run = library.run_lanes
     run.argtypes, run.restype = [ctypes.c_long] * 3 + [np.ctypeslib.ndpointer(float)] * 3, ctypes.c_int
     return _Library(run, lanes, _GROUPS, os.cpu_count() or 1)
 
 
-def _on_device(ready: Simulator, device: str) -> _Library:
-    """Build the loop for an OpenCL device.
-
-    Raises:
-        InvalidName, NotInstalled: no such device.
-        NoCode: a part of the loop is not written for devices.
-    """
-    text, step = written_for_devices(ready.loop.function)
-    return _Library(loaded_kernel(text + _around(ready.problem, ready.loop, step), device), 1, _ITEMS, 1)
+_LIBRARIES: Latest[_Library] = Latest(4)
 
 
 def lanes_sources(problem: Problem, loop: Composite) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -18,9 +19,11 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.simulation.lanes import run_many
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.operating_limits import FAILS, Judge, Point
+from fpirhc.studies.scenarios.bench import ranges
 from fpirhc.studies.scenarios.draws import SEARCHING
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number
@@ -28,7 +31,8 @@ from fpirhc.summary import Column, Table, in_percent, line, number
 RISK, CONFIDENCE = 0.05, 0.999  # where nothing else is said
 _BOXES = 99  # of 1 % to 99 %
 _FIRST = 8  # percent: the first box that is tried
-_GENERATION = 20  # plants of a search side by side, at most
+_GENERATION = 20  # plants of a generation, at most
+_SIDE_BY_SIDE = 64  # plants that run before it is asked whether one failed
 
 
 @dataclass(frozen=True)
@@ -243,6 +247,10 @@ class _Plants:
 
     def worst_drawn(self, percent: int) -> Point:
         """Return the first drawn plant of the box that fails, or the one with the largest error; of 0 % the problem's own."""
+        if percent and self._alike:
+            chosen = self._worst_of_lanes(percent)
+            if chosen is not None:
+                return chosen
         worst = Point(percent, 0.0, "")
         for k, (shares, noise) in enumerate(zip(self._shares, self._noise, strict=True)):
             one = self._point(percent, shares, noise)
@@ -253,6 +261,40 @@ class _Plants:
             if percent == 0 and not self._problem.disturbances and self._problem.sensing.ideal:
                 break  # all of them are the same
         return worst
+
+    @cached_property
+    def _alike(self) -> bool:
+        """Whether plants differ in their parameters alone, and fail by their errors alone, so that they may run side by side."""
+        problem, steady = self._problem, not self._problem.disturbances and self._problem.sensing.ideal
+        return steady and self._compiled and problem.reality is None and not problem.limits.states
+
+    def _worst_of_lanes(self, percent: int) -> Point | None:
+        """The same by plants side by side; None where they cannot run so, or rounding decides which one fails first."""
+        sizes = ranges(self._problem)
+        for begin in range(0, len(self._shares), _SIDE_BY_SIDE):
+            places = range(begin, min(begin + _SIDE_BY_SIDE, len(self._shares)))
+            exact = np.array([self._exact(percent, self._shares[k]) for k in places])
+            try:
+                for one in exact:
+                    self._problem.with_exact(one)
+                many = run_many(self._loop, exact)
+            except FpirhcError:  # the loop one after the other names the plant
+                return None
+            if not many.lanes or many.rms_error.keys() != sizes.keys():
+                self.__dict__["_alike"] = False
+                return None
+            shares = np.array([many.rms_error[name] / size for name, size in sizes.items()])
+            errors = np.sqrt(np.mean(shares**2, axis=0))
+            errors[list(many.stops)] = math.inf
+            self._errors[places] = errors
+            failing = np.flatnonzero(~(errors <= self._judge.fails))
+            if failing.size:
+                k = begin + int(failing[0])
+                first = self._point(percent, self._shares[k], self._noise[k])
+                return first if first.why else None
+        worst = int(np.argmax(self._errors))
+        largest = self._point(percent, self._shares[worst], self._noise[worst])
+        return None if largest.why else largest
 
     def search(self, percent: int) -> tuple[float, Counterexample | None]:
         """Return the largest error that a search in the box meets, and a plant that fails, if it meets one."""

@@ -14,7 +14,9 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.operating_limits import Judge
 from fpirhc.studies.robust import robust_boxes, wanted_draws
+from fpirhc.symbolic.native import find_compiler
 
 RATE, PERIOD = 60.0, 0.02  # 1/s, s
 EDGE = 2 / (RATE * PERIOD)  # e+ = (1 - T b rate) e is stable below this gain b of the plant, with a model of gain 1
@@ -58,6 +60,27 @@ def test_a_search_of_a_box_without_draws_in_its_corner_finds_the_plant_that_fail
     assert box.percent > 100 * (EDGE - 1)
     assert box.counterexample is not None
     assert box.counterexample.from_percent == math.ceil(100 * (EDGE - 1))
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+def test_plants_side_by_side_have_the_box_of_plants_one_after_the_other(monkeypatch):
+    """What a sentence says is run by itself then, less than the draws of one box, and the search, which is as long as one."""
+    asked: list[float] = []
+    point = Judge.point
+
+    def noted(self, value, *run):
+        asked.append(value)
+        return point(self, value, *run)
+
+    monkeypatch.setattr(Judge, "point", noted)
+    found = robust_boxes(pump())
+    assert len(asked) < 2 * found.draws
+    alone = robust_boxes(pump(), compiled=False)
+    assert len(asked) > 4 * found.draws
+    for one, other in zip(found.boxes, alone.boxes, strict=True):
+        assert (one.percent, one.fails_at, one.why) == (other.percent, other.fails_at, other.why)
+        assert one.counterexample == other.counterexample
+        assert one.worst_drawn == pytest.approx(other.worst_drawn, rel=1e-12)
 
 
 @pytest.mark.parametrize(("risk", "confidence"), [(0.05, 0.999), (0.01, 0.9999), (0.3, 0.5)])
