@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.signal import lsim
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
@@ -25,8 +26,17 @@ KE0, APPROACH, CYCLE = 0.309, 1.5, 1 / 12
 
 
 @cache
-def task() -> Task:
-    return fp.load_problem(NAME)
+def task(name: str = NAME) -> Task:
+    return fp.load_problem(name)
+
+
+def described(of: Task, sets: int) -> dict[str, np.ndarray]:
+    """The rows of the description's table of a population, each by set."""
+    lines = of.description.splitlines()
+    first = next(k for k, line in enumerate(lines) if line.strip().startswith("worst, lowest, mean"))
+    rows = ([cell.strip() for cell in line.split("  ") if cell.strip()] for line in lines[first + 1 :])
+    found = [row for _, row in zip(of.controllers, rows, strict=False)]
+    return {name: np.array(numbers, dtype=float).reshape(sets, -1) for name, *numbers in found}
 
 
 @cache
@@ -131,9 +141,11 @@ def test_a_loop_of_its_own_has_the_same_run(name, controller, law):
     np.testing.assert_allclose(run["plant_state.bis"], own_loop(name, law(), 300), atol=2e-4)
 
 
-def figures(names: list[str], controllers: list[str], folder: Path) -> dict[str, dict[str, tuple[float, float, float]]]:
-    """By controller and set: the worst share of the time in the range in %, the lowest bis, and the mean share."""
-    study = fp.compare_scenarios(task(), cases=names, controllers=controllers, seed=0, folder=folder)
+def figures(
+    names: list[str], controllers: list[str], folder: Path, of: str = NAME
+) -> dict[str, dict[str, tuple[float, ...]]]:
+    """By controller and set: the worst share of the time in the range in %, the lowest bis, the mean share, and the travel."""
+    study = fp.compare_scenarios(task(of), cases=names, controllers=controllers, seed=0, folder=folder)
     cases, found = task().cases, {}
     assert cases is not None
     for controller, records in study.records.items():
@@ -141,7 +153,8 @@ def figures(names: list[str], controllers: list[str], folder: Path) -> dict[str,
         for group in dict.fromkeys(cases.group(r["name"]) for r in records):
             own = [r["metrics"] for r in records if cases.group(r["name"]) == group]
             shares, lowest = ([m[what][""] for m in own] for what in ("in_band", "lowest"))
-            found[controller][group] = (100 * min(shares), min(lowest), 100 * float(np.mean(shares)))
+            travel = [float(np.mean([m["travel"][""] for m in own]))] if "travel" in own[0] else []
+            found[controller][group] = (100 * min(shares), min(lowest), 100 * float(np.mean(shares)), *travel)
     return found
 
 
@@ -158,14 +171,36 @@ def test_the_patient_who_is_hardest_to_reach_is_reached(tmp_path):
 def test_nobody_fares_worse_than_the_description_says(tmp_path):
     """All 101, as in its table; on the half that was not tuned nobody is below 37, nor for less than 90 % in the range."""
     found = figures(["all"], list(task().controllers), tmp_path)
-    lines = task().description.splitlines()
-    first = next(k for k, line in enumerate(lines) if line.strip().startswith("worst, lowest, mean"))
-    for line in lines[first + 1 : first + 1 + len(found)]:
-        name, *numbers = (cell.strip() for cell in line.split("  ") if cell.strip())
-        table = np.array(numbers, dtype=float).reshape(4, 3)
+    for name, table in described(task(), len(SETS)).items():
         np.testing.assert_allclose(table, [found[name][s] for s in SETS], atol=0.6, err_msg=name)
     worst, lowest, mean = found["cascade in mg/l"]["A unseen"]
     assert (worst >= 90, lowest >= 37, mean >= 97) == (True, True, True)
+
+
+def test_the_monitor_is_its_transfer_function():
+    """Independent: scipy's response of the continuous system to the held input, one cycle of delay before it."""
+    of = task("anaesthesia_monitor")
+    problem = replace(of.problem, sensing=fp.Sensing(), duration=11.0)
+    run = fp.simulate(problem, of.controllers["pump alone"], seed=0, compiled=False)
+    held = np.concatenate([[92.0], run["plant_state.bis"]])[:-1]
+    system = ([-0.049, 0.066, 0.976, 0.056], [1.0, 2.27, 6.353, 1.487, 0.056])
+    fine = np.arange(0, 60 * 11 + 1e-9, 0.05)
+    changes = np.concatenate([[0.0], held - 92.0])[np.minimum((fine / 5 + 1 - 1e-9).astype(int), len(held))]
+    _, shown, _ = lsim(system, changes, fine, interp=False)
+    index = run["reality_state.index"]
+    np.testing.assert_allclose(index, 92.0 + shown[::100][: len(index)], atol=2e-2)
+
+
+@pytest.mark.slow
+def test_filters_of_the_index_are_as_described(tmp_path):
+    """Two filters that move the target as much are as good as each other."""
+    of = task("anaesthesia_monitor")
+    found = figures(["A unseen"], list(of.controllers), tmp_path, of.name)
+    for name, table in described(of, 1).items():
+        np.testing.assert_allclose(table, [found[name]["A unseen"]], atol=0.6, err_msg=name)
+    low, haar = (found[f"cascade, {name}"]["A unseen"] for name in ("low-pass", "Haar"))
+    assert haar[3] == pytest.approx(low[3], rel=0.1)
+    assert np.allclose(haar[:3], low[:3], atol=0.6)
 
 
 GOOD = Path(str(find_problem(NAME))).with_suffix(".csv").read_text("utf-8").splitlines()
