@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
+import sys
+import zipfile
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -222,3 +225,31 @@ def test_a_page_runs_its_own_scripts_and_webassembly_alone(short, monkeypatch):
     assert "<title>&lt;b&gt;&amp;: lab</title>" in text
     assert text.count("</script>") == 3
     assert "@" not in resources.files("fpirhc.export.lab").joinpath("lab.js").read_text()
+
+
+@pytest.mark.slow
+def test_a_wheel_has_all_that_the_package_reads(tmp_path):
+    """Every file of the package and nothing else beside the problems; a lab is written with the wheel's files alone."""
+    builders = pytest.importorskip(
+        "hatchling.builders.wheel", reason="hatchling is not installed: pip install hatchling"
+    )
+    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
+    root = Path(fp.__file__).parents[1]
+    listed = subprocess.run(["git", "ls-files", "fpirhc"], cwd=root, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("the package is in no repository")
+    wheel = next(builders.WheelBuilder(str(root)).build(directory=str(tmp_path)))
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if name.startswith("fpirhc/")}
+        archive.extractall(tmp_path / "installed")
+    assert {name for name in names if not name.startswith("fpirhc/_problems/")} == {*listed.stdout.split()}
+    words = ["-m", "fpirhc", "lab", "crane_slots", "--controllers", "slots", "--out", str(tmp_path / "lab.html")]
+    away = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
+    done = subprocess.run([sys.executable, *words], cwd=tmp_path, env=away, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    text = (tmp_path / "lab.html").read_text(encoding="utf-8")
+    for part in ("lab/lab.js", "lab/lab.css"):
+        assert resources.files("fpirhc.export").joinpath(part).read_text(encoding="utf-8").strip() in text
+    assert (
+        resources.files("fpirhc.simulation.pictures").joinpath("planar.css").read_text(encoding="utf-8").strip() in text
+    )
