@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import base_and_order, counterparts, steps_per_cycle
+from fpirhc.adapters.names import adapter, base_and_order, counterparts, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -21,6 +21,7 @@ from fpirhc.task.external_plant import ExternalPlant, quantities
 _STEP, _PULL, _COORDINATES = 1e-3, 2.0, ("x", "y", "heading")  # s; 1/s of the speed's error; in the order of `_moved`
 
 
+@adapter
 def commonroad_body(
     kind: str, model: Plant, *, period: float, speed: float, vehicle: int = 2, names: Mapping[str, str] | None = None
 ) -> ExternalPlant:

@@ -14,6 +14,7 @@ from typing import Any
 import control
 import numpy as np
 
+from fpirhc.adapters.names import adapter
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import Mistakes
 from fpirhc.plant.motion import Output
@@ -26,6 +27,7 @@ from fpirhc.task.problem import Problem
 Names = Mapping[str, str]
 
 
+@adapter
 def plant_of(
     system: Any,
     exact: Any = None,

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.adapters.names import adapter, finite_numbers
 from fpirhc.errors import package
 from fpirhc.simulation.held_input import HELD_INPUT, HeldInput
 from fpirhc.simulation.loop import close_loop, start_memory
@@ -22,6 +23,7 @@ from fpirhc.task.problem import Problem
 Reward = Callable[[Mapping[str, np.ndarray]], float]
 
 
+@adapter
 def as_env(problem: Problem, *, reward: Reward | None = None, setpoints: Setpoints | None = None) -> Any:
     """Return a problem as a Gymnasium environment.
 
@@ -61,7 +63,7 @@ def as_env(problem: Problem, *, reward: Reward | None = None, setpoints: Setpoin
 
         def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, np.ndarray]]:
             """Send the action, and measure at the end of the cycle."""
-            gone = play.step(np.asarray(action, dtype=float))
+            gone = play.step(finite_numbers("step", action, problem.plant.inputs))
             return play.observation, play.reward, gone, play.cycle >= problem.cycles, play.signals
 
     return Environment()

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import counterparts
+from fpirhc.adapters.names import adapter, counterparts
 from fpirhc.errors import InvalidProblem, Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
 
+@adapter
 def fmu_body(
     path: str | Path,
     model: Plant,

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.adapters.names import adapter
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -22,6 +23,7 @@ from fpirhc.task.external_plant import ExternalPlant, quantities
 Read = int | Callable[[Any], float]
 
 
+@adapter
 def gymnasium_body(env: Any, model: Plant, *, measures: Mapping[str, Read]) -> ExternalPlant:
     """Return an environment as a reality.
 

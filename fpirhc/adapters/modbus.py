@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.adapters.names import adapter
 from fpirhc.adapters.real_time import RealTime, Setup, device
 from fpirhc.errors import InvalidProblem, package
 from fpirhc.plant.plant import Plant
@@ -34,6 +35,7 @@ class Register:
     readonly: bool = False
 
 
+@adapter
 def modbus_body(
     host: str,
     model: Plant,

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import base_and_order, counterparts, steps_per_cycle
+from fpirhc.adapters.names import adapter, base_and_order, counterparts, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -22,6 +22,7 @@ _Values = Mapping[str, float]
 _Places = Mapping[str, tuple[int, int]]
 
 
+@adapter
 def mujoco_body(
     mjcf: str | Path,
     model: Plant,

@@ -1,10 +1,58 @@
-"""What the adapters share: the names of one world in the other."""
+"""What the adapters share: the names of one world in the other, and errors that say whose they are."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
-from fpirhc.errors import InvalidProblem, Mistakes
+import numpy as np
+
+from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
+from fpirhc.fields.checked import checked_call
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def adapter(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function with a check of its arguments, and with what its package raises as an error that names the function.
+
+    Raises:
+        InvalidProblem: whatever else the package raises about a file or a model, in its own words.
+    """
+    checked = checked_call(function)
+
+    @wraps(function)
+    def adapted(*arguments: P.args, **named: P.kwargs) -> R:
+        try:
+            return checked(*arguments, **named)
+        except FpirhcError:
+            raise
+        except OSError as error:
+            words = f"'{error.filename}' cannot be read: {error.strerror}" if error.filename else str(error)
+            raise InvalidProblem(f"{function.__name__}: {words}") from error
+        except Exception as error:
+            words = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise InvalidProblem(f"{function.__name__}: {words}") from error
+
+    return adapted
+
+
+def finite_numbers(where: str, given: object, names: Iterable[str]) -> np.ndarray:
+    """Return what is given as an array with one finite number for each name.
+
+    Raises:
+        InvalidValue: it has other ones, or none.
+    """
+    wanted = tuple(names)
+    try:
+        numbers = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (len(wanted),) or not np.isfinite(numbers).all():
+        raise InvalidValue(f"{where}({given!r}): expected {len(wanted)} finite numbers: {', '.join(wanted)}")
+    return numbers
 
 
 def counterparts(

@@ -14,12 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.adapters.names import adapter
 from fpirhc.adapters.real_time import RealTime, Setup, device
 from fpirhc.errors import InvalidProblem, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
 
+@adapter
 def opcua_body(
     address: str,
     model: Plant,

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.adapters.names import adapter
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -23,6 +24,7 @@ _State = dict[str, np.ndarray]
 _SENT = ("thrust_x", "thrust_y", "thrust_z")
 
 
+@adapter
 def rotorpy_body(
     model: Plant,
     *,

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.adapters.names import adapter
 from fpirhc.adapters.real_time import RealTime
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
@@ -23,6 +24,7 @@ from fpirhc.task.external_plant import ExternalPlant
 _SENSORS, _HEATERS = ("T1", "T2"), ("Q1", "Q2")
 
 
+@adapter
 def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) -> ExternalPlant:
     """Return the lab as a reality.
 

@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 import casadi as ca
 import numpy as np
 
+from fpirhc.adapters.names import adapter
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.symbolic.layout import Expression, Named
@@ -23,6 +24,7 @@ _Values = Named | Mapping[str, Expression] | Mapping[str, float]
 _MOVING, _GRAVITY = ("revolute", "continuous", "prismatic"), 9.81  # m/s^2
 
 
+@adapter
 def arm(urdf: str | Path, *, exact: Mapping[str, float] | None = None) -> Plant:
     """Return the plant M(q) q'' + h(q, q') = torques - damping q'.
 
