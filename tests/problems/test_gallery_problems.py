@@ -18,6 +18,7 @@ from scipy.optimize import brentq, fsolve
 
 import fpirhc as fp
 from fpirhc.errors import NotContractive
+from fpirhc.review.questions.reality import LOOP
 from fpirhc.review.questions.right_model import FORM
 
 SAFE = "RHC+FPI, model-referenced"
@@ -459,3 +460,14 @@ def test_the_house_loses_what_it_is_given():
     given = run["command.heat"][:-1].sum() + (gains[:-1] + gains[1:] - lost[:-1] - lost[1:]).sum() / 2
     held = p["air"] * (room[-1] - room[0]) + p["mass"] * (wall[-1] - wall[0])
     assert held == pytest.approx(problem.period * given, abs=0.01 * problem.period * run["command.heat"].sum())
+
+
+def test_a_review_of_whole_portions_is_what_runs_show():
+    """A rounded dose has no slope, and its linear loop is that of the mouse alone, which grows: runs of both forms decide."""
+    one = task("tumour_portions")
+    both = {name: one.controllers[name] for name in (SAFE, "RHC+FPI")}
+    for name, answers in fp.review(one.problem, both, mismatch=0.0, seed=0).controllers.items():
+        [answer] = [a for a in answers if a.question == LOOP]
+        assert answer.verdict.value == ("yes" if name == SAFE else "no")
+        assert "rounds or switches dose" in answer.evidence
+        assert f"{rms('tumour_portions', name):.3g} ln(mm^3) with it" in answer.evidence

@@ -77,6 +77,15 @@ def test_a_neutral_mode_counts_where_an_error_shows_it():
     assert diagonal(1.0, state=np.eye(2), errors=np.eye(2)).radius == pytest.approx(1.0)
 
 
+def test_a_double_neutral_mode_counts_as_single_ones_do():
+    """Time that is spent in a queue that stays, z+ = [[1, 1], [0, 1]] z: the poles split by the root of rounding, 1e-6."""
+    drift = np.array([[0.5, 0.0, 0.0], [0.0, 1.0, 1.0], [0.0, 2e-12, 1.0]])
+    for shown, radius in ((0, 0.5), (1, 1 + np.sqrt(2e-12))):
+        cycle = LinearCycle(drift, np.ones((3, 1)), np.eye(3)[:1], np.eye(3))
+        loop = LinearLoop((cycle,), np.eye(3)[[shown]], np.eye(3), 0.1)
+        assert loop.radius == pytest.approx(radius, rel=1e-9)
+
+
 def diagonal(pole: float, *, state: np.ndarray, errors: np.ndarray) -> LinearLoop:
     """A loop with the poles 0.5, which the command shows, and another one."""
     cycle = LinearCycle(np.diag([0.5, pole]), np.ones((2, 1)), np.array([[1.0, 0.0]]), state)

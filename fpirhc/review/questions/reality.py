@@ -24,6 +24,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Points, thinned, usable
+from fpirhc.review.prediction import TRIED
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.speed import law_of
 from fpirhc.sensing.base import response_names
@@ -95,14 +96,28 @@ def real_loops(grid: ReviewGrid, controller: Controller) -> list[LinearLoop]:
     """Return linear loops of the real pair at some points of the reference.
 
     Raises:
-        NotSupported: no linear loop; a controller whose model is the reality.
+        NotSupported: no linear loop; a controller whose model is the reality; a reality that rounds or switches an input.
         FpirhcError: every error that the controller raises about the problem.
     """
     assert grid.real is not None
     if controller.plant_model(grid.real).plant is not grid.problem.plant:
         raise NotSupported("its model is the reality")
+    if deaf := _deaf(grid.real):
+        raise NotSupported(
+            f"the reality rounds or switches {', '.join(deaf)}, so that no small change of it moves anything"
+        )
     points = Points(grid, controller, grid.real)
     return [points.at(k) for k in thinned(usable(grid), _POINTS)]
+
+
+def _deaf(problem: Problem) -> list[str]:
+    """Inputs of which no small change moves the reality at its start: a rounded or a switched one has a slope of zero."""
+    plant = problem.truth.plant
+    x, u, p = plant.symbols()
+    moved = ca.vertcat(plant.equations.rate(x, u, p), plant.equations.response(x, u, p))
+    slopes = ca.Function("fpirhc_deaf", [x, u, p], [ca.densify(ca.jacobian(moved, u))])
+    sizes = np.abs(slopes(problem.real_start, problem.inputs_before, plant.exact).full()).max(axis=0)
+    return [name for name, size in zip(plant.inputs, sizes, strict=True) if size == 0]
 
 
 def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray, iteration: Iteration) -> Extra:
@@ -248,7 +263,7 @@ def real_pair_converges(case: Case) -> Answer | None:
         adapted = max(one.radius for one in real_loops(case.grid, case.controller))
         bare = max(one.radius for one in real_loops(case.grid, without_deformation(case.controller)))
     except (FpirhcError, np.linalg.LinAlgError) as error:
-        return Answer(LOOP, Verdict.UNKNOWN, f"no linear loop of the real pair: {error}")
+        return _by_run(case, f"no linear loop of the real pair: {error}")
     text = f"the slowest or fastest growing mode is multiplied by {adapted:.6g} per cycle, without adaptation by {bare:.6g}"
     numbers = {"radius": adapted, "bare_radius": bare}
     if adapted < 1:
@@ -259,6 +274,19 @@ def real_pair_converges(case: Case) -> Answer | None:
     if bare >= 1:
         change = "Lower the rate of the tracking law: the loop does not converge without adaptation either."
     return Answer(LOOP, Verdict.UNKNOWN if adapted < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
+
+
+def _by_run(case: Case, reason: str) -> Answer:
+    """The answer where there is no linear loop: a run with adaptation and one without."""
+    trial = case.trial(case.controller.deformation)
+    pair = None if isinstance(trial, str) else trial[0]
+    if pair is None:
+        return Answer(LOOP, Verdict.UNKNOWN, reason)
+    text = f"{reason}; in a run of at most {TRIED} cycles {pair.sentence}"
+    if pair.lower:
+        return Answer(LOOP, Verdict.YES, text)
+    change = "Lower the gain, use another form, or leave the deformation out."
+    return Answer(LOOP, Verdict.NO if pair.fails else Verdict.UNKNOWN, text, change if pair.fails else "")
 
 
 def plain_pair_converges(case: Case) -> Answer | None:

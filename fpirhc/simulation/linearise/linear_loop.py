@@ -70,17 +70,20 @@ class LinearLoop:
 
         The first live in the controller's memory alone, such as a covariance that forgets. A neutral mode, |pole| = 1, neither
         decays nor grows; where E V = 0 for its eigenvector V, it is the amount of a drug that has left the body, or the heat of a
-        jacket whose change alone is weighed.
+        jacket whose change alone is weighed. A double one, such as the time that cars spend in a queue that stays, splits by the
+        square root of rounding, so the mean of poles that lie together is what counts.
         """
         count = len(self.cycles)
-        lasting = np.abs(self.poles) > 1 - NEUTRAL * count
+        near = [np.abs(self.poles - pole) < 10 * NEUTRAL * count for pole in self.poles]
+        means = np.array([abs(self.poles[one].mean()) for one in near])
+        lasting = means > 1 - NEUTRAL * count
         if not len(self.errors) or not lasting.any():
             return np.zeros(len(self.poles), dtype=bool)
-        neutral = lasting & (np.abs(self.poles) < 1 + NEUTRAL * count)
         values, vectors = np.linalg.eig(self.dynamics)  # z is in scales already
         sizes = np.abs(vectors).max(axis=0)
         by_error, by_any = (_seen(rows, vectors) / sizes for rows in (self.errors, self._everything))
         near = [np.abs(values - pole) < 10 * NEUTRAL * count for pole in self.poles]
+        neutral = lasting & (means < 1 + NEUTRAL * count)
         no_error, nothing = (
             np.array([share[one].max(initial=0.0) < _SHOWN for one in near]) for share in (by_error, by_any)
         )
