@@ -84,6 +84,24 @@ def test_a_replay_with_faults_is_the_stepper_bit_by_bit(name, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.skipif(shutil.which("nm") is None, reason="no nm")
+@pytest.mark.parametrize("name", ["torque", "state limits"])
+def test_a_controller_has_no_heap_no_files_and_no_globals(name, tmp_path):
+    """Of other files it calls functions of numbers and of memory alone, and it writes into nothing but its struct."""
+    exported(name, tmp_path, live=("deformation.gain",), cycles=1)
+    own = [str(path) for path in sorted(tmp_path.glob("arm*.c"))]
+    subprocess.run([str(find_compiler()), *STRICT, "-O2", "-c", *own], cwd=tmp_path, check=True)
+    said = subprocess.run(
+        ["nm", *(f"{Path(one).stem}.o" for one in own)], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    symbols = [line.split()[-2:] for line in said.stdout.splitlines() if line and not line.endswith(":")]
+    outside = {symbol for kind, symbol in symbols if kind == "U" and not symbol.startswith("arm_")}
+    numbers = "exp log pow sin cos sincos tan asin acos atan tanh atanh sqrt fmin fmax floor ceil fmod lrint"
+    assert outside <= {*numbers.split(), "memcpy", "memset", "memmove"}
+    assert not [symbol for kind, symbol in symbols if kind in "DdBbC"]
+
+
+@needs_compiler
 def test_a_replay_tells_what_differs(tmp_path):
     """The comparison can fail: one bit of a recorded command is turned."""
     exported("torque", tmp_path)
