@@ -1,8 +1,13 @@
-"""Every form of a problem: one thing to be moved, y follows 0.5 sin 2t, and its mass is believed 15 % too large."""
+"""Every form of a problem: one thing to be moved, y follows 0.5 sin 2t, and its mass is believed 15 % too large.
+
+And any problem in another form: its coordinates as outputs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -96,3 +101,23 @@ FORMS = {
     "reality": moved(chain(2), 2, reality=fp.Reality(MASS, start={"a": 0.1, "w": 0.0})),
     "outside": moved(chain(2), 2, reality=fp.ExternalPlant(Body(), measures=SEEN)),
 }
+
+
+def with_arguments(function: Any, names: Sequence[str]) -> Any:
+    """The function, which says that it takes these arguments."""
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    vars(function)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
+    return function
+
+
+def named_again(problem: fp.Problem) -> fp.Problem:
+    """The problem with its coordinates as outputs."""
+    names = [f"d{k}" for k in range(max(problem.plant.orders))] + ["p"]
+
+    def of(coordinate: str) -> Any:
+        return with_arguments(lambda q, *rest: q[coordinate], names)
+
+    plant = replace(problem.plant, outputs={n: fp.Output(unit, of(n)) for n, unit in problem.plant.coordinates.items()})
+    cost = problem.cost
+    cost = replace(cost, states={}, outputs=cost.states) if isinstance(cost, fp.Quadratic) else cost
+    return replace(problem, plant=plant, cost=cost, reality=problem.reality and fp.Reality(plant))

@@ -31,7 +31,7 @@ from fpirhc.report.figures import (
     sweep_panels,
 )
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
-from fpirhc.simulation.log import responses_of, shown_motion
+from fpirhc.simulation.log import judged_motion, responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import readable
 from fpirhc.studies.comparison.changes import Outcome
@@ -427,12 +427,12 @@ def _tubes(entry: Entry, edges: np.ndarray) -> list[dict[str, Any]]:
     prediction, run = entry.prediction, entry.run
     if prediction is None or prediction.tube is None or not np.isfinite(prediction.tube).all():
         return []
-    state = "plant_state" if "plant_state" in run.layout else "state"  # of which the band is
-    places = {e: k for k, e in enumerate(run.layout[state].elements)}
+    motion = judged_motion(run.layout)  # of which the band is
+    places = {e: k for k, e in enumerate(run.layout[motion].elements)}
     count, charts = min(run.cycles, len(prediction.tube)), []
     for c in (c for c in run.layout["error"].elements if c in places):
         half = prediction.tube[:count, places[c]]
-        apart = run[f"{state}.{c}"][:count] - prediction.nominal.states[:count, places[c]]
+        apart = run[f"{motion}.{c}"][:count] - prediction.nominal.outputs[:count, places[c]]
         lines = [("distance", apart), ("predicted at most", half), ("predicted at least", -half)]
         title = f"{entry.name}: {c}, distance from the model's own run"
         charts.append(_chart(title, run.unit(f"error.{c}"), lines, edges) | {"only": entry.name, "band": [2, 3]})

@@ -21,6 +21,7 @@ from fpirhc.errors import FpirhcError, NoAnswer
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import known_exactly, with_exact_parameters
 from fpirhc.plant.plant import Plant
+from fpirhc.review.grid import each
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.model_as_plant import ModelAsPlant, loop_of, shortened
 from fpirhc.simulation.run import Run
@@ -59,6 +60,33 @@ class NominalRun:
         """Cycles of the run."""
         return len(self.desired)
 
+    @cached_property
+    def plant(self) -> Plant:
+        """What moved, with its own parameters as the exact ones."""
+        return _own_plant(self.problem.plant, self.believed)
+
+    @cached_property
+    def right(self) -> Problem:
+        """The problem in which the model may be what moved."""
+        same = np.array_equal(self.plant.approximate, self.problem.plant.approximate)
+        return self.problem if same else replace(self.problem, plant=self.plant)
+
+    @cached_property
+    def outputs(self) -> np.ndarray:
+        """Outputs of the run and their derivatives, shape (cycles + 1, ny); without outputs the states."""
+        plant, count = self.plant, len(self.states)
+        rows = (
+            np.zeros((count, len(plant.inputs))),
+            np.tile(plant.exact, (count, 1)),
+            np.zeros((count, len(plant.names))),
+        )
+        return each(plant.equations.output, self.states, *rows)
+
+
+def _own_plant(plant: Plant, parameters: np.ndarray) -> Plant:
+    """What a nominal run moves: a model with these parameters, or the plant itself, whose outputs a model does not show."""
+    return known_exactly(plant) if plant.outputs else exactly(plant, parameters)
+
 
 @dataclass(frozen=True, eq=False)
 class ResponseErrors:
@@ -85,10 +113,7 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
     """
 
     def run() -> Run:
-        plant = problem.plant
-        own = (
-            known_exactly(plant) if plant.outputs else exactly(plant, controller.plant_model(problem).parameters(plant))
-        )
+        own = _own_plant(problem.plant, controller.plant_model(problem).parameters(problem.plant))
         model = replace(problem, plant=own, disturbances={}, sensing=Sensing())
         return simulate(model, without_deformation(resolved(problem, controller)), seed=0, compiled=compiled)
 

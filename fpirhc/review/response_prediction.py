@@ -19,6 +19,7 @@ from fpirhc.errors import InvalidProblem, InvalidValue, NoAnswer, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.mismatch import check_mismatch
+from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each, review_grid, state_slopes
 from fpirhc.review.loops import ideal_loops, ideal_places, own_loops
 from fpirhc.review.prediction import (
@@ -46,8 +47,9 @@ class Prediction:
         adapted: response errors with the deformation.
         without: response errors without a deformation.
         null: response errors with the deformation on a right model, where every change does harm.
-        tube: bound of |plant's state - nominal state| with the deformation, to first order, shape (cycles + 1, nx);
-            with a mismatch the largest over the box of parameters. None where there is no bound.
+        tube: bound of |plant's outputs - nominal outputs| and their derivatives with the deformation, to first order, shape
+            (cycles + 1, ny), without outputs of the states; with a mismatch the largest over the box of parameters. None where
+            there is no bound.
         reason: why there is no tube; else empty.
     """
 
@@ -73,11 +75,11 @@ class Prediction:
 
     @property
     def half_width(self) -> Mapping[str, float]:
-        """Largest half-width of the tube by state, from `measure_from` on; empty without a tube."""
+        """Largest half-width of the tube by state or output, from `measure_from` on; empty without a tube."""
         if self.tube is None:
             return ByName({}, "Prediction.half_width")
         widest = self.tube[self._first :].max(axis=0)
-        names = self.nominal.problem.plant.state.elements
+        names = self.nominal.problem.plant.output.elements
         return ByName(zip(names, map(float, widest), strict=True), "Prediction.half_width")
 
     @property
@@ -168,7 +170,7 @@ _LOST = 1e6  # entry of a product of I - a J, from which errors grow
 
 
 def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.ndarray | None = None) -> np.ndarray:
-    """Return the bound of |x_k - x^_k| (cycles + 1, nx) that the response errors allow, with x^_k the states of the nominal run.
+    """Return the bound of |y_k - y^_k| (cycles + 1, ny) that the response errors allow, with y^_k the outputs of the nominal run.
 
     Args:
         nominal: the nominal run.
@@ -177,19 +179,20 @@ def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.nda
         exact: exact parameters, shape (np,); None: the plant's.
 
     Raises:
-        NotSupported: coordinates that are not controlled, no linear loop, one that does not converge even with the
+        NotSupported: coordinates or outputs that are not controlled, no linear loop, one that does not converge even with the
             right model.
     """
-    plant = nominal.problem.plant
-    if plant.outputs:
-        raise NotSupported("no tube: the nominal run of outputs is that of the plant, and a tube is around the model's")
-    if len(plant.controlled_names) < len(plant.names):
-        raise NotSupported("no tube: a coordinate that is not controlled moves by itself")
+    plant = nominal.plant
+    free = [n for n in plant.chains if not plant.response_orders.get(n)]
+    if free:
+        raise NotSupported(
+            f"no tube: {', '.join(free)} is not controlled through a derivative, and moves by itself or at once"
+        )
     force = majorant(nominal, errors, gain, exact) + np.abs(errors.force - errors.error)
-    grid = review_grid(nominal.problem, 0.0, 0)
+    grid = review_grid(nominal.right, 0.0, 0)
     loops = ideal_loops(grid, nominal.controller, _POINTS)
-    effects = [_effect(grid, nominal, k) for k in ideal_places(grid, nominal.believed, _POINTS)]
-    answers = [_impulses(*one, nominal.cycles) for one in zip(loops, effects, strict=True)]
+    effects = [_effect(grid, plant, k) for k in ideal_places(grid, plant.exact, _POINTS)]
+    answers = [_impulses(loop, *one, nominal.cycles) for loop, one in zip(loops, effects, strict=True)]
     longest = max(len(a) for a in answers)
     largest = np.max([np.pad(a, ((0, longest - len(a)), (0, 0), (0, 0))) for a in answers], axis=0)
     bound = np.zeros((nominal.cycles + 1, largest.shape[1]))
@@ -221,17 +224,17 @@ def majorant(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np
     return size
 
 
-def _effect(grid: ReviewGrid, nominal: NominalRun, place: int) -> np.ndarray:
-    """The model's gain (n, nu) from inputs to responses at a point."""
-    at = grid.states[place], grid.needed(nominal.believed)[place], nominal.believed
-    return state_slopes(grid.problem.plant, *at).d
+def _effect(grid: ReviewGrid, plant: Plant, place: int) -> tuple[np.ndarray, np.ndarray]:
+    """The gain (n, nu) from inputs to responses at a point, and the slopes (ny, nx) of the outputs and their derivatives."""
+    slopes = state_slopes(plant, grid.states[place], grid.needed(plant.exact)[place], plant.exact)
+    return slopes.d, slopes.y
 
 
-def _impulses(loop: LinearLoop, gain: np.ndarray, cycles: int) -> np.ndarray:
-    """|h_j| (j, nx, n): the motion of the states after a unit of the responses over one cycle."""
+def _impulses(loop: LinearLoop, gain: np.ndarray, shown: np.ndarray, cycles: int) -> np.ndarray:
+    """|h_j| (j, ny, n): the motion of the outputs after a unit of the responses over one cycle."""
     if loop.radius >= 1:
         raise NoAnswer("no tube: the loop does not converge even with the right model")
-    sizes = np.abs(loop.impulses(np.linalg.inv(gain), cycles)).max(
+    sizes = np.abs(shown @ loop.impulses(np.linalg.inv(gain), cycles)).max(
         axis=0
     )  # of all cycles of a period in which the unit may come
     lasting = sizes.max(axis=(1, 2)) >= _GONE * sizes.max()

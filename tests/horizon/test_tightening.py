@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from forms import named_again
 from reviewed import linear
 
 import fpirhc as fp
@@ -93,6 +94,16 @@ def test_a_limit_that_the_wrong_model_breaks_is_kept_with_margins():
     alone, adapted = beyond(problem, plain()), beyond(problem, adaptive())
     assert alone > 1e-3
     assert 0 < adapted < 0.5 * alone
+    assert beyond(problem, fp.tightened(problem, adaptive())) <= 1e-6
+
+
+def test_margins_keep_the_limits_of_a_plant_by_its_outputs():
+    """The same carriage with its place as an output needs nearly the same margins, and keeps its track with them."""
+    problem = named_again(carriage())
+    own, again = (fp.state_margins(p, adaptive(), passes=0) for p in (carriage(), problem))
+    for name, margins in own.items():
+        np.testing.assert_allclose(again[name], margins, rtol=0.2)
+    assert beyond(problem, adaptive()) > 1e-4
     assert beyond(problem, fp.tightened(problem, adaptive())) <= 1e-6
 
 

@@ -96,7 +96,31 @@ def test_the_predicted_response_error_is_that_of_a_run() -> None:
     rms = np.sqrt(np.mean((run["realised"][1:] - run["desired"][:-1])[first:] ** 2))
     assert prediction.rms(prediction.without)["depth"] == pytest.approx(rms, rel=0.25)
     assert prediction.helps
-    assert "tube" in prediction.reason
+
+
+@pytest.mark.parametrize("plans", [False, True])
+def test_a_run_is_inside_the_tube_of_its_outputs(plans: bool) -> None:
+    """The depth and its rate, around the run of the right model; the tube is at most ten times as wide as what is needed."""
+    controller: Controller = fp.ComputedTorque(LAW, fp.Affine(-1.5))
+    if plans:
+        controller = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2), fp.Affine(-1.5))
+    problem = planned() if plans else sedated(hill(5.5))
+    prediction = fp.predict_response(problem, controller, compiled=False)
+    assert prediction.tube is not None
+    first = round(problem.measure_from / problem.period)
+    away = np.abs(simulated(problem, controller)["output"] - prediction.nominal.outputs)[first:].max(axis=0)
+    half = prediction.tube[first:].max(axis=0)
+    assert (away < half).all()
+    assert (away > 0.1 * half).all()
+    assert tuple(prediction.half_width) == problem.plant.output.elements
+
+
+def test_no_tube_where_the_command_moves_an_output_at_once() -> None:
+    plant = replace(hill(5.5), outputs={"depth": fp.Output("1", lambda x, u, p: x.E + 0.1 * u.u)}, inverse=None)
+    problem = replace(sedated(hill(5.5)), plant=plant)
+    prediction = fp.predict_response(problem, fp.ComputedTorque(LAW, fp.Affine(-0.5)), compiled=False)
+    assert prediction.tube is None
+    assert "depth is not controlled through a derivative, and moves by itself or at once" in prediction.reason
 
 
 def test_the_start_off_the_reference_asks_for_a_fast_map() -> None:

@@ -8,7 +8,6 @@ Runge-Kutta's formula is the same in both.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from forms import named_again, with_arguments
 from on_problem import on_problem
 from plants import simulated
 
@@ -23,14 +23,6 @@ import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.members import examples
 from fpirhc.plant.motion import followed_units
-
-
-def with_arguments(function: Any, names: Sequence[str]) -> Any:
-    """The function, which says that it takes these arguments."""
-    kind = inspect.Parameter.POSITIONAL_ONLY
-    vars(function)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
-    return function
-
 
 # Coordinates as outputs
 
@@ -58,19 +50,6 @@ LOOPS: dict[str, tuple[Controller, fp.Problem]] = {
         )
     },
 }  # fmt: skip
-
-
-def named_again(problem: fp.Problem) -> fp.Problem:
-    """The problem with its coordinates as outputs."""
-    names = [f"d{k}" for k in range(max(problem.plant.orders))] + ["p"]
-
-    def of(coordinate: str) -> Any:
-        return with_arguments(lambda q, *rest: q[coordinate], names)
-
-    plant = replace(problem.plant, outputs={n: fp.Output(unit, of(n)) for n, unit in problem.plant.coordinates.items()})
-    cost = problem.cost
-    cost = replace(cost, states={}, outputs=cost.states) if isinstance(cost, fp.Quadratic) else cost
-    return replace(problem, plant=plant, cost=cost, reality=problem.reality and fp.Reality(plant))
 
 
 @pytest.mark.parametrize("name", LOOPS)

@@ -10,6 +10,7 @@ import abroad
 import numpy as np
 import pytest
 from chains import chain
+from forms import named_again
 
 import fpirhc as fp
 from fpirhc.contraction.large_errors import least_product
@@ -136,6 +137,18 @@ def test_run_is_inside_its_tube(name, which, gain):
     # Not empty words: the largest deviations are a good part of the tube, however alike the signs of its parts are.
     assert (deviation.max(axis=0) > half.max(axis=0) / 6)[coordinates].all()
     assert predicted.half_width[problem.plant.names[0]] == half.max(axis=0)[0]
+
+
+def test_tube_of_outputs_is_that_of_the_same_coordinates():
+    """For a tracking law, whose run of the right model is the same; to what a wrong model changes within a cycle."""
+    problem, tested = (
+        replace(undisturbed("two_mass"), duration=3.0, measure_from=1.0),
+        controller("two_mass", "CTC", -0.5),
+    )
+    own, again = (fp.predict_response(p, tested, compiled=False) for p in (problem, named_again(problem)))
+    assert again.tube is not None
+    for name, half in own.half_width.items():
+        assert again.half_width[name] == pytest.approx(half, rel=0.01)
 
 
 def test_tube_of_a_tracking_law_has_its_closed_form():
