@@ -132,7 +132,7 @@ class Trajectory(Reference):
     """
 
     motion: Callable[[Expression], Mapping[str, Expression]]
-    scale: Finite = field(default=1.0, kw_only=True)
+    scale: Finite = field(default=1.0, kw_only=True, metadata={"setting": "where given"})
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
         def of(time: Expression) -> dict[str, Expression]:

@@ -299,12 +299,14 @@ def test_outputs_and_maps_are_planned_between_stages(name):
     np.testing.assert_allclose(runs[0]["command"], runs[1]["command"], atol=1e-4 * scale)
 
 
-def test_the_usual_way_to_replan_is_no_setting_of_a_baseline() -> None:
+def test_the_usual_way_to_replan_and_the_whole_reference_are_no_settings_of_a_baseline() -> None:
     """Baselines from before there was a choice stay usable; a plan in every cycle is another problem."""
     usual = describe(fp.Horizon(stages=3, step=0.1))
     every = describe(fp.Horizon(stages=3, step=0.1, replan="cycle"))
     assert "replan" not in usual
     assert every == {**usual, "replan": "cycle"}
+    whole, half = (describe(fp.Trajectory(lambda t: {"y": t}, scale=scale)) for scale in (1.0, 0.5))
+    assert half == {**whole, "scale": 0.5}
 
 
 def test_a_run_has_its_cost_per_cycle_whatever_the_stages_are():
