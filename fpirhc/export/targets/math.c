@@ -69,9 +69,10 @@ static pair times(pair a, pair b) {
   return sum(p.high, p.low);
 }
 
-/* exp(x + low) for a small rest: 1 + r + r^2/2 + ... after r = x - n ln 2; the series beyond is interpolated at Chebyshev's nodes. */
+/* exp(x + low) = 1 + r + r c / (2 - c) after r = x - n ln 2; c = r + 2 - r coth(r / 2) = r - r^2/6 + r^4/360 - ..., interpolated at
+   Chebyshev's nodes. */
 static double exponential(double x, double low) {
-  double n, high, rest, r, q = 2.509554606865001e-08;
+  double n, high, rest, r, z, c = 4.1437682605934066e-08;
   int far = ((unsigned long)(bits_of(x) >> 32) & 0x7ffffffful) >= 0x40862000ul; /* 708 and more, or not a number */
   if (far) {
     if (x != x) return x;
@@ -79,10 +80,9 @@ static double exponential(double x, double low) {
     if (x < -745.2) return 0;
   }
   n = whole(x * 1.4426950408889634), high = x - n * LN2, rest = n * LN2_REST - low, r = high - rest;
-  q = q * r + 2.7613795667584423e-07, q = q * r + 2.755728008252803e-06, q = q * r + 2.4801536408860383e-05;
-  q = q * r + 1.9841269854330848e-04, q = q * r + 1.3888888905871448e-03, q = q * r + 8.333333333332157e-03;
-  q = q * r + 4.1666666666651364e-02, q = q * r + 1.6666666666666666e-01, q = q * r + 0.5;
-  r = 1 + (high + (r * r * q - rest));
+  z = r * r, c = c * z - 1.6534060075471242e-06, c = c * z + 6.613756471649627e-05, c = c * z - 2.7777777777564456e-03;
+  c = r - z * (c * z + 1.6666666666666660e-01);
+  r = 1 + (high + (r * c / (2 - c) - rest));
   return far ? scaled(r, (int)n) : r * power_of_2((int)n);
 }
 
@@ -185,7 +185,7 @@ static pair reduced(double x, int* quarter) {
   return sum(r.high, r.low);
 }
 
-/* sin(x + turn pi / 2) */
+/* sin(x + turn pi / 2); (sin r - r) / r^3 and (cos r - 1 + r^2/2) / r^4 are interpolated at Chebyshev's nodes. */
 static double wave(double x, int turn) {
   double z, q, value;
   pair r;
@@ -193,13 +193,13 @@ static double wave(double x, int turn) {
   if (!(x - x == 0)) return x - x;
   r = reduced(x, &quarter), quarter += turn, z = r.high * r.high;
   if (quarter & 1) {
-    q = 1.0 / 2432902008176640000.0, q = q * z - 1.0 / 6402373705728000.0, q = q * z + 1.0 / 20922789888000.0;
-    q = q * z - 1.0 / 87178291200.0, q = q * z + 1.0 / 479001600.0, q = q * z - 1.0 / 3628800.0, q = q * z + 1.0 / 40320.0;
-    q = q * z - 1.0 / 720.0, q = q * z + 1.0 / 24.0, value = 1 - 0.5 * z;
+    q = -1.1382614868556325e-11, q = q * z + 2.0876146024689747e-09, q = q * z - 2.7557317270560326e-07;
+    q = q * z + 2.4801587298763433e-05, q = q * z - 1.3888888888887395e-03, q = q * z + 4.1666666666666664e-02;
+    value = 1 - 0.5 * z;
     value += ((1 - value) - 0.5 * z) + (z * z * q - r.high * r.low);
   } else {
-    q = 1.0 / 355687428096000.0, q = q * z - 1.0 / 1307674368000.0, q = q * z + 1.0 / 6227020800.0, q = q * z - 1.0 / 39916800.0;
-    q = q * z + 1.0 / 362880.0, q = q * z - 1.0 / 5040.0, q = q * z + 1.0 / 120.0, q = q * z - 1.0 / 6.0;
+    q = 1.591810123027412e-10, q = q * z - 2.5051131455427946e-08, q = q * z + 2.755731610068303e-06;
+    q = q * z - 1.9841269836754970e-04, q = q * z + 8.333333333330946e-03, q = q * z - 1.6666666666666666e-01;
     value = r.high + (r.low * (1 - 0.5 * z) + r.high * z * q);
   }
   return quarter & 2 ? -value : value;
