@@ -11,6 +11,7 @@ import sys
 import tempfile
 import warnings
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,8 @@ from fpirhc.symbolic.native import find_compiler
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "targets.md"
-CASES = (
+Limited = dict[str, tuple[float, float]]
+CASES: tuple[tuple[str, str, Limited], ...] = (
     ("two_mass", "CTC+FPI (eq 6)", {}),
     ("two_mass", "RHC+FPI", {}),
     ("two_mass", "RHC+FPI", {"q1": (1.85, 2.35)}),
@@ -32,7 +34,12 @@ CASES = (
     ("fishery", "RHC+FPI", {}),
 )
 WEB = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("anaesthesia", "RHC+FPI"))
-BOARDS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("leaking_tanks", "RHC+FPI"))
+BOARDS: tuple[tuple[str, str, Limited], ...] = (
+    ("two_mass", "CTC+FPI (eq 6)", {}),
+    ("two_mass", "RHC+FPI", {}),
+    ("two_mass", "RHC+FPI", {"q1": (1.85, 2.35)}),
+    ("leaking_tanks", "RHC+FPI", {}),
+)
 UNITS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"))
 SMALL = (("two_mass", "CTC+FPI (eq 6)"), ("fishery", "RHC+FPI"), ("two_mass", "RHC+FPI"))
 CYCLES = 2000
@@ -42,11 +49,10 @@ QEMU = (
 )  # fmt: skip
 
 
-def row(problem: str, title: str, states: dict[str, tuple[float, float]]) -> list[str]:
+def row(problem: str, title: str, states: Limited) -> list[str]:
     """One line of the table."""
     task, compiler = fp.load_problem(problem), str(find_compiler())
-    changed = replace(task.problem, limits=replace(task.problem.limits, states=states)) if states else task.problem
-    device = device_of(changed, task.controllers[title], title, name="c", cycles=CYCLES)
+    device = device_of(_limited(task.problem, states), task.controllers[title], title, name="c", cycles=CYCLES)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write(device, target_called("c"), folder)
@@ -68,12 +74,19 @@ def row(problem: str, title: str, states: dict[str, tuple[float, float]]) -> lis
         assert differ is not None
         assert size is not None
         samples = (folder / "samples.bin").read_bytes()
-    limits = f", {', '.join(states)} limited" if states else ""
     digest = hashlib.sha256(samples).hexdigest()[:12]
     sums = " / ".join(differ.groups())
     memory, work = device.stepper.memory.size, device.sizes["w"]
-    return [f"{problem}, {title}{limits}", f"{flash / 1000:.1f}", f"{int(size[1]) / 1000:.1f}", f"{stack / 1000:.1f}",
+    return [_called(problem, title, states), f"{flash / 1000:.1f}", f"{int(size[1]) / 1000:.1f}", f"{stack / 1000:.1f}",
             f"{memory}", f"{work}", sums, digest]  # fmt: skip
+
+
+def _limited(problem: fp.Problem, states: Limited) -> fp.Problem:
+    return replace(problem, limits=replace(problem.limits, states=states)) if states else problem
+
+
+def _called(problem: str, title: str, states: Limited) -> str:
+    return ", ".join([problem, title, *(f"{name} limited" for name in states)])
 
 
 def unit_row(problem: str, title: str, target: str) -> list[str]:
@@ -111,10 +124,10 @@ def web_row(problem: str, title: str) -> list[str]:
     return [f"{problem}, {title}", *(f"{size / 1000:.0f}" for size in sizes), *hashes]
 
 
-def cortex_row(problem: str, title: str) -> list[str]:
+def cortex_row(problem: str, title: str, states: Limited) -> list[str]:
     """One line of the table of Cortex-M7: sizes, instructions, and the commands of a run with it and with C here."""
     task = fp.load_problem(problem)
-    shorter = replace(task.problem, duration=500 * task.problem.period, measure_from=0.0)
+    shorter = replace(_limited(task.problem, states), duration=500 * task.problem.period, measure_from=0.0)
     device = device_of(shorter, task.controllers[title], title, name="c", cycles=1, libm="own")
     with tempfile.TemporaryDirectory() as name:
         board, here, lines = Path(name) / "board", Path(name) / "c", io.BytesIO()
@@ -141,7 +154,7 @@ def cortex_row(problem: str, title: str) -> list[str]:
     ]
     code, data = image.size(0), image.size(0x20000000)
     counts = emulated.counts
-    return [f"{problem}, {title}", f"{code / 1000:.0f}", f"{data / 1000:.0f}", f"{np.mean(counts):.0f}", f"{max(counts)}",
+    return [_called(problem, title, states), f"{code / 1000:.0f}", f"{data / 1000:.0f}", f"{np.mean(counts):.0f}", f"{max(counts)}",
             f"{apart:.1g}", *hashes]  # fmt: skip
 
 
@@ -213,38 +226,47 @@ def _said(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
+TABLES: dict[str, tuple[list[str], Callable[[], list[list[str]]]]] = {
+    "table": (
+        ["controller", "code, kB", "struct, kB", "stack, kB", "memory", "work", "cycles that differ", "answers"],
+        lambda: [row(*case) for case in CASES],
+    ),
+    "units": (
+        ["controller", "target", "archive, kB", "problems by FMPy", "command, inputs pass through", "one period late"],
+        lambda: [unit_row(*case, target) for case in UNITS for target in ("fmu", "fmu2")],
+    ),
+    "cortex": (
+        [
+            "controller",
+            "code, kB",
+            "data, kB",
+            "instructions, mean",
+            "most",
+            "command",
+            "commands in QEMU",
+            "commands here",
+        ],
+        lambda: [cortex_row(*case) for case in BOARDS],
+    ),
+    "misra": (["rule", "CTC+FPI (eq 6)", "RHC+FPI", "why it stays"], misra_rows),
+    "boards": (
+        ["controller", "flash, kB", "Uno", "Mega 2560"],
+        lambda: [board_row(*case, bare) for case in SMALL for bare in (True, False)],
+    ),
+    "web": (
+        ["controller", "module, kB", "compressed, kB", "commands in Node", "commands in C here"],
+        lambda: [web_row(*case) for case in WEB],
+    ),
+}
+
+
 def main() -> None:
-    """Measure and write."""
+    """Measure and write: every table of the page, or those that are named."""
     warnings.simplefilter("ignore", fp.HarmfulAdaptation)
-    text = PAGE.read_text(encoding="utf-8")
-    head = ["controller", "code, kB", "struct, kB", "stack, kB", "memory", "work", "cycles that differ", "answers"]
-    text = _filled(text, "table", head, [row(*case) for case in CASES])
-    head = [
-        "controller",
-        "target",
-        "archive, kB",
-        "problems by FMPy",
-        "command, inputs pass through",
-        "one period late",
-    ]
-    rows = [unit_row(problem, title, target) for problem, title in UNITS for target in ("fmu", "fmu2")]
-    text = _filled(text, "units", head, rows)
-    head = [
-        "controller",
-        "code, kB",
-        "data, kB",
-        "instructions, mean",
-        "most",
-        "command",
-        "commands in QEMU",
-        "commands here",
-    ]
-    text = _filled(text, "cortex", head, [cortex_row(*case) for case in BOARDS])
-    text = _filled(text, "misra", ["rule", "CTC+FPI (eq 6)", "RHC+FPI", "why it stays"], misra_rows())
-    head = ["controller", "flash, kB", "Uno", "Mega 2560"]
-    text = _filled(text, "boards", head, [board_row(*case, bare) for case in SMALL for bare in (True, False)])
-    head = ["controller", "module, kB", "compressed, kB", "commands in Node", "commands in C here"]
-    PAGE.write_text(_filled(text, "web", head, [web_row(*case) for case in WEB]), encoding="utf-8")
+    for name in sys.argv[1:] or TABLES:
+        head, measured = TABLES[name]
+        rows = measured()
+        PAGE.write_text(_filled(PAGE.read_text(encoding="utf-8"), name, head, rows), encoding="utf-8")
 
 
 def _filled(text: str, place: str, head: list[str], rows: list[list[str]]) -> str:

@@ -268,8 +268,8 @@ def test_nothing_is_loaded_from_anywhere(name, reports, visit):
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_a_lab_runs_anew_while_a_slider_moves(width, scheme, visit, pictures, tmp_path):
-    """The sentence follows the slider and comes back with it, nothing is fetched or complained about, and memory does not grow."""
+def test_a_lab_runs_anew_while_a_slider_moves(width, scheme, visit, pictures, tmp_path, capsys):
+    """Sentence, address and Python follow the slider; nothing is fetched or complained about, and memory does not grow."""
     pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
     task = fp.load_problem("two_mass")
     chosen = {name: task.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")}
@@ -290,6 +290,15 @@ def test_a_lab_runs_anew_while_a_slider_moves(width, scheme, visit, pictures, tm
     first, second = moved(1.0), moved(2.0)
     assert "CTC+FPI (eq 6) lowers the rms error of q1 from 0.3355 to 0.003155 m (106 times less), q2 from " in first
     assert first != second
+    moves = page.evaluate("location.hash"), page.inner_text("#python")
+    assert moves[0] == "#exact.m1=2"
+    assert 'fp.with_settings(problem, {"plant.parameters.m1.exact": 2})' in moves[1]
+    exec(moves[1], {})
+    assert capsys.readouterr().out.count("10000 cycles of 0.001 s, seed 0") == 2
+    page.reload()  # the address has the sliders
+    while page.evaluate("!window.shownNumber || busy"):
+        page.wait_for_timeout(20)
+    assert page.inner_text("#sentence") == second
     assert moved(1.0) == first
     size = page.evaluate("performance.memory.usedJSHeapSize")
     for k in range(500 if scheme == "light" else 40):
