@@ -103,8 +103,7 @@ class _Traffic:
                 raise InvalidProblem("the bus has an error frame")
             self._newest[message.arbitration_id] = message
         for at in self._read:
-            newest = self._newest.get(at.identifier)
-            if newest is None:
+            if (newest := self._newest.get(at.identifier)) is None:
                 raise InvalidProblem(f"no message 0x{at.identifier:X} has arrived")
             if len(newest.data) < at.byte + struct.calcsize(at.format):
                 raise InvalidProblem(f"message 0x{at.identifier:X} has {len(newest.data)} bytes, too few for its field")

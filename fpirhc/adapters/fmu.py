@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fpirhc.adapters.names import adapter, counterparts
-from fpirhc.errors import InvalidProblem, Mistakes, package
+from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
@@ -47,10 +47,9 @@ def fmu_body(
     """
     fmpy = package("fmpy", "outside")
     described = fmpy.read_model_description(str(path))
-    if described.coSimulation is None:
-        name = Path(path).name
-        raise InvalidProblem(f"fmu_body: {name} is made for model exchange alone; export it for co-simulation")
     units, mistakes, fixed = quantities(model), Mistakes("fmu_body"), parameters or {}
+    if described.coSimulation is None:
+        mistakes.add(f"{Path(path).name} is made for model exchange alone; export it for co-simulation")
     known = {v.name: v.valueReference for v in described.modelVariables if v.type in ("Real", "Float64")}
     mistakes.unknown("measures: quantity", measures, units)
     mistakes.unknown("variable", measures.values(), known)
@@ -60,7 +59,7 @@ def fmu_body(
     folder = TemporaryDirectory()
     make = partial(fmpy.instantiate_fmu, fmpy.extract(str(path), folder.name), described, fmi_type="CoSimulation")
     references = [[known[name] for name in names] for names in (fixed, sent.values(), measures.values())]
-    body = _Body(make, described.fmiVersion, period, list(fixed.values()), references)
+    body = _Body(make, described.fmiVersion[0] == "3", period, list(fixed.values()), references)
     weakref.finalize(body, folder.cleanup)
     return ExternalPlant(body, measures={name: units[name] for name in measures})
 
@@ -71,14 +70,14 @@ class _Body:
 
     Args:
         make: returns an instance.
-        version: of FMI.
+        third: whether it is of FMI 3.
         period: of a step.
         fixed: values of the parameters.
         references: of the parameters, of the inputs, and of what is measured.
     """
 
     make: Callable[[], Any]
-    version: str
+    third: bool
     period: float
     fixed: list[float]
     references: list[list[int]]
@@ -91,9 +90,8 @@ class _Body:
             self.unit.terminate()
             self.unit.freeInstance()
         unit = self.unit = self.make()
-        new = self.version.startswith("3")
-        self._set, self._get = (unit.setFloat64, unit.getFloat64) if new else (unit.setReal, unit.getReal)
-        if not new:
+        self._set, self._get = (unit.setFloat64, unit.getFloat64) if self.third else (unit.setReal, unit.getReal)
+        if not self.third:
             unit.setupExperiment(startTime=0.0)
         unit.enterInitializationMode()
         self._set(self.references[0], self.fixed)
