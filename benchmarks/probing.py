@@ -1,6 +1,6 @@
 """What a probe proposes beside a grid of settings by hand: errors over those of the controller alone, on a run of another seed.
 
-.venv/bin/python benchmarks/probing.py                        # plants of other packages, and three shipped ones: five minutes
+.venv/bin/python benchmarks/probing.py                        # all plants, and a late link: five minutes
 .venv/bin/python benchmarks/probing.py two_mass quadrotor
 Option: --late CYCLES, a link before the plant that nobody told; for plants of other packages.
 
@@ -22,6 +22,7 @@ from fpirhc.probing.probe import Trial, tried
 from fpirhc.problem_files.shipped import missing, shipped_groups
 
 UNSEEN = ("two_mass", "two_link_arm", "van_der_pol")  # no constant of the rule was chosen on them
+LATE = ("quadrotor", (1, 3, 5))  # cycles of its link
 GAINS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.25)
 
 
@@ -75,9 +76,11 @@ def main() -> None:
     parser.add_argument("--cycles", type=int, default=400)
     asked = parser.parse_args()
     outside = {name: path for name, path in shipped_groups()["plants of other packages"].items() if not missing(path)}
-    for name in asked.problems or [*outside, *UNSEEN]:
+    everything = [(name, 0) for name in (*outside, *UNSEEN)] + [(LATE[0], k) for k in LATE[1] if LATE[0] in outside]
+    for name, cycles in [(name, asked.late) for name in asked.problems] or everything:
         task = fp.load_problem(name)
-        problem = late(task.problem, asked.late)
+        problem = late(task.problem, cycles)
+        title = f"{name}, {cycles} late" if cycles else name
         alone = next(c for n, c in task.controllers.items() if n.startswith("RHC"))
         begun = time.process_time()
         found = fp.probe(problem, alone, cycles=asked.cycles, seed=3)
@@ -89,8 +92,8 @@ def main() -> None:
         probe = trials.pop("probe", Trial(1.0, 1.0))
         hand = min(trials, key=lambda n: trials[n].error)
         print(
-            f"{name:13s} probe {probe.error:.4f} (worst coordinate {probe.worst:.3f}), by hand {trials[hand].error:.4f} ({hand}), "
-            f"ratio {probe.error / trials[hand].error:.2f}; {took:.0f} s\n              {found.lines} {found.why}",
+            f"{title:17s} probe {probe.error:.4f} (worst coordinate {probe.worst:.3f}), by hand {trials[hand].error:.4f} ({hand}), "
+            f"ratio {probe.error / trials[hand].error:.2f}; {took:.0f} s\n                  {found.lines} {found.why}",
             flush=True,
         )
 

@@ -188,27 +188,32 @@ def _trials(
 ) -> dict[str, Trial]:
     """Trials of the shortlist, then of the shares beside the best one, which are added to it, as long as one is better."""
     results: dict[str, Trial] = {}
-    new: Mapping[str, Predicted] = shortlist
-    while new:
-        outcomes = tried(problem, bare, {name: one.deformation for name, one in new.items()}, seed=seed)
+    new, walked = dict(shortlist), set()
+    while True:
+        outcomes = tried(problem, bare, {name: one.deformation for name, one in new.items()}, seed=seed) if new else {}
         notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
         results |= {name: one for name, one in outcomes.items() if isinstance(one, Trial)}
         name = best(results)
-        if name is None or name not in new:
-            break
+        if name is None:
+            return results
+        beside = {} if name in walked else rule.beside(shortlist[name])
+        walked.add(name)
         known = [one.deformation for one in shortlist.values()]
-        form = name.partition(",")[0]
-        beside = {f"{form}, share {share:g}": one for share, one in rule.beside(shortlist[name]).items()}
-        new = {title: one for title, one in beside.items() if one.deformation not in known}
+        titled = {f"{name.partition(',')[0]}, share {share:g}": one for share, one in beside.items()}
+        new = {title: one for title, one in titled.items() if one.deformation not in known}
         shortlist |= new
-    while (name := best(results)) and name.startswith(DARING):
-        chosen = shortlist[name].deformation
-        louder = tried(problem, bare, {name: chosen.with_effective_gain(_MARGIN * chosen.effective_gain())}, seed=seed)
-        if isinstance(outcome := louder[name], Trial) and outcome.passes:
-            break
-        notes.append(f"{name} is not kept: on the plant it does not bear {_MARGIN:g} times its gain")
-        del results[name]
-    return results
+        if not new:
+            if not name.startswith(DARING) or _bears_more(problem, bare, shortlist[name].deformation, seed):
+                return results
+            notes.append(f"{name} is not kept: on the plant it does not bear {_MARGIN:g} times its gain")
+            del results[name]
+
+
+def _bears_more(problem: Problem, bare: Controller, chosen: Deformation, seed: int) -> bool:
+    """Whether a trial with a larger gain passes."""
+    louder = chosen.with_effective_gain(_MARGIN * chosen.effective_gain())
+    outcome = tried(problem, bare, {"": louder}, seed=seed)[""]
+    return isinstance(outcome, Trial) and outcome.passes
 
 
 def _recorded(

@@ -149,8 +149,8 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
     return plant, signals
 
 
-DARING = "daring"
-"""Name of the candidate that keeps its margins at the estimate alone: trials have to show them."""
+DARING = ("daring", "prompt")
+"""Candidates that keep their margins at the estimate alone: trials have to show them. The second believes no lateness."""
 
 SHARES = (0.05, 0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
 _RINGING = (4.0, 1.0)  # g / (1 - pole) of the filters
@@ -202,6 +202,11 @@ class Setting:
 
     def _largest(self, estimates: Estimates) -> float:
         return estimates.largest_weighted if self.weighted else estimates.largest
+
+    @property
+    def prompt(self) -> bool:
+        """Whether it is model-referenced, and its mirror believes that the plant answers at once."""
+        return self.referenced and not (any(self.cycles) or any(self.lags) or self.weighted)
 
     def with_share(self, share: float) -> Setting:
         """Return the same form with another share, whose filter rings alike."""
@@ -295,7 +300,8 @@ class Rule:
             "matrix": self._first(one for one in calm if one.setting.weighted),
             "long lag": self._long(),
             "bold": min(safe, key=lambda one: one.steps, default=None),
-            DARING: next(filter(self._daring, _few_filters(calm)), None),
+            DARING[0]: next(filter(self._daring, _few_filters(calm)), None),
+            DARING[1]: next(filter(self._daring, _few_filters(one for one in calm if one.setting.prompt)), None),
         }
         different: dict[str, Predicted] = {}
         for name, candidate in chosen.items():
