@@ -1,22 +1,321 @@
-"""The stage of a horizon expanded around a trajectory, for second-order sweeps, whole and in parts.
+"""The stage of a horizon expanded around a trajectory, for second-order sweeps, whole and in parts by the chain rule.
 
     s+ = F(s, u, theta),   A = dF/ds,  B = dF/du,   l_s, l_u,   and the second derivatives Q = l_ss, S = l_us, R = l_uu.
 
 Loops in C call the parts, because they need Jacobians later, or not at all: `evaluate` and `pull` do the work of `linear_stage`,
-`bend` and `curve` that of `hessian_stage`, with fewer operations and nothing twice (`fpirhc.symbolic.chain_rule`).
+`bend` and `curve` that of `hessian_stage`, with fewer operations and nothing twice. Theory: docs/theory-plants.md.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import casadi as ca
 
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.symbolic.chain_rule import ChainRule, chain_rule, slopes_function, tangent_code
+
+_OPERANDS = 2  # most operands of an elementary operation
+_Edges = list[dict[int, ca.SX]]  # for every result, its partial derivatives by the result that they are of
+_WIDE = 4  # numbers of a wide register
+# The lines are many. Apart from the loops around them they are compiled several times as fast, and less optimising is enough.
+_TEXT = """
+#ifdef PORTABLE
+#define APART
+#else /* PORTABLE */
+#if defined(__GNUC__) && !defined(__clang__)
+#define APART __attribute__((noinline, optimize("O2", "tree-vectorize")))
+#elif defined(__GNUC__)
+#define APART __attribute__((noinline))
+#else
+#define APART
+#endif
+#endif /* PORTABLE */
+
+INLINE int {name}_lines(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
+  casadi_real e[{count}], t[{rows}][{width}];
+  Out made[8];
+  int i, j;
+  made[0] = e;
+  if ({slopes}(arg, made, iw, w, 0)) return 1;
+  {lines}
+  for (j = 0; j < {ns}; ++j)
+    for (i = 0; i < {ns}; ++i) res[0][j * {ns} + i] = t[{first} + i][j];
+  for (j = 0; j < {nu}; ++j)
+    for (i = 0; i < {ns}; ++i) res[1][j * {ns} + i] = t[{first} + i][{ns} + j];
+  for (j = 0; j < {ns}; ++j) res[2][j] = t[{first} + {ns}][j];
+  for (j = 0; j < {nu}; ++j) res[3][j] = t[{first} + {ns}][{ns} + j];
+  return 0;
+}}
+
+#ifdef PORTABLE
+#define {name}_wide {name}_lines
+#define {name}_plain {name}_lines
+#else /* PORTABLE */
+#ifdef ALWAYS_WIDE
+#define {name}_plain {name}_wide
+#else
+APART static int {name}_plain(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
+  return {name}_lines(arg, res, iw, w);
+}}
+#endif
+
+#if defined(__GNUC__) && defined(__x86_64__)
+APART __attribute__((target("avx2")))
+static int {name}_wide(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
+  return {name}_lines(arg, res, iw, w);
+}}
+#else
+#define {name}_wide {name}_plain
+#endif
+#endif /* PORTABLE */
+
+INLINE int {name}(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {{
+  (void)mem;
+  return WIDE ? {name}_wide(arg, res, iw, w) : {name}_plain(arg, res, iw, w);
+}}
+"""
+
+
+class Graph(NamedTuple):
+    """What the chain rule runs over, after the eliminations that add no edge.
+
+    Args:
+        slopes: for every place, its partial derivatives (of the symbols of m) by the place that they are of.
+        between: the places that are left between variables and results, in the order of the computation.
+        variables: number of variables, which have the first places.
+        results: the places of the results, one after another at the end.
+    """
+
+    slopes: _Edges
+    between: list[int]
+    variables: int
+    results: range
+
+
+@dataclass(frozen=True, eq=False)
+class ChainRule:
+    """The two parts of a derivative.
+
+    Args:
+        partials: m, a column of expressions of the variables and parameters.
+        symbols: a column of as many symbols for m.
+        pulled: J' w of the symbols and of the symbols `weights`.
+        weights: w, as long as the results.
+        graph: from which J is made.
+    """
+
+    partials: ca.SX
+    symbols: ca.SX
+    pulled: ca.SX
+    weights: ca.SX
+    graph: Graph
+
+    @cached_property
+    def jacobian(self) -> ca.SX:
+        """J of the symbols, by elimination of everything between the variables and the results."""
+        slopes, between, count, results = self.graph
+        back = [dict(by) for by in slopes]
+        ahead = _ahead(back)
+        for n in between:
+            _eliminate(n, back, ahead)
+        jacobian = ca.SX(len(results), count)
+        for row, n in enumerate(results):
+            for place, slope in back[n].items():
+                jacobian[row, place] = slope
+        return jacobian
+
+
+def chain_rule(results: ca.SX, variables: ca.SX, parameters: ca.SX) -> ChainRule:
+    """Return both parts of the derivative of a column of results.
+
+    Args:
+        results: a dense column of expressions.
+        variables: a column of symbols, by which they are differentiated.
+        parameters: a column of all other symbols.
+    """
+    function = ca.Function("fpirhc_values", [variables, parameters], [results], {"cse": True})
+    weights = ca.SX.sym("w", results.numel())
+    calls = any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
+    edges, ends, values = _direct(results, variables) if calls else _graph(function, variables, parameters)
+    partials, symbols = _named(edges, values)
+    pulled = _pulled(edges, ends, weights, variables.numel())
+    return ChainRule(partials, symbols, pulled, weights, _compressed(edges, ends, variables.numel()))
+
+
+def _direct(results: ca.SX, variables: ca.SX) -> tuple[_Edges, list[int], list[ca.SX]]:
+    """The graph of a Function that calls others, which are not looked into: from the variables straight to the results."""
+    jacobian, count = ca.densify(ca.jacobian(results, variables)), variables.numel()
+    rows = [{k: jacobian[r, k] for k in range(count) if not jacobian[r, k].is_zero()} for r in range(results.numel())]
+    values = [*ca.vertsplit(variables), *ca.vertsplit(results)]
+    return [*({} for _ in range(count)), *rows], list(range(count, len(values))), values
+
+
+def _graph(function: ca.Function, variables: ca.SX, parameters: ca.SX) -> tuple[_Edges, list[int], list[ca.SX]]:
+    """The edges between active results, the place of every output, and all values.
+
+    The first places are the variables; a result that does not depend on them has no edges.
+    """
+    values = ca.vertsplit(variables) if variables.numel() else []
+    edges: _Edges = [{} for _ in values]
+    active, at, ends = [True] * len(values), dict[int, int](), [0] * function.numel_out(0)
+    for k in range(function.n_instructions()):
+        kind, operands, target = (
+            function.instruction_id(k),
+            function.instruction_input(k),
+            function.instruction_output(k),
+        )
+        if kind == ca.OP_OUTPUT:
+            ends[target[1]] = at[operands[0]]
+            continue
+        if kind == ca.OP_INPUT and operands[0] == 0:
+            at[target[0]] = operands[1]
+            continue
+        by: dict[int, ca.SX] = {}
+        if kind == ca.OP_INPUT:
+            value = parameters[operands[1]]
+        elif kind == ca.OP_CONST:
+            value = ca.SX(function.instruction_constant(k))
+        else:
+            places = [at[j] for j in operands]
+            value, *slopes = _operation(kind, len(places))(*(values[j] for j in places))
+            for place, slope in zip(places, slopes, strict=True):
+                if active[place] and not slope.is_zero():
+                    by[place] = by[place] + slope if place in by else slope
+        at[target[0]] = len(values)
+        values.append(value)
+        edges.append(by)
+        active.append(bool(by))
+    return edges, ends, values
+
+
+@cache
+def _operation(kind: int, operands: int) -> ca.Function:
+    """Function operands -> (value, partial derivatives) of one elementary operation."""
+    symbols = [ca.SX.sym(name) for name in "ab"[:operands]]
+    value = ca.SX.unary(kind, *symbols) if operands < _OPERANDS else ca.SX.binary(kind, *symbols)
+    return ca.Function("fpirhc_operation", symbols, [value, *(ca.densify(ca.jacobian(value, s)) for s in symbols)])
+
+
+def _named(edges: _Edges, values: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """The partial derivatives that are not constant, each once, and symbols, which take their place at the edges."""
+    places = [(n, place) for n, by in enumerate(edges) for place, slope in by.items() if not slope.is_constant()]
+    slopes = ca.cse(ca.vertcat(*(edges[n][place] for n, place in places), *values))
+    partials, symbols = list[ca.SX](), dict[int, ca.SX]()
+    for (n, place), slope in zip(places, ca.vertsplit(slopes[: len(places)]) if places else [], strict=True):
+        key = slope.element_hash()
+        if key not in symbols:
+            symbols[key] = ca.SX.sym(f"m{len(partials)}")
+            partials.append(slope)
+        edges[n][place] = symbols[key]
+    if not partials:  # linear: a column must have an entry
+        return ca.SX(0.0), ca.SX.sym("m")
+    return ca.vertcat(*partials), ca.vertcat(*symbols.values())
+
+
+def _pulled(edges: _Edges, ends: list[int], weights: ca.SX, count: int) -> ca.SX:
+    """J' w, from the last result back to the variables."""
+    bars = [ca.SX(0) for _ in edges]
+    for end, weight in zip(ends, ca.vertsplit(weights), strict=True):
+        bars[end] += weight
+    for n in reversed(range(count, len(edges))):
+        for place, slope in edges[n].items():
+            bars[place] += slope * bars[n]
+    return ca.vertcat(*bars[:count])
+
+
+def _compressed(edges: _Edges, ends: list[int], count: int) -> Graph:
+    """The graph with the results at its end, and without what can be eliminated for nothing."""
+    first = len(edges)
+    back = [dict(by) for by in edges] + [{end: ca.SX(1)} if edges[end] or end < count else {} for end in ends]
+    ahead, between, left = _ahead(back), [n for n in range(count, first) if back[n]], 0
+    while len(between) != left:
+        left = len(between)
+        between = [n for n in between if _adds_edges(back[n], ahead[n]) or _eliminate(n, back, ahead)]
+    return Graph(back, between, count, range(first, first + len(ends)))
+
+
+def _ahead(back: _Edges) -> list[set[int]]:
+    """For every place, the places that depend on it."""
+    ahead: list[set[int]] = [set() for _ in back]
+    for n, by in enumerate(back):
+        for place in by:
+            ahead[place].add(n)
+    return ahead
+
+
+def _adds_edges(by: dict[int, ca.SX], after: set[int]) -> bool:
+    return len(by) * len(after) > len(by) + len(after)
+
+
+def _eliminate(n: int, back: _Edges, ahead: list[set[int]]) -> bool:
+    """Connect what is before and after a result, and take it out; returns False, for filters."""
+    for later in ahead[n]:
+        slope, by = back[later].pop(n), back[later]
+        for place, before in back[n].items():
+            product = slope * before
+            by[place] = by[place] + product if place in by else product
+            ahead[place].add(later)
+    for place in back[n]:
+        ahead[place].discard(n)
+    return False
+
+
+def slopes_function(rule: ChainRule, name: str) -> ca.Function:
+    """Function m -> the slopes of the graph that are not 1, in the order in which `tangent_code` reads them."""
+    slopes = [slope for slope in _slopes(rule.graph) if not slope.is_one()]
+    return ca.Function(name, [rule.symbols], [ca.cse(ca.densify(ca.vertcat(*slopes, 0)))])
+
+
+def tangent_code(rule: ChainRule, name: str, slopes: str, blocks: tuple[int, int]) -> str:
+    """Return C code of `name`, CasADi's signature, m -> (A, B, l_s, l_u), for the results (s+, l) of the variables (s, u).
+
+    All directions of a tangent stand side by side: a line that does all of them at once is a loop of known length, which compilers
+    turn into wide instructions,  t_n[:] = sum over the operands k of n of (dn/dk) t_k[:],  for every result n that is left after
+    the eliminations that add no edge.
+
+    Args:
+        rule: both parts of the derivative.
+        name: of the C function.
+        slopes: name of the compiled `slopes_function`.
+        blocks: sizes of s and u.
+    """
+    graph, (ns, nu) = rule.graph, blocks
+    width = -(-(ns + nu) // _WIDE) * _WIDE
+    row = {n: k for k, n in enumerate([*graph.between, *graph.results])}
+    count, lines = 0, list[str]()
+    for n in row:
+        terms, units = list[str](), list[str]()
+        for place, slope in graph.slopes[n].items():
+            factor = "1" if slope.is_one() else f"e[{count}]"
+            count += not slope.is_one()
+            if place < graph.variables:
+                units.append(f"t[{row[n]}][{place}] += {factor};")
+            else:
+                terms.append(f"{factor} * t[{row[place]}][j]" if factor != "1" else f"t[{row[place]}][j]")
+        lines.append(f"for (j = 0; j < {width}; ++j) t[{row[n]}][j] = {' + '.join(terms) or 'ALL(0)'};")
+        lines += units
+    first = len(graph.between)
+    return _TEXT.format(
+        name=name,
+        slopes=slopes,
+        count=count + 1,
+        rows=len(row),
+        width=width,
+        first=first,
+        ns=ns,
+        nu=nu,
+        lines="\n  ".join(lines),
+    )
+
+
+def _slopes(graph: Graph) -> list[ca.SX]:
+    return [slope for n in (*graph.between, *graph.results) for slope in graph.slopes[n].values()]
+
 
 _MANY = 16  # directions from which on loops over all of them beat scalar code: 24 directions took .76 of the time, 12 took 1.03
 

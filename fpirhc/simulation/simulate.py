@@ -1,8 +1,7 @@
-"""Runs a closed loop and logs every signal.
+"""Runs a closed loop and logs every signal, and computes those that judge the run from its log.
 
-The loop's one-cycle Function is accumulated over a chunk of cycles inside CasADi (compiled when a C compiler is found),
-so Python is entered once per chunk: to fill in disturbances and noise, to check that all signals are finite, to report
-progress.
+The loop's one-cycle Function is accumulated over a chunk of cycles inside CasADi (compiled when a C compiler is found), so Python
+is entered once per chunk: for disturbances and noise, to check that all signals are finite, to report progress.
 """
 
 from __future__ import annotations
@@ -11,27 +10,36 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
+import casadi as ca
 import numpy as np
 
+from fpirhc.broken import attempted
+from fpirhc.contraction.measured import identified_factor, jacobians_along
+from fpirhc.contraction.spectrum import factors_along
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
+from fpirhc.controllers.reference_states import own_signals
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.log import with_common_columns
 from fpirhc.simulation.loop import close_loop, start_memory
-from fpirhc.simulation.path import Exchange, disturbance_values, moving
+from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, disturbance_values, moving
 from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.run_signals import judgements
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record, set_point_table
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.native import Native, native
 from fpirhc.symbolic.program import chained
+from fpirhc.task.exogenous import model_values, real_values, rows_of
 from fpirhc.task.problem import Problem
 
 _CHAIN = 5  # cycles of the inner chain of the virtual machine
@@ -375,3 +383,126 @@ def stopped(problem: Problem, cycle: int, what: str) -> str:
     """Return the reason why a run ended before this cycle."""
     when = f"at t = {cycle * problem.period:g} {problem.time_unit} (cycle {cycle})"
     return f"{what} {when}; the run keeps the cycles before it"
+
+
+_CHUNK = 500  # cycles whose costs are evaluated in one call
+Judgement = tuple[Signal, np.ndarray]
+_COSTS: Latest[tuple[OptimalControl, Evaluator]] = Latest(
+    2
+)  # every controller of a comparison is judged by the same cost
+
+
+def judgements(
+    problem: Problem, controller: Controller, layout: Layout, log: np.ndarray, broken: list[str]
+) -> list[Judgement]:
+    """Return 'cost' by term where there is one of states that really are, and 'contraction' where the controller adapts.
+
+    Sentences about signals that break are added to `broken`.
+    """
+    judged: list[Judgement | None] = []
+    # A cost of states that the reality does not have is nobody's.
+    whole = "plant_state" in layout and layout["plant_state"].elements == problem.plant.state.elements
+    if problem.cost is not None and problem.horizon is not None and whole:
+        judged.append(attempted("the signal 'cost'", _costs, problem, layout, log, broken=broken))
+    gain = controller.deformation.effective_gain()
+    of_responses = controller.response(problem) is None and controller.deforms != "target"
+    if gain != 0 and log.shape[0] and of_responses:
+        named = "the signal 'contraction'"
+        factors = attempted(named, _contraction, problem, controller, layout, log, broken=broken)
+        finite = factors is not None and np.isfinite(factors).all()
+        judged += [(scalar("contraction"), factors[:, None])] if factors is not None and finite else []
+    return [one for one in judged if one is not None]
+
+
+def _contraction(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:
+    """Return the factor of every cycle: of the Jacobian at an instant, with a reality of the one over a cycle.
+
+    Plant and model have the signals from outside of the cycle. With a foreign reality it is the factor that the run shows, the same
+    in every cycle, or NaN.
+    """
+    states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
+    gain, model = controller.deformation.effective_gain(), controller.plant_model(problem)
+    iteration = controller.deformation.iteration
+    if not problem.equations_known:
+        shown = (
+            np.nan
+            if problem.response_delay
+            else identified_factor(deformed, log[:, layout.slice("realised")], gain, iteration.weights)
+        )
+        return np.full(len(log), shown)
+    own = model.plant
+    plant, real = (
+        (own, states) if problem.reality is None else (problem.real_plant, log[:, layout.slice(REALITY_STATE)])
+    )
+    times = log[:, layout.slice("time")].ravel() + problem.period / 2
+    exact = rows_of(real_values(plant, problem.signals), times, plant.exact)
+    believed = rows_of(model_values(own, model.signals), times, model.parameters(own))
+    modelled = problem if own is problem.plant else replace(problem, plant=own)
+
+    def jacobians(rows: np.ndarray) -> np.ndarray:
+        parameters = believed[rows], exact[rows]
+        return iteration.weighted(jacobians_along(modelled, real[rows], states[rows], deformed[rows], *parameters))
+
+    return factors_along(len(log), jacobians, gain)
+
+
+def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:
+    """Return the stage cost of every cycle by term, at the actual state and command, with the exact parameters.
+
+    With a reality it is the model's cost at the states that really were, with the exact values of the model's own parameters.
+    The same cost judges all controllers of a problem, whatever their models: effort relative to a feedforward is relative to the
+    feedforward of the plant.
+    """
+    shifted, own = LOGGED in layout.names, bool(own_signals(problem))
+    ocp, evaluator = _COSTS.of((problem,), (shifted,), lambda: _cost_evaluator(problem, shifted=shifted))
+    states = log[:, layout.slice("plant_state")]
+    commands = log[:, layout.slice("command")]
+    states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
+    times = log[:, layout.slice("time")]
+    # Along the reference that the run had, where it is no function of the time alone.
+    motion = [log[:, layout.slice(name)] for name in ("reference", "reference_response")] if own else []
+    # A disturbed output is h + d; its error is that of h to the reference less d.
+    shift = [log[:, layout.slice(LOGGED)]] if shifted else []
+    costs = np.empty((log.shape[0], len(ocp.terms)))
+    evaluator.arguments[-1][:] = problem.plant.exact
+    for at in range(0, log.shape[0], _CHUNK):
+        size = min(_CHUNK, log.shape[0] - at)
+        for argument, source in zip(evaluator.arguments, (times, *motion, *shift, states, commands), strict=False):
+            argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
+        evaluator.evaluate()
+        costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
+    return Signal("cost", tuple(ocp.terms)), costs
+
+
+def _cost_evaluator(problem: Problem, *, shifted: bool) -> tuple[OptimalControl, Evaluator]:
+    """A horizon of one cycle, and its cost terms of many cycles."""
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    plant, own = problem.plant, bool(own_signals(problem))
+    one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={}, lengths=())
+    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
+    outside = real_values(plant, problem.signals)
+    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
+    return ocp, Evaluator(_cost_function(ocp, data_of, _CHUNK, shifted=shifted))
+
+
+def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shifted: bool) -> ca.Function:
+    """Function (times, [states and responses of the reference], [shift], states, inputs, parameters) -> cost terms of many cycles.
+
+    There are `count` cycles. The shift is subtracted from the reference.
+    """
+    t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
+    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(data_of.n_in() - 1))
+    motion = [ca.MX.sym(data_of.name_in(k), data_of.size1_in(k)) for k in range(1, data_of.n_in() - 1)]
+    data = data_of(t, *(ca.repmat(m, 1, 2) for m in motion), p)[:, 0]
+    if shifted:
+        place = ocp.data.slice("reference")
+        shift = ca.MX.sym("shift", place.stop - place.start)
+        data = ca.vertcat(data[: place.start], data[place] - shift, data[place.stop :])
+        motion = [*motion, shift]
+    one = ca.Function("fpirhc_cost", [t, *motion, s, u, p], [ocp.stage_cost(s, u, data)[1]])
+    times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
+    inputs = ca.MX.sym("u", ocp.input.size, count)
+    moves = [ca.MX.sym(m.name(), m.size1(), count) for m in motion]
+    terms = one.map(count)(times, *moves, states, inputs, ca.repmat(p, 1, count))
+    return ca.Function("fpirhc_costs", [times, *moves, states, inputs, p], [terms])

@@ -14,7 +14,7 @@ import numpy as np
 
 import fpirhc as fp
 from attack.problems import line_task
-from fpirhc.baselines.reading import read_baseline
+from fpirhc.baselines.check import read_baseline
 from fpirhc.errors import FpirhcError
 from fpirhc.studies.scenarios.ledger import Ledger
 

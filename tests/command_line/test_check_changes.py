@@ -12,10 +12,10 @@ from blessed import write_problems
 import fpirhc as fp
 from fpirhc.baselines.bands import BANDED, Expected, Metric
 from fpirhc.baselines.baseline import Baseline, Settings, to_text
+from fpirhc.baselines.check import new_metrics, new_settings, read_baseline
 from fpirhc.baselines.judging import BETTER, CHANGED, HOLDS, WORSE, Judgement, Row, ignoring, judge
 from fpirhc.baselines.measuring import FINISHED, Measurement
 from fpirhc.baselines.printing import cells, change, explained, headline, in_summary, sentence, show_check, to_markdown
-from fpirhc.baselines.reading import new_metrics, new_settings, read_baseline
 from fpirhc.cli.options import percent
 
 

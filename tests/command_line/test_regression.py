@@ -16,6 +16,7 @@ from blessed import LINE, NOISY, write_problems
 import fpirhc as fp
 from fpirhc.baselines.bands import BANDED, EXACT, FACTOR, KINDS, TIGHT, Expected, expected
 from fpirhc.baselines.baseline import fingerprint, settings_of, to_text
+from fpirhc.baselines.check import read_baseline
 from fpirhc.baselines.judging import Judgement, Row, judge
 from fpirhc.baselines.measuring import (
     DIVERGED,
@@ -31,7 +32,6 @@ from fpirhc.baselines.measuring import (
 )
 from fpirhc.baselines.places import problems_here
 from fpirhc.baselines.printing import to_markdown
-from fpirhc.baselines.reading import read_baseline
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
 from fpirhc.errors import BaselineError, InvalidName

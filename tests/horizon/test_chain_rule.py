@@ -12,6 +12,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.horizon.hessian_models import (
+    chain_rule,
     hessian_stage,
     linear_stage,
     linearise_stage,
@@ -22,7 +23,6 @@ from fpirhc.horizon.hessian_models import (
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.symbolic.chain_rule import chain_rule
 from fpirhc.symbolic.native import find_compiler, native
 
 X, P = ca.SX.sym("x", 3), ca.SX.sym("p", 2)

@@ -14,7 +14,7 @@ from fpirhc.review.answer import Verdict
 from fpirhc.review.question import known_questions
 from fpirhc.review.questions.gain import GAIN
 from fpirhc.review.questions.reference import COMMANDS
-from fpirhc.simulation import run_signals
+from fpirhc.simulation import simulate as simulating
 from fpirhc.studies.comparison import compare as comparing
 from fpirhc.studies.comparison import pairwise
 
@@ -80,7 +80,7 @@ def test_a_null_test_that_breaks_loses_no_comparison(monkeypatch):
 
 def test_a_signal_that_breaks_after_the_run_does_not_lose_it(monkeypatch):
     """The run has its own signals, and says which one is missing."""
-    monkeypatch.setattr(run_signals, "_contraction", breaks)
+    monkeypatch.setattr(simulating, "_contraction", breaks)
     run = fp.simulate(PROBLEM, CONTROLLERS["CTC+FPI (eq 6)"], seed=0, compiled=False)
     assert run.cycles == 50
     assert "contraction" not in run.layout
