@@ -151,6 +151,20 @@ def add_json(parser: Parser, instead: str) -> None:
     parser.add_argument("--json", action="store_true", help=f"print one JSON object instead of {instead}")
 
 
+def add_fails(parser: Parser) -> None:
+    """--fails SHARE."""
+    text = "rms error from which a run has failed, as a share of the reference's range (default: 0.5)"
+    parser.add_argument("--fails", type=float, default=argparse.SUPPRESS, metavar="SHARE", help=text)
+
+
+def add_study(parser: Parser, folder: str, seeds: str) -> None:
+    """--seed, --out, --no-compile and --json of a study that prints a table."""
+    add_seed(parser, seeds)
+    add_out(parser, f"results/PROBLEM/{folder}")
+    add_no_compile(parser)
+    add_json(parser, "the table")
+
+
 def add_format(parser: Parser, table: str, default: str | None) -> None:
     """--format csv or parquet."""
     text = f"kind of the file with {table} (default: {default or 'no such file'}); parquet needs pyarrow"

@@ -118,6 +118,13 @@ def reproducing(verb: Verb, options: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
+def study_settings(verb: Verb, options: argparse.Namespace, *own: str) -> dict[str, Any]:
+    """Return what every study is given of a command line, and those of its own options that stand there, by name."""
+    stated = {name: getattr(options, name) for name in own if hasattr(options, name)}
+    common = {"controllers": options.controllers, "seed": options.seed, "compiled": not options.no_compile}
+    return {**common, "command": reproducing(verb, options), **stated}
+
+
 def _as_given(action: argparse.Action, value: Any) -> list[str]:
     """The words of an option; what may be given again is given once for each of its values."""
     option = action.option_strings[-1]

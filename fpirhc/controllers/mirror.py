@@ -156,7 +156,7 @@ BEFORE = "_deformation_before"
 _STATE, _OFFSET, _ACTED = "mirror_state", "mirror_offset", "mirror_acted"
 
 
-Kept: TypeAlias = Callable[[Expression], dict[str, Expression]]  # of a move of the estimate: what the twin remembers
+After: TypeAlias = Callable[[Expression], dict[str, Expression]]  # of a move of the estimate: what the twin remembers
 
 
 def _twin(path: CommandPath, motion: _States | _Outputs) -> Block:
@@ -175,11 +175,11 @@ def _twin(path: CommandPath, motion: _States | _Outputs) -> Block:
         end, mean, remembered = path.acted(s)
         parameters, signals = path.parameters(s)
         waits = path.cycles(s) < path.late + 0.5  # the samples still show the start
-        sample, more, kept = motion.sample(s, end, mean, parameters, waits)
+        sample, more, after = motion.sample(s, end, mean, parameters, waits)
         shown, response, *memories = estimate.function(sample, *(getattr(s, m.name) for m in own))
         away = getattr(s, motion.reads[0].name) - shown
         move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
-        remembered |= kept(move) | signals
+        remembered |= after(move) | signals
         for signal, value, matrix in zip(own, memories, moves, strict=True):
             remembered[f"{signal.name}_next"] = value + matrix @ move
         return {"_modelled": response if more is None else response + more, **remembered}
@@ -214,17 +214,17 @@ class _States:
 
     def sample(
         self, s: Signals, end: Expression, mean: Expression, parameters: Expression, waits: Expression
-    ) -> tuple[Expression, Expression | None, Kept]:
+    ) -> tuple[Expression, Expression | None, After]:
         """Return the sample of the cycle, what it adds to the estimated response, and what is remembered after a move."""
         acting, answered, next_deformations = self._past.seen(s)
         at = ca.if_else(waits, s.mirror_state, self._advance(s.mirror_state, mean, parameters, -acting))
         sample, part = self._seen(at, end, parameters, -acting[self._controlled]), self._path.fraction
 
-        def kept(move: Expression) -> dict[str, Expression]:
+        def after(move: Expression) -> dict[str, Expression]:
             late = {"mirror_sample_next": sample + self._shown @ move} if part else {}
             return {f"{_STATE}_next": at + self._ahead @ move, **next_deformations, **late}
 
-        return (1 - part) * sample + part * s.mirror_sample if part else sample, answered, kept
+        return (1 - part) * sample + part * s.mirror_sample if part else sample, answered, after
 
 
 class _Deformations:
@@ -330,7 +330,7 @@ class _Outputs:
 
     def sample(
         self, s: Signals, end: Expression, mean: Expression, parameters: Expression, waits: Expression
-    ) -> tuple[Expression, Expression | None, Kept]:
+    ) -> tuple[Expression, Expression | None, After]:
         """Return the sample of the cycle, nothing that it adds to the response, and what is remembered after a move."""
         path, part, remembered = self._path, self._path.fraction, dict[str, Expression]()
         if part:
@@ -346,13 +346,13 @@ class _Outputs:
         at = ca.if_else(waits, s.mirror_state, later)
         offset = ca.if_else(waits, s.mirror_offset, self._ahead @ s.mirror_offset)
 
-        def kept(move: Expression) -> dict[str, Expression]:
+        def after(move: Expression) -> dict[str, Expression]:
             measured = getattr(s, MEASURED)
             measured = ca.if_else(is_finite(measured), measured, at)
             turn = self._chain(at, end, parameters) - self._chain(measured, end, parameters)
             return {f"{_STATE}_next": measured, f"{_OFFSET}_next": offset + move + turn, **remembered}
 
-        return self._seen(at, end, parameters, offset), None, kept
+        return self._seen(at, end, parameters, offset), None, after
 
 
 def _starts(problem: Problem) -> tuple[Signal, Signal]:

@@ -328,22 +328,22 @@ def mismatch_figure(comparison: ScenarioComparison) -> Drawing:
     return figure
 
 
-def limits_figure(found: OperatingLimits) -> Drawing:
+def limits_figure(result: OperatingLimits) -> Drawing:
     """Return the figure of the error against what grows, a panel per quantity and a colour per controller."""
     colours = dict(
-        zip(dict.fromkeys(one.controller for one in found.limits), PALETTE * len(found.limits), strict=False)
+        zip(dict.fromkeys(one.controller for one in result.limits), PALETTE * len(result.limits), strict=False)
     )
-    shown = [q for q in found.quantities if any(one.quantity is q for one in found.limits)]
+    shown = [q for q in result.quantities if any(one.quantity is q for one in result.limits)]
     columns = min(len(shown), _PANELS)
     rows = -(-len(shown) // columns)
-    figure = new_figure(5.5 * columns, 3.8 * rows, f"{found.problem}: error against what grows")
+    figure = new_figure(5.5 * columns, 3.8 * rows, f"{result.problem}: error against what grows")
     axes = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
-    finite = [p.error for one in found.limits for p in one.points if np.isfinite(p.error)]
-    edge = 10 * max(10 * found.fails, min(max(finite, default=1.0), 1e3 * found.fails))
+    finite = [p.error for one in result.limits for p in one.points if np.isfinite(p.error)]
+    edge = 10 * max(10 * result.fails, min(max(finite, default=1.0), 1e3 * result.fails))
     for axis, quantity in zip(axes, shown, strict=False):
-        for one in (one for one in found.limits if one.quantity is quantity):
+        for one in (one for one in result.limits if one.quantity is quantity):
             _draw_limit(axis, one, colours[one.controller], edge)
-        axis.axhline(100 * found.fails, color="#777777", ls="--", lw=1)
+        axis.axhline(100 * result.fails, color="#777777", ls="--", lw=1)
         axis.set_xscale("log")
         axis.set_yscale("log")
         axis.set_ylim(top=150 * edge)
@@ -368,19 +368,19 @@ def _draw_limit(axis: Axes, one: OperatingLimit, colour: str, edge: float) -> No
 _FAILED = "#d8d8d8"
 
 
-def sweep_figure(found: Sweep) -> Drawing:
+def sweep_figure(result: Sweep) -> Drawing:
     """Return the figure of a sweep: lines over one setting; over two a map per controller, and one of who is best."""
-    return _sweep_lines(found) if len(found.axes) == 1 else _sweep_maps(found)
+    return _sweep_lines(result) if len(result.axes) == 1 else _sweep_maps(result)
 
 
-def _sweep_lines(found: Sweep) -> Drawing:
-    [over] = found.axes
-    figure = new_figure(9.0, 4.5, f"{found.problem}: over {over.path}")
+def _sweep_lines(result: Sweep) -> Drawing:
+    [over] = result.axes
+    figure = new_figure(9.0, 4.5, f"{result.problem}: over {over.path}")
     axis = figure.subplots()
-    for one, colour in zip(found.maps, PALETTE * len(found.maps), strict=False):
+    for one, colour in zip(result.maps, PALETTE * len(result.maps), strict=False):
         shown = np.where(one.outcomes == "finished", one.values, np.nan)
         axis.plot(
-            over.values, [found.aim.told(v) for v in shown], ".-", color=colour, lw=1.5, label=literal(one.controller)
+            over.values, [result.aim.told(v) for v in shown], ".-", color=colour, lw=1.5, label=literal(one.controller)
         )
         failed = [v for v, outcome in zip(over.values, one.outcomes, strict=True) if outcome != "finished"]
         axis.plot(
@@ -388,84 +388,84 @@ def _sweep_lines(found: Sweep) -> Drawing:
         )
         if over.path in one.now:
             axis.axvline(one.now[over.path], color=colour, ls=":", lw=1)
-    _scale_of(axis, found)
+    _scale_of(axis, result)
     axis.set_xlabel(literal(over.path))
-    axis.set_ylabel(literal(_figure_label(found)))
+    axis.set_ylabel(literal(_figure_label(result)))
     axis.grid(visible=True, alpha=0.25)
     draw_legend(axis)
     return figure
 
 
-def _sweep_maps(found: Sweep) -> Drawing:
+def _sweep_maps(result: Sweep) -> Drawing:
     from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
-    several = len(found.maps) > 1
-    count = len(found.maps) + several
+    several = len(result.maps) > 1
+    count = len(result.maps) + several
     columns = min(count, _PANELS)
     rows = -(-count // columns)
-    figure = new_figure(4.6 * columns, 3.9 * rows, f"{found.problem}: {_figure_label(found)}")
+    figure = new_figure(4.6 * columns, 3.9 * rows, f"{result.problem}: {_figure_label(result)}")
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-    told = [np.vectorize(found.aim.told)(np.where(m.outcomes == "finished", m.values, np.inf)) for m in found.maps]
+    told = [np.vectorize(result.aim.told)(np.where(m.outcomes == "finished", m.values, np.inf)) for m in result.maps]
     numbers = np.concatenate([values[np.isfinite(values)] for values in told])
     low, high = (float(numbers.min()), float(numbers.max())) if numbers.size else (0.1, 1.0)
     high = high if high > low else low + 1
     norm = LogNorm(low, high) if low > 0 else Normalize(low, high)
     drawn = None
-    for axis, one, values in zip(panels, found.maps, told, strict=False):
-        drawn = _draw_map(axis, found, values, cmap="viridis", norm=norm)
+    for axis, one, values in zip(panels, result.maps, told, strict=False):
+        drawn = _draw_map(axis, result, values, cmap="viridis", norm=norm)
         axis.set_title(literal(one.controller))
-        if all(path.path in one.now for path in found.axes):
-            axis.plot(*(one.now[over.path] for over in found.axes), "o", mfc="none", mec="white", mew=1.5)
+        if all(path.path in one.now for path in result.axes):
+            axis.plot(*(one.now[over.path] for over in result.axes), "o", mfc="none", mec="white", mew=1.5)
     if several:
-        axis = panels[len(found.maps)]
-        colours = [PALETTE[k % len(PALETTE)] for k in range(len(found.maps))]
-        best = np.where(found.winners >= 0, found.winners, np.nan)
-        _draw_map(axis, found, best, cmap=ListedColormap(colours), norm=Normalize(-0.5, len(colours) - 0.5))
-        for one, colour in zip(found.maps, colours, strict=True):
+        axis = panels[len(result.maps)]
+        colours = [PALETTE[k % len(PALETTE)] for k in range(len(result.maps))]
+        best = np.where(result.winners >= 0, result.winners, np.nan)
+        _draw_map(axis, result, best, cmap=ListedColormap(colours), norm=Normalize(-0.5, len(colours) - 0.5))
+        for one, colour in zip(result.maps, colours, strict=True):
             axis.plot([], [], "s", color=colour, label=literal(one.controller))
         axis.set_title("best")
         draw_legend(axis)
     for axis in panels[count:]:
         axis.remove()
     if drawn is not None:
-        figure.colorbar(drawn, ax=panels[: len(found.maps)], label=literal(_figure_label(found)))
+        figure.colorbar(drawn, ax=panels[: len(result.maps)], label=literal(_figure_label(result)))
     return figure
 
 
-def sweep_panels(figure: Drawing, found: Sweep) -> list[dict[str, Any]]:
+def sweep_panels(figure: Drawing, result: Sweep) -> list[dict[str, Any]]:
     """Return where the panels of a drawn figure lie, and where the values of the settings in them, as shares of its size."""
     panels = []
     for axis in (one for one in figure.axes if one.get_label() != "<colorbar>"):
         to_figure, (left, bottom) = axis.transData - figure.transFigure, (axis.get_xlim()[0], axis.get_ylim()[0])
-        across = to_figure.transform([(v, bottom) for v in found.axes[0].values])[:, 0]
-        along = [to_figure.transform([(left, v) for v in over.values])[:, 1] for over in found.axes[1:]]
+        across = to_figure.transform([(v, bottom) for v in result.axes[0].values])[:, 0]
+        along = [to_figure.transform([(left, v) for v in over.values])[:, 1] for over in result.axes[1:]]
         ends = axis.get_position()
         centres = [values.tolist() for values in (across, *along)]
         panels.append({"low": [*map(float, ends.min)], "high": [*map(float, ends.max)], "centres": centres})
     return panels
 
 
-def sweep_cells(found: Sweep) -> dict[str, Any]:
+def sweep_cells(result: Sweep) -> dict[str, Any]:
     """Return what is said of every cell of a sweep, and the command of its run."""
-    axes = [{"path": a.path, "values": [number(v) for v in a.values], "set": found.set_texts(a)} for a in found.axes]
+    axes = [{"path": a.path, "values": [number(v) for v in a.values], "set": result.set_texts(a)} for a in result.axes]
     maps = [
         {
             "controller": one.controller,
             "without": list(one.without),
-            "run": found.run_command(one.controller),
+            "run": result.run_command(one.controller),
             "cells": [
-                f"{found.aim.name} {found.aim.text(float(v))}" if outcome == "finished" else str(outcome)
+                f"{result.aim.name} {result.aim.text(float(v))}" if outcome == "finished" else str(outcome)
                 for v, outcome in zip(one.values.ravel(), one.outcomes.ravel(), strict=True)
             ],
         }
-        for one in found.maps
+        for one in result.maps
     ]
-    return {"axes": axes, "maps": maps, "seed": f" --seed {found.seed}"}
+    return {"axes": axes, "maps": maps, "seed": f" --seed {result.seed}"}
 
 
-def _draw_map(axis: Axes, found: Sweep, values: np.ndarray, **colours: Any) -> Any:
+def _draw_map(axis: Axes, result: Sweep, values: np.ndarray, **colours: Any) -> Any:
     """One map; cells without a number are grey."""
-    across, along = found.axes
+    across, along = result.axes
     axis.set_facecolor(_FAILED)
     masked = np.ma.masked_invalid(values.T)
     mesh = axis.pcolormesh(across.values, along.values, masked, shading="nearest", **colours)
@@ -476,17 +476,17 @@ def _draw_map(axis: Axes, found: Sweep, values: np.ndarray, **colours: Any) -> A
     return mesh
 
 
-def _scale_of(axis: Axes, found: Sweep) -> None:
-    [over] = found.axes
+def _scale_of(axis: Axes, result: Sweep) -> None:
+    [over] = result.axes
     if over.logarithmic:
         axis.set_xscale("log" if over.values[0] > 0 else "symlog")
-    finished = [v for one in found.maps for v in one.values[one.outcomes == "finished"]]
+    finished = [v for one in result.maps for v in one.values[one.outcomes == "finished"]]
     if finished and min(finished) > 0 and max(finished) > 10 * min(finished):
         axis.set_yscale("log")
 
 
-def _figure_label(found: Sweep) -> str:
-    return f"{found.aim.name} [{found.aim.unit}]" if found.aim.unit not in ("", "1") else found.aim.name
+def _figure_label(result: Sweep) -> str:
+    return f"{result.aim.name} [{result.aim.unit}]" if result.aim.unit not in ("", "1") else result.aim.name
 
 
 def _medians(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:

@@ -242,21 +242,21 @@ def _of_cases(wanted: Picture, kept: Mapping[str, Sequence[Mapping[str, Kept]]])
     return _drawn(wanted, list(shown), lambda figure: wanted.draw_cases(figure, readable(shown)))
 
 
-def render_limits(found: OperatingLimits) -> str:
+def render_limits(result: OperatingLimits) -> str:
     """Return the page's text."""
     return render_charted(
-        found.view, limits_figure(found) if found.limits else None, "Error against what grows", _LIMITS
+        result.view, limits_figure(result) if result.limits else None, "Error against what grows", _LIMITS
     )
 
 
-def render_sweep(found: Sweep) -> str:
+def render_sweep(result: Sweep) -> str:
     """Return the page's text."""
-    figure, name = sweep_figure(found), " and ".join(axis.path for axis in found.axes)
-    caption = f"{_SWEEP if len(found.axes) > 1 else _LINES} {_CELL}"
+    figure, name = sweep_figure(result), " and ".join(axis.path for axis in result.axes)
+    caption = f"{_SWEEP if len(result.axes) > 1 else _LINES} {_CELL}"
     chart = Image(figure.address, f"Over {name}", caption)  # drawn first: only then it is known where its panels lie
-    data = json.dumps({**sweep_cells(found), "panels": sweep_panels(figure, found)}, separators=(",", ":"))
+    data = json.dumps({**sweep_cells(result), "panels": sweep_panels(figure, result)}, separators=(",", ":"))
     script = f"const SWEEP={_in_script(data)};\n{asset('sweep.js')}"
-    return render_page("scenarios.html", found.view, [script], chart=chart, own=(), cells=True)
+    return render_page("scenarios.html", result.view, [script], chart=chart, own=(), cells=True)
 
 
 def _in_script(data: str) -> str:

@@ -149,9 +149,9 @@ class Points:
             self._ideals[place] = self.asked.at(quiet)
         return self._ideals[place]
 
-    def noisy(self, place: int, kept: np.ndarray) -> LinearLoop:
+    def noisy(self, place: int, correlation: np.ndarray) -> LinearLoop:
         """Return the linear loop at a point behind the noise of the sensors, see `AskedLoop.noisy`."""
-        return self.asked.noisy(self.quiet(place), kept)
+        return self.asked.noisy(self.quiet(place), correlation)
 
     def shaken(self, place: int, corners: Sequence[tuple[float, float]]) -> tuple[LinearLoop, ...]:
         """Return the linear loops at a point behind noise of the response that the map sees, see `AskedLoop.shaken`."""

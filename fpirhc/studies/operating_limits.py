@@ -34,7 +34,7 @@ from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
 
 FAILS = 0.5  # relative error from which a run has failed, where nothing else is said
-_PRECISE = 1.05  # between the value that fails and the one that holds
+_NEAR = 1.05  # between the value that fails and the one that holds
 _HALVINGS = 14  # below the first value that is tried
 _OUTSIDE = 0.02  # of a limit's width: a state farther outside has left it
 _SAMPLES = 2000
@@ -140,12 +140,12 @@ class OperatingLimits(Study):
         Raises:
             InvalidName: there is none.
         """
-        found = {f"{one.controller}: {one.quantity.name}": one for one in self.limits}
+        result = {f"{one.controller}: {one.quantity.name}": one for one in self.limits}
         key = f"{controller}: {quantity}"
-        if key not in found:
+        if key not in result:
             why = self.untried.get((controller, quantity), "")
-            raise InvalidName(f"no limit '{key}'{f' ({why})' if why else ''}.{nearest(key, found)}")
-        return found[key]
+            raise InvalidName(f"no limit '{key}'{f' ({why})' if why else ''}.{nearest(key, result)}")
+        return result[key]
 
     @property
     def view(self) -> View:
@@ -232,7 +232,7 @@ def _limit(name: str, quantity: Quantity, loops: _Loops) -> OperatingLimit:
             points[value] = _tried(quantity, value, loops)
         return bool(points[value].why)
 
-    holds, fails = (math.nan, quantity.start) if failed(quantity.start) else _bracket(quantity, failed)
+    holds, fails = (math.nan, quantity.start) if failed(quantity.start) else _limits(quantity, failed)
     why = points[fails].why if fails in points else ""
     return OperatingLimit(name, quantity, holds, fails, why, tuple(points[v] for v in sorted(points)))
 
@@ -247,19 +247,35 @@ def _tried(quantity: Quantity, value: float, loops: _Loops) -> Point:
         return Point(value, math.inf, str(error).partition(";")[0])
 
 
-def _bracket(quantity: Quantity, failed: Callable[[float], bool]) -> tuple[float, float]:
-    """The largest value that holds and the smallest one that fails, near each other; infinity where none fails."""
-    holds, fails = quantity.start, min(quantity.first, quantity.most)
+def _limits(quantity: Quantity, failed: Callable[[float], bool]) -> tuple[float, float]:
+    step = quantity.first if quantity.whole else 0.0
+    return bracket(failed, quantity.start, quantity.first, quantity.most, step=step)
+
+
+def bracket(
+    failed: Callable[[float], bool], start: float, first: float, most: float, *, step: float = 0.0, near: float = _NEAR
+) -> tuple[float, float]:
+    """Return the largest value that holds and the smallest one that fails, by doubling and halving; infinity where none fails.
+
+    Args:
+        failed: whether a value fails; the start does not.
+        start: value that holds.
+        first: the first value that is tried.
+        most: the largest one.
+        step: of which all values are multiples; 0: they are any.
+        near: ratio of both from which they are near enough.
+    """
+    holds, fails = start, min(first, most)
     while not failed(fails):
-        if fails >= quantity.most:
+        if fails >= most:
             return fails, math.inf
-        holds, fails = fails, min(2 * fails, quantity.most)
+        holds, fails = fails, min(2 * fails, most)
     for _ in range(_HALVINGS):
-        if fails <= _PRECISE * holds or (quantity.whole and fails - holds < 1.5 * quantity.first):
+        if fails <= near * holds or fails - holds < 1.5 * step:
             break
         middle = math.sqrt(holds * fails) if holds > 0 else fails / 2
-        if quantity.whole:
-            middle = quantity.first * round((holds + fails) / 2 / quantity.first)
+        if step:
+            middle = step * round((holds + fails) / 2 / step)
         holds, fails = (holds, middle) if failed(middle) else (middle, fails)
     return holds, fails
 
@@ -468,42 +484,42 @@ _MAKERS: dict[str, Callable[[Problem], Quantity]] = {
 # --- What is said of it -------------------------------------------------------------------------------------------------
 
 
-def _view(found: OperatingLimits) -> View:
+def _view(result: OperatingLimits) -> View:
     conditions = (
-        f"A run fails if it ends early, leaves a limit of a state, or has an rms error above {in_percent(found.fails)} of the "
+        f"A run fails if it ends early, leaves a limit of a state, or has an rms error above {in_percent(result.fails)} of the "
         "reference's range. Controllers do not know of what grows, except of the period. Cells are the smallest value that "
         "fails; 5 % below, or one cycle below a latency, the run holds."
     )
-    heads = [Column("controller"), *(Column(f"{q.name} [{q.unit}]") for q in found.quantities)]
-    cells = {(one.controller, one.quantity.name): one for one in found.limits}
-    controllers = dict.fromkeys(one.controller for one in found.limits)
-    table = Table(f"{found.problem}: where controllers fail", heads, conditions)
+    heads = [Column("controller"), *(Column(f"{q.name} [{q.unit}]") for q in result.quantities)]
+    cells = {(one.controller, one.quantity.name): one for one in result.limits}
+    controllers = dict.fromkeys(one.controller for one in result.limits)
+    table = Table(f"{result.problem}: where controllers fail", heads, conditions)
     for name in controllers:
-        row = [cells.get((name, q.name)) for q in found.quantities]
+        row = [cells.get((name, q.name)) for q in result.quantities]
         table.add([name, *("not tried" if one is None else one.text for one in row)])
     reasons = [
         f"{one.controller}, {one.quantity.name}: {one.why}"
-        for one in found.limits
+        for one in result.limits
         if one.why and not one.why.startswith("error of")
     ]
     untried: dict[str, list[str]] = {}
-    for (name, what), why in found.untried.items():
+    for (name, what), why in result.untried.items():
         untried.setdefault(f"{what}: {why}", []).append(name)
-    everyone = {name for name, _ in found.untried} | set(controllers)
+    everyone = {name for name, _ in result.untried} | set(controllers)
     lacking = [text if set(names) == everyone else f"{', '.join(names)}, {text}" for text, names in untried.items()]
-    return found.viewed(
-        sentences=[(text, None) for text in _sentences(found)],
+    return result.viewed(
+        sentences=[(text, None) for text in _sentences(result)],
         conditions=conditions,
         tables=(table,),
         lists={"What failed": reasons, "Not tried": lacking},
-        facts=_facts(found),
+        facts=_facts(result),
     )
 
 
-def _sentences(found: OperatingLimits) -> Iterator[str]:
+def _sentences(result: OperatingLimits) -> Iterator[str]:
     """Who bears most of each quantity, and who least."""
-    for quantity in found.quantities:
-        rows = [one for one in found.limits if one.quantity.name == quantity.name]
+    for quantity in result.quantities:
+        rows = [one for one in result.limits if one.quantity.name == quantity.name]
         if not rows:
             continue
 
@@ -526,12 +542,12 @@ def _said(one: OperatingLimit) -> str:
     return f"fails at {one.quantity.text(one.fails)}"
 
 
-def _facts(found: OperatingLimits) -> dict[str, Any]:
+def _facts(result: OperatingLimits) -> dict[str, Any]:
     return {
-        "problem": found.problem,
-        "fails": found.fails,
-        "seed": found.seed,
-        "versions": found.versions,
+        "problem": result.problem,
+        "fails": result.fails,
+        "seed": result.seed,
+        "versions": result.versions,
         "limits": [
             {
                 "controller": one.controller,
@@ -542,7 +558,7 @@ def _facts(found: OperatingLimits) -> dict[str, Any]:
                 "why": one.why,
                 "runs": [[p.value, p.error, p.why] for p in one.points],
             }
-            for one in found.limits
+            for one in result.limits
         ],
-        "untried": [{"controller": c, "quantity": q, "why": why} for (c, q), why in found.untried.items()],
+        "untried": [{"controller": c, "quantity": q, "why": why} for (c, q), why in result.untried.items()],
     }

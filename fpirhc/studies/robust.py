@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 
@@ -22,7 +22,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.lanes import run_many
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.operating_limits import FAILS, Judge, Point
+from fpirhc.studies.operating_limits import FAILS, Judge, Point, bracket
 from fpirhc.studies.scenarios.bench import ranges
 from fpirhc.studies.scenarios.draws import SEARCHING
 from fpirhc.studies.view import Progress, Study, View, circumstances
@@ -207,29 +207,14 @@ def _robust_box(name: str, plants: _Plants, most: int, progress: Progress | None
                 progress(name, len(asked), steps)
         return asked[percent]
 
-    holds, fails = _largest(lambda percent: not worst(percent).why, most)
-    if holds < 0:
+    if worst(0).why:
         return RobustBox(name, math.nan, 0.0, asked[0].why, asked[0].error, asked[0].error, None)
-    found, example = plants.search(holds)
+    low, fails = bracket(lambda percent: bool(worst(int(percent)).why), 0, _FIRST, most, step=1, near=1.0)
+    holds, why = int(low), asked[int(fails)].why if math.isfinite(fails) else ""
+    largest, example = plants.search(holds)
     if progress:
         progress(name, steps, steps)
-    why = asked[fails].why if fails <= most else ""
-    above = float(fails) if fails <= most else math.inf
-    return RobustBox(name, float(holds), above, why, asked[holds].error, found, example)
-
-
-def _largest(holds: Callable[[int], bool], most: int) -> tuple[int, int]:
-    """The largest box that holds and the smallest one above that fails, as bisection finds them; -1 where none holds."""
-    low, high = -1, 0
-    while high <= most and holds(high):
-        low, high = high, most if 0 < high < most <= 2 * high else max(_FIRST, 2 * high)
-        if low == most:
-            return most, most + 1
-    high = min(high, most + 1)
-    while high - low > 1 and low >= 0:
-        middle = (low + high) // 2
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low, high
+    return RobustBox(name, float(holds), float(fails), why, asked[holds].error, largest, example)
 
 
 class _Plants:
@@ -320,17 +305,17 @@ class _Plants:
             differential_evolution(
                 negative_error, limits, init=start, maxiter=generations, tol=0, polish=False, seed=self._seed
             )
-        except _Found as found:
-            return largest, self._counterexample(percent, found, noise)
+        except _Found as failing:
+            return largest, self._counterexample(percent, failing, noise)
         return largest, None
 
-    def _counterexample(self, percent: int, found: _Found, noise: int) -> Counterexample:
+    def _counterexample(self, percent: int, failing: _Found, noise: int) -> Counterexample:
         holds, fails = 0, percent
         while fails - holds > 1:
             middle = (holds + fails) // 2
-            holds, fails = (holds, middle) if self._point(middle, found.shares, noise).why else (middle, fails)
-        values = self._exact(percent, found.shares)
-        return Counterexample(dict(zip(self._parameters, map(float, values), strict=True)), found.point.why, fails)
+            holds, fails = (holds, middle) if self._point(middle, failing.shares, noise).why else (middle, fails)
+        values = self._exact(percent, failing.shares)
+        return Counterexample(dict(zip(self._parameters, map(float, values), strict=True)), failing.point.why, fails)
 
     def _exact(self, percent: int, shares: np.ndarray) -> np.ndarray:
         pairs = zip(self._parameters.values(), shares, strict=True)
@@ -359,37 +344,37 @@ class _Found(Exception):  # it ends a search and reports no error
 # --- What is said of it -------------------------------------------------------------------------------------------------
 
 
-def _view(found: RobustBoxes) -> View:
+def _view(result: RobustBoxes) -> View:
     conditions = (
-        f"A run fails if it ends early, leaves a limit of a state, or has an rms error above {in_percent(found.fails)} of the "
+        f"A run fails if it ends early, leaves a limit of a state, or has an rms error above {in_percent(result.fails)} of the "
         f"reference's range. The box of P percent holds the plants that scenarios with a mismatch of P percent draw. "
-        f"{found.draws} plants per box; where none fails, at most {in_percent(found.risk)} of all plants of the box do, with "
-        f"{in_percent(found.confidence)} confidence for all boxes at once."
+        f"{result.draws} plants per box; where none fails, at most {in_percent(result.risk)} of all plants of the box do, with "
+        f"{in_percent(result.confidence)} confidence for all boxes at once."
     )
     heads = ["controller", "box [%]", "fails at [%]", "worst drawn", "worst found", "counterexample from [%]"]
-    table = Table(f"{found.problem}: how wrong the model may be", [Column(head) for head in heads], conditions)
-    for one in found.boxes:
+    table = Table(f"{result.problem}: how wrong the model may be", [Column(head) for head in heads], conditions)
+    for one in result.boxes:
         example = "none found" if one.counterexample is None else str(one.counterexample.from_percent)
         errors = (_error(one.worst_drawn), _error(one.worst_found))
         table.add([one.controller, _percent(one.percent), _percent(one.fails_at), *errors, example])
-    examples = [f"{one.controller}: {_plant(one.counterexample)}" for one in found.boxes if one.counterexample]
-    return found.viewed(
-        sentences=[(text, None) for text in _sentences(found)],
+    examples = [f"{one.controller}: {_plant(one.counterexample)}" for one in result.boxes if one.counterexample]
+    return result.viewed(
+        sentences=[(text, None) for text in _sentences(result)],
         conditions=conditions,
         tables=(table,),
         lists={"Plants of the boxes that fail": examples},
-        skipped=found.untried,
+        skipped=result.untried,
         facts={
-            **{name: getattr(found, name) for name in ("problem", "risk", "confidence", "draws", "fails", "seed")},
-            "boxes": [asdict(one) for one in found.boxes],
-            "untried": dict(found.untried),
-            "versions": found.versions,
+            **{name: getattr(result, name) for name in ("problem", "risk", "confidence", "draws", "fails", "seed")},
+            "boxes": [asdict(one) for one in result.boxes],
+            "untried": dict(result.untried),
+            "versions": result.versions,
         },
     )
 
 
-def _sentences(found: RobustBoxes) -> Iterator[str]:
-    for one in sorted(found.boxes, key=lambda box: -1.0 if math.isnan(box.percent) else box.percent, reverse=True):
+def _sentences(result: RobustBoxes) -> Iterator[str]:
+    for one in sorted(result.boxes, key=lambda box: -1.0 if math.isnan(box.percent) else box.percent, reverse=True):
         if math.isnan(one.percent):
             yield f"{one.controller}: fails as the problem stands ({one.why})."
             continue

@@ -164,10 +164,10 @@ class Sweep(Study):
         Raises:
             InvalidName: there is none.
         """
-        found = {one.controller: one for one in self.maps}
-        if controller not in found:
-            raise InvalidName(f"no map of '{controller}'.{nearest(controller, found)}")
-        return found[controller]
+        result = {one.controller: one for one in self.maps}
+        if controller not in result:
+            raise InvalidName(f"no map of '{controller}'.{nearest(controller, result)}")
+        return result[controller]
 
     def run_command(self, controller: str) -> str:
         """Return the beginning of the command that runs a controller; settings and seed follow."""
@@ -422,8 +422,8 @@ class _Runner:
         return int(np.ravel_multi_index(tuple(place), self._grid.shape))
 
     def _settings(self, place: Sequence[int]) -> dict[str, float]:
-        found = self._grid.settings(place, list(self._now))
-        return {p: round(v) if is_whole(self._controller, p) else v for p, v in found.items()}
+        result = self._grid.settings(place, list(self._now))
+        return {p: round(v) if is_whole(self._controller, p) else v for p, v in result.items()}
 
     @cached_property
     def _live(self) -> bool:
@@ -449,96 +449,96 @@ class _Runner:
 # --- What is said of it --------------------------------------------------------------------------------------------------
 
 
-def _view(found: Sweep) -> View:
-    cells = math.prod(len(axis.values) for axis in found.axes)
+def _view(result: Sweep) -> View:
+    cells = math.prod(len(axis.values) for axis in result.axes)
     over = " and ".join(
         f"{axis.path} from {number(axis.values[0])} to {number(axis.values[-1])} in {len(axis.values)} values"
         + (" by equal factors" if axis.logarithmic else "")
-        for axis in found.axes
+        for axis in result.axes
     )
     conditions = (
-        f"{cells} runs of a controller over {over}, with the noise of seed {found.seed}; {found.aim.name} is judged. A run "
+        f"{cells} runs of a controller over {over}, with the noise of seed {result.seed}; {result.aim.name} is judged. A run "
         "fails if it ends early, diverges (an rms error above the reference's range) or is refused; best and worst "
         "are of those that finished."
     )
     heads = [Column(head) for head in ("controller", "failed", "best", "at", "worst")]
-    table = Table(f"{found.problem}: over {' and '.join(axis.path for axis in found.axes)}", heads, conditions)
-    for one in found.maps:
-        table.add([one.controller, in_percent(one.failed), *_extremes(found, one)])
+    table = Table(f"{result.problem}: over {' and '.join(axis.path for axis in result.axes)}", heads, conditions)
+    for one in result.maps:
+        table.add([one.controller, in_percent(one.failed), *_extremes(result, one)])
     reasons = [
         f"{one.controller}: {int((one.outcomes == kind).sum())} {kind}{f', such as: {why}' if why else ''}"
-        for one in found.maps
+        for one in result.maps
         for kind, why in one.reasons.items()
     ]
     built = [
         f"{one.controller}: {', '.join(one.rebuilt)} cannot be live, so every value has a loop of its own"
-        for one in found.maps
+        for one in result.maps
         if one.rebuilt
     ]
     same = [
         f"{one.controller} has no {', '.join(one.without)}: it is the same along it"
-        for one in found.maps
+        for one in result.maps
         if one.without
     ]
     lists = {"Why runs failed": reasons, "How it was run": [*built, *same]}
-    return found.viewed(
-        sentences=[(text, None) for text in _sentences(found)],
+    return result.viewed(
+        sentences=[(text, None) for text in _sentences(result)],
         conditions=conditions,
         tables=(table,),
         lists=lists,
-        facts=_facts(found),
+        facts=_facts(result),
     )
 
 
-def _extremes(found: Sweep, one: SweepMap) -> list[str]:
+def _extremes(result: Sweep, one: SweepMap) -> list[str]:
     """The best number, where it is, and the largest one of a run that finished."""
     if not np.isfinite(one.values).any():
         return ["none", "", ""]
     best = np.unravel_index(int(np.argmin(one.values)), one.values.shape)
     at = ", ".join(
         f"{axis.path} = {number(axis.values[k])}"
-        for axis, k in zip(found.axes, best, strict=True)
+        for axis, k in zip(result.axes, best, strict=True)
         if axis.path not in one.without
     )
     finished = one.values[one.outcomes == "finished"]
-    largest = found.aim.text(float(finished.max())) if finished.size else "none"
-    return [found.aim.text(float(one.values[best])), at, largest]
+    largest = result.aim.text(float(finished.max())) if finished.size else "none"
+    return [result.aim.text(float(one.values[best])), at, largest]
 
 
-def _sentences(found: Sweep) -> Iterator[str]:
+def _sentences(result: Sweep) -> Iterator[str]:
     """Who is best where, and who fails."""
-    cells, places = found.winners.size, found.winners.ravel()
-    if len(found.maps) > 1:
-        shares = sorted(((int((places == k).sum()), one.controller) for k, one in enumerate(found.maps)), reverse=True)
+    cells, places = result.winners.size, result.winners.ravel()
+    if len(result.maps) > 1:
+        shares = sorted(((int((places == k).sum()), one.controller) for k, one in enumerate(result.maps)), reverse=True)
         told = ", ".join(f"{name} in {count}" for count, name in shares if count)
-        yield f"{found.aim.subject[0].upper()}{found.aim.subject[1:]} is best with: {told or 'none alone'} of {cells} cells."
-    for one in found.maps:
+        yield f"{result.aim.subject[0].upper()}{result.aim.subject[1:]} is best with: {told or 'none alone'} of {cells} cells."
+    for one in result.maps:
         failed = int((one.outcomes != "finished").sum())
         yield f"{one.controller} fails in {failed} of {cells} cells." if failed else f"{one.controller} fails nowhere."
 
 
-def _facts(found: Sweep) -> dict[str, Any]:
+def _facts(result: Sweep) -> dict[str, Any]:
     return {
-        "problem": found.problem,
-        "title": found.title,
-        "seed": found.seed,
-        "figure": found.aim.name,
-        "axes": [{"path": a.path, "values": list(a.values), "logarithmic": a.logarithmic} for a in found.axes],
+        "problem": result.problem,
+        "title": result.title,
+        "seed": result.seed,
+        "figure": result.aim.name,
+        "axes": [{"path": a.path, "values": list(a.values), "logarithmic": a.logarithmic} for a in result.axes],
         "maps": [
             {
                 "controller": one.controller,
-                "values": [found.aim.told(float(v)) for v in one.values.ravel()],
+                "values": [result.aim.told(float(v)) for v in one.values.ravel()],
                 "outcomes": [str(v) for v in one.outcomes.ravel()],
                 "reasons": dict(one.reasons),
                 "without": list(one.without),
                 "rebuilt": list(one.rebuilt),
                 "as it stands": dict(one.now),
             }
-            for one in found.maps
+            for one in result.maps
         ],
         "order": "the last setting is the fastest",
-        "sentences": list(_sentences(found)),
-        "settings": found.settings,
-        "versions": found.versions,
-        "command": found.command,
+        "sentences": list(_sentences(result)),
+        "settings": result.settings,
+        "versions": result.versions,
+        "command": result.command,
     }

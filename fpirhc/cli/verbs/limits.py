@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_out, add_problem, add_seed
-from fpirhc.cli.output import publish, reproducing, results_folder
+from fpirhc.cli.options import add_controllers, add_fails, add_problem, add_study
+from fpirhc.cli.output import publish, results_folder, study_settings
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -14,12 +14,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_controllers(parser)
     text = "what grows: mismatch, latency, noise, lost, period, or names of parameters (default: these five)"
     parser.add_argument("--over", nargs="+", metavar="NAME", help=text)
-    text = "rms error from which a run has failed, as a share of the reference's range (default: 0.5)"
-    parser.add_argument("--fails", type=float, metavar="SHARE", help=text)
-    add_seed(parser, "noise and lost samples")
-    add_out(parser, "results/PROBLEM/limits")
-    add_no_compile(parser)
-    add_json(parser, "the table")
+    add_fails(parser)
+    add_study(parser, "limits", "noise and lost samples")
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -29,24 +25,15 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.figures import limits_figure, save_figure
     from fpirhc.report.html import render_limits
     from fpirhc.report.terminal import progress_bars
-    from fpirhc.studies.operating_limits import FAILS, operating_limits
+    from fpirhc.studies.operating_limits import operating_limits
 
     folder = results_folder(options.out, task.name, "limits")
     with progress_bars() as progress:
-        found = operating_limits(
-            task,
-            over=options.over,
-            controllers=options.controllers,
-            fails=FAILS if options.fails is None else options.fails,
-            seed=options.seed,
-            compiled=not options.no_compile,
-            command=reproducing(VERB, options),
-            progress=progress,
-        )
-    if found.limits:
-        save_figure(limits_figure(found), folder / "limits.png")
-    publish(found.view, render_limits(found), folder, as_json=options.json)
-    return ExitCode.FINISHED if found.limits else ExitCode.BAD_INPUT
+        result = operating_limits(task, **study_settings(VERB, options, "over", "fails"), progress=progress)
+    if result.limits:
+        save_figure(limits_figure(result), folder / "limits.png")
+    publish(result.view, render_limits(result), folder, as_json=options.json)
+    return ExitCode.FINISHED if result.limits else ExitCode.BAD_INPUT
 
 
 VERB = Verb(

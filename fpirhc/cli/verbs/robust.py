@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_out, add_problem, add_seed
-from fpirhc.cli.output import publish, reproducing, results_folder
+from fpirhc.cli.options import add_controllers, add_fails, add_problem, add_study
+from fpirhc.cli.output import publish, results_folder, study_settings
 from fpirhc.cli.verb import ExitCode, Verb
 
 _SHARES = {
     "risk": "largest share of the plants of a box that may fail (default: 0.05)",
     "confidence": "with which that is said (default: 0.999)",
-    "fails": "rms error from which a run has failed, as a share of the reference's range (default: 0.5)",
 }
 
 
@@ -20,10 +19,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_controllers(parser)
     for name, text in _SHARES.items():
         parser.add_argument(f"--{name}", type=float, default=argparse.SUPPRESS, metavar="SHARE", help=text)
-    add_seed(parser, "the draws and the noise")
-    add_out(parser, "results/PROBLEM/robust")
-    add_no_compile(parser)
-    add_json(parser, "the table")
+    add_fails(parser)
+    add_study(parser, "robust", "the draws and the noise")
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -35,19 +32,10 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.robust import robust_boxes
 
     folder = results_folder(options.out, task.name, "robust")
-    shares = {name: getattr(options, name) for name in _SHARES if hasattr(options, name)}
     with progress_bars() as progress:
-        found = robust_boxes(
-            task,
-            controllers=options.controllers,
-            **shares,
-            seed=options.seed,
-            compiled=not options.no_compile,
-            command=reproducing(VERB, options),
-            progress=progress,
-        )
-    publish(found.view, render_charted(found.view), folder, as_json=options.json)
-    return ExitCode.FINISHED if found.boxes else ExitCode.BAD_INPUT
+        result = robust_boxes(task, **study_settings(VERB, options, *_SHARES, "fails"), progress=progress)
+    publish(result.view, render_charted(result.view), folder, as_json=options.json)
+    return ExitCode.FINISHED if result.boxes else ExitCode.BAD_INPUT
 
 
 VERB = Verb(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_controllers, add_format, add_json, add_no_compile, add_out, add_problem, add_seed
-from fpirhc.cli.output import publish, reproducing, results_folder, resumable, table_writer
+from fpirhc.cli.options import add_controllers, add_format, add_problem, add_study
+from fpirhc.cli.output import publish, results_folder, resumable, study_settings, table_writer
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -16,10 +16,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_controllers(parser)
     text = "figure of merit, such as settling.q1 (default: the problem's headline metric, or the relative error)"
     parser.add_argument("--metric", metavar="NAME", help=text)
-    add_seed(parser, "noise, the same in every run")
-    add_out(parser, "results/PROBLEM/sweep_PATH...")
-    add_no_compile(parser)
-    add_json(parser, "the table")
+    add_study(parser, "sweep_PATH...", "noise, the same in every run")
     add_format(parser, "a row per run", "csv")
 
 
@@ -36,20 +33,10 @@ def _run(options: argparse.Namespace) -> ExitCode:
     axes = [Axis.parsed(text) for text in options.over]
     folder = results_folder(options.out, task.name, "_".join(["sweep", *(axis.path for axis in axes)]))
     with resumable(folder / LEDGER), progress_bars() as progress:
-        found = sweep(
-            task,
-            axes,
-            folder=folder,
-            controllers=options.controllers,
-            metric=options.metric,
-            seed=options.seed,
-            compiled=not options.no_compile,
-            command=reproducing(VERB, options),
-            progress=progress,
-        )
-    write_table(found.to_dataframe(), folder / "sweep")
-    save_figure(sweep_figure(found), folder / "sweep.png")
-    publish(found.view, render_sweep(found), folder, as_json=options.json)
+        result = sweep(task, axes, folder=folder, **study_settings(VERB, options, "metric"), progress=progress)
+    write_table(result.to_dataframe(), folder / "sweep")
+    save_figure(sweep_figure(result), folder / "sweep.png")
+    publish(result.view, render_sweep(result), folder, as_json=options.json)
     return ExitCode.FINISHED
 
 

@@ -351,12 +351,12 @@ def _noisy_loops(case: Case) -> list[tuple[LinearLoop, np.ndarray]] | None:
     times, random = case.problem.period * np.arange(_DRAWN), np.random.default_rng(0)
     series = np.array([one.values(times, random) for one in noises])
     points, variances = points_of(case.grid, case.controller), series.var(axis=1)
-    kept = np.mean(series[:, 1:] * series[:, :-1], axis=1) / np.maximum(variances, 1e-300)
-    kept = np.where(np.abs(kept) < _WHITE, 0.0, kept)
-    loops = [points.noisy(k, kept) for k in thinned(case.loops.places, _POINTS)]
+    correlation = np.mean(series[:, 1:] * series[:, :-1], axis=1) / np.maximum(variances, 1e-300)
+    correlation = np.where(np.abs(correlation) < _WHITE, 0.0, correlation)
+    loops = [points.noisy(k, correlation) for k in thinned(case.loops.places, _POINTS)]
     if any(np.abs(one.poles).max(initial=0.0) >= 1 for one in loops):
         return None
-    return [(one, np.diag(variances * (1 - kept**2))) for one in loops]
+    return [(one, np.diag(variances * (1 - correlation**2))) for one in loops]
 
 
 NOISE_PAIR = "Are gain and filter those that the sensors' noise asks for?"

@@ -300,12 +300,12 @@ class AskedLoop:
         """Return the linear loop of the period that begins at a memory."""
         return self._among([self._period(memory)])[0]
 
-    def noisy(self, memory: np.ndarray, kept: np.ndarray) -> LinearLoop:
+    def noisy(self, memory: np.ndarray, correlation: np.ndarray) -> LinearLoop:
         """Return the linear loop behind the noise of the sensors, n+ = c n + w, with the commands that are sent for v.
 
         Args:
             memory: at which it is linearised.
-            kept: c, shape (noises,); zero for white noise.
+            correlation: c, shape (noises,); zero for white noise.
 
         Raises:
             NotSupported: no sensor has noise.
@@ -316,7 +316,7 @@ class AskedLoop:
         ways = [[self._noise.way(at, self._scales(period[0]))] for at in period]
         directions = self._directions(ways, self._noise.width, None)
         plain = self._linear(directions, 0, self._scales(period[0])[self._places], self._command)
-        return plain.with_noise([at.kicked[0][1][self._command] for at in directions], kept)
+        return plain.with_noise([at.kicked[0][1][self._command] for at in directions], correlation)
 
     @cached_property
     def _noise(self) -> Step | None:

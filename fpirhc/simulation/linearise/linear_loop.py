@@ -89,16 +89,18 @@ class LinearLoop:
         )
         return (neutral & no_error) | (lasting & nothing)
 
-    def with_noise(self, told: Sequence[np.ndarray], kept: np.ndarray) -> LinearLoop:
+    def with_noise(self, feedthrough: Sequence[np.ndarray], correlation: np.ndarray) -> LinearLoop:
         """Return the loop whose w is a noise n+ = c n + w, of which z remembers the present value.
 
         Args:
-            told: of every cycle, what n adds to v at once, shape (nu, nw).
-            kept: c, shape (nw,); zero for white noise.
+            feedthrough: of every cycle, what n adds to v at once, shape (nu, nw).
+            correlation: c, shape (nw,); zero for white noise.
         """
-        width, cycles = len(kept), []
-        for one, at_once in zip(self.cycles, told, strict=True):
-            dynamics = np.block([[one.dynamics, one.entry], [np.zeros((width, one.dynamics.shape[1])), np.diag(kept)]])
+        width, cycles = len(correlation), []
+        for one, at_once in zip(self.cycles, feedthrough, strict=True):
+            dynamics = np.block(
+                [[one.dynamics, one.entry], [np.zeros((width, one.dynamics.shape[1])), np.diag(correlation)]]
+            )
             entry = np.vstack([np.zeros_like(one.entry), np.eye(width)])
             state = np.pad(one.state, ((0, 0), (0, width)))
             cycles.append(LinearCycle(dynamics, entry, np.hstack([one.arriving, at_once]), state))
