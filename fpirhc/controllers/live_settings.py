@@ -196,7 +196,8 @@ class LiveSettings:
 
     def _accepts(self, path: str, value: float) -> bool:
         try:
-            self.changed({path: value})
+            with np.errstate(over="ignore", invalid="ignore"):  # bounds are sought with numbers of any size
+                self.changed({path: value})
         except FpirhcError:
             return False
         return True

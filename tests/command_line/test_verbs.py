@@ -410,7 +410,7 @@ def test_exit_codes_are_those_of_the_help(verb, folder, monkeypatch, capsys):
     )
     # Loops are compiled for a page in tests of their own, where zig is.
     monkeypatch.setattr("fpirhc.export.lab.lab.package", lambda *_: None)
-    monkeypatch.setattr("fpirhc.export.lab.lab.web_module", lambda _: b"")
+    monkeypatch.setattr("fpirhc.export.lab.loop.web_module", lambda _: b"")
     FAULTY.clear()
     if verb.name == "completion":
         pytest.importorskip("shtab")
@@ -471,7 +471,7 @@ def test_bless_is_accept_for_one_version(folder, capsys):
     printed = capsys.readouterr().err
     assert "the command 'bless' is now 'accept'" in printed
     assert "needs a reason" in printed
-    with pytest.raises(fp.FpirhcError, match=r"fpirhc\.bless is called fpirhc\.accept now"):
+    with pytest.raises(fp.FpirhcError, match=r"fpirhc\.bless is called fpirhc\.baselines\.check\.accept now"):
         getattr(fp, "bless")  # noqa: B009 -- a type checker knows that it is gone
 
 
