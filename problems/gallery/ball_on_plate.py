@@ -111,8 +111,9 @@ tuning = {
 
 
 def seen_from_above(q, v, p):
-    """The plate and the ball."""
-    return [fp.Shape.box((0.0, 0.0), PLATE, PLATE), fp.Shape.disc((q.x, q.y), RADIUS)]
+    """The edge of the plate and the ball."""
+    edge = [(PLATE / 2 * a, PLATE / 2 * b) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    return [fp.Shape.line(*edge), fp.Shape.disc((q.x, q.y), RADIUS)]
 
 
 pictures = (fp.Planar("The plate from above", plant, seen_from_above, controllers=headline),)

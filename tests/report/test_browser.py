@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +69,9 @@ def visit(browser: Any) -> Iterator[Any]:
     """Function (path of a page, width, colour scheme) -> the opened page, after its first frames."""
     contexts = []
 
-    def opened(path: Path, width: int = 1280, scheme: str = "light") -> Opened:
-        contexts.append(browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme))
+    def opened(path: Path, width: int = 1280, scheme: str = "light", motion: str = "no-preference") -> Opened:
+        screen = {"width": width, "height": 800}
+        contexts.append(browser.new_context(viewport=screen, color_scheme=scheme, reduced_motion=motion))
         one = Opened(contexts[-1].new_page())
         one.page.on("console", lambda m: one.complaints.append(m.text) if m.type in ("error", "warning") else None)
         one.page.on("pageerror", lambda error: one.complaints.append(str(error)))
@@ -265,6 +266,43 @@ def test_nothing_is_loaded_from_anywhere(name, reports, visit):
     assert one.page.evaluate("window.intruder") is None
     elsewhere = [r for r in one.requests if not r.startswith("file:")]
     assert {one.refusals[r] for r in elsewhere} == {"csp"}  # a network that fails would say so in other words
+
+
+@pytest.fixture(scope="session")
+def drawn(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report with a mechanism that moves and a picture over place and time."""
+    del browser
+    shipped = fp.load_problem("ball_on_plate")
+    both = {name: shipped.controllers[name] for name in ("RHC", "RHC+FPI")}
+    heat = fp.HeatMap("Place", rows=("plant_state.x", "plant_state.y"), place="axis", quantity="place")
+    short = replace(shipped.problem, duration=2.0, measure_from=0.0)
+    pictures = (*shipped.pictures, heat)
+    task = replace(shipped, problem=short, controllers=both, tuning={}, pictures=pictures)
+    path = tmp_path_factory.mktemp("drawn") / "drawn.html"
+    write_report(compare(task, seed=0, compiled=False), path)
+    return path
+
+
+@pytest.mark.parametrize("motion", ["no-preference", "reduce"])
+def test_a_mechanism_plays_when_it_is_asked(motion, drawn, visit, pictures):
+    """It rests at first, plays and pauses by its button, follows its slider; nothing is fetched, whatever the reader prefers."""
+    opened = visit(drawn, 1280, "light", motion)
+    page = opened.page
+
+    def after(milliseconds: int) -> float:
+        page.wait_for_timeout(milliseconds)
+        return float(page.inner_text(".motion output").removesuffix(" s"))
+
+    assert after(300) == 0.0
+    page.click(".motion button")
+    assert after(500) > 0.0
+    page.click(".motion button")
+    assert after(100) == after(300)
+    page.fill(".motion input[type=range]", "500")
+    assert after(100) == pytest.approx(1.0)
+    assert opened.complaints == []
+    assert all(r.startswith(("data:", drawn.as_uri())) for r in opened.requests)
+    page.screenshot(path=pictures / f"mechanism-{motion}.png", full_page=True)
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
