@@ -2,14 +2,15 @@
 
     live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
 
-A path begins at the controller, or at the problem for cost, limits, dead times, reference, sensing and disturbances. The path of an
-interval stands for its finite ends, 'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a
-sigmoid, are recomputed from the others. A number that no block reads may be live where the loop is the same one for other numbers.
+A path begins at the controller, or at the problem. The path of an interval stands for its ends, 'limits.inputs.Q1.0' and '.1'.
+Automatic settings, such as the scale of a sigmoid, follow from the others. A number that no block reads may be live where the loop
+is the same one for others. The exact parameters of a reality are data of every loop: 'reality.plant.parameters.m.exact'.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import cast
@@ -30,7 +31,9 @@ from fpirhc.symbolic.paths import changed_at, content_at, names_in, opened, path
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
-OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances")
+OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances", "reality")
+MOVING = "_exact"  # signal of the parameters of what moves, in the memory of a loop
+_MOVED = re.compile(r"reality\.plant\.parameters\.(.+)\.exact")
 _ALWAYS_DATA = "Parameters (exact and approximate) and the start are data of every loop; they need no live setting"
 _IN_TABLES = ("sensing", "disturbances")  # of what Python makes tables before a run
 _NUDGES, _SMALLEST = (0.07, 2.0), 1e-3  # shares by which a number is changed to see whether the loop depends on it
@@ -75,10 +78,21 @@ class LiveSettings:
         """One signal per setting, with the number of the build as its start."""
         return Layout(tuple(scalar(PREFIX + path, start=value) for path, value in self.start.items()))
 
+    @property
+    def moved(self) -> dict[str, str]:
+        """Those paths that are parameters of what moves, with the parameters' names."""
+        return {path: found[1] for path in self.paths if (found := _MOVED.fullmatch(path))}
+
+    def place_moved(self, loop: Composite, path: str) -> int:
+        """Return the place of a parameter of what moves in the loop's memory."""
+        return int(loop.memory.slice(MOVING).start + loop.memory[MOVING].elements.index(self.moved[path]))
+
     def planted(self) -> tuple[Problem, Controller]:
         """Return problem and controller with live numbers in place of the settings."""
-        problem, controller = self.problem, self.controller
+        problem, controller, data = self.problem, self.controller, self.moved
         for path, value in self.start.items():
+            if path in data:
+                continue
             if self._in_problem(path):
                 problem = changed_at(problem, path, live_number(path, value), copied)
             else:
@@ -99,7 +113,9 @@ class LiveSettings:
             raise (self._refusal(error) if isinstance(interruption, Exception) else interruption) from None
         read = {s.name for b in composite.blocks for s in b.inputs.signals}
         for path in self.paths:
-            if PREFIX + path not in read:
+            if path in self.moved:
+                _require_moving(path, composite)
+            elif PREFIX + path not in read:
                 self._require_apart(path, composite, compose)
         _refuse_lost(composite, self.paths)
         return composite
@@ -327,6 +343,16 @@ def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Con
     raise InvalidName(
         f"setting '{path}': neither the controller nor the problem's {', '.join(OF_PROBLEM)} have '{first}'.{hint}"
     )
+
+
+def _require_moving(path: str, composite: Composite) -> None:
+    """Raise for a parameter of what moves where nothing moves.
+
+    Raises:
+        NotSupported: a controller alone, as on a machine.
+    """
+    if MOVING not in composite.memory:
+        raise not_live([path], "nothing moves in a controller alone; change the machine", " here")
 
 
 def _refuse_lost(composite: Composite, paths: Sequence[str]) -> None:

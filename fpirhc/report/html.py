@@ -432,7 +432,7 @@ def _tubes(entry: Entry, edges: np.ndarray) -> list[dict[str, Any]]:
     count, charts = min(run.cycles, len(prediction.tube)), []
     for c in (c for c in run.layout["error"].elements if c in places):
         half = prediction.tube[:count, places[c]]
-        apart = run[f"{motion}.{c}"][:count] - prediction.nominal.outputs[:count, places[c]]
+        apart = run[f"{motion}.{c}"][:count] - prediction.nominal.motion[:count, places[c]]
         lines = [("distance", apart), ("predicted at most", half), ("predicted at least", -half)]
         title = f"{entry.name}: {c}, distance from the model's own run"
         charts.append(_chart(title, run.unit(f"error.{c}"), lines, edges) | {"only": entry.name, "band": [2, 3]})

@@ -72,7 +72,7 @@ class NominalRun:
         return self.problem if same else replace(self.problem, plant=self.plant)
 
     @cached_property
-    def outputs(self) -> np.ndarray:
+    def motion(self) -> np.ndarray:
         """Outputs of the run and their derivatives, shape (cycles + 1, ny); without outputs the states."""
         plant, count = self.plant, len(self.states)
         rows = (

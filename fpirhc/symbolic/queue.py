@@ -16,7 +16,7 @@ import casadi as ca
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.functions import ceil, entry_at
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.live import expressed, is_live, live_numbers, nominal, not_live
+from fpirhc.symbolic.live import LiveNumber, expressed, is_live, live_numbers, nominal, not_live
 
 MOST = 1000  # cycles of dead time; the memory has a fixed size
 Cycles = float | tuple[float, ...]  # one dead time for all channels, or one for each
@@ -109,6 +109,10 @@ class Queue:
         )
         return ca.vertcat(*entries)
 
+    def at(self, queue: Expression, size: int, cycles: Expression) -> Expression:
+        """Return what was pushed so many cycles ago, all entries alike; the number is known at run time, up to the longest."""
+        return ca.vertcat(*(self._read(queue[j::size], cycles) for j in range(size)))
+
     def driven(
         self, step: ca.Function, state: Expression, queue: Expression, size: int, held: Sequence[Expression]
     ) -> Expression:
@@ -139,9 +143,9 @@ class Queue:
     def _reach(self, cycles: Cycles) -> int:
         return max(max(self._shares(c)) for c in every(cycles)) + 1
 
-    def _read(self, past: Expression, cycles: float) -> Expression:
+    def _read(self, past: Expression, cycles: float | Expression) -> Expression:
         """What was pushed a live number of cycles ago: the sum of `_shares`, in the same operations."""
-        delay = expressed(cycles, past)
+        delay = expressed(cycles, past) if isinstance(cycles, float | int | LiveNumber) else cycles
         whole = ca.floor(delay + _WHOLE)
         part = ca.if_else(whole < ca.ceil(delay - _WHOLE), ca.fmax(delay - whole, 0), 0)
         heights = [self._height(j) for j in range(-self.width, self.width + 1)]

@@ -581,12 +581,36 @@ def test_slotine_li_with_a_deformation_keeps_its_gradient():
     assert np.abs(run(controller, LATE["input"])["error"][5000:]).max() < 0.02
 
 
-def test_set_points_behind_dead_time_are_refused_for_the_gradient_alone():
-    """The error of an earlier instant needs the reference of that instant, which a filter of set-points does not remember."""
-    problem = fp.Problem(
-        hardening(), fp.Setpoint({"q": 0.3}, rate=4.0), {"q": 0.0}, period=1e-3, duration=0.05, dead_time=LATE["input"]
-    )
-    with pytest.raises(NotSupported, match=r"LyapunovRule pairs .* use Projection, or a Trajectory"):
-        fp.simulate(problem, AID, seed=0, compiled=False)
-    assert fp.simulate(problem, NLMS, seed=0, compiled=False).stop is None
-    assert set(BOX) == set(SLOW.bounds)
+def stepped(t):
+    """The motion of a filter of order 2 from rest at zero to a set-point of 0.3, in closed form."""
+    return {"q": 0.3 * (1 - ca.exp(-4 * t) * (1 + 4 * t))}
+
+
+AIM = fp.Setpoint({"q": 0.3}, rate=4.0, order=2, start={"q": 0.0})
+TAUGHT = {  # dead time, prediction of it, and the size of what a fraction of a cycle interpolates
+    "input": ({"inputs": {"u": 0.02}}, 0.0, 1e-9),
+    "measurement": ({"measurement": 0.02}, 0.0, 1e-9),
+    "fraction": ({"inputs": {"u": 0.01}, "measurement": 0.0125}, 0.0, 1e-5),
+    "predicted": ({"inputs": {"u": 0.02}}, 0.02, 1e-9),
+}
+
+
+@pytest.mark.parametrize("name", TAUGHT)
+def test_set_points_behind_dead_time_teach_what_a_trajectory_teaches(name):
+    """The filter of set-points moves as the closed form does, and the gradient is of the error of the same earlier instant.
+
+    A prediction leads the later state to the target of now, so its closed form is later by as much.
+    """
+    late, ahead, size = TAUGHT[name]
+
+    def moves(t):
+        return stepped(ca.if_else(t > ahead - 1e-9, t - ahead, 0))
+
+    controller = fp.Predicted(SLOW, inputs=ahead) if ahead else SLOW
+    runs = [
+        run(controller, fp.DeadTime(**late), 1.0, reference=r, start={"q": 0.0, "q'": 0.0})
+        for r in (AIM, fp.Trajectory(moves))
+    ]
+    np.testing.assert_allclose(runs[0]["estimate"], runs[1]["estimate"], atol=size)
+    np.testing.assert_allclose(runs[0]["command"], runs[1]["command"], atol=10 * size)
+    assert np.abs(runs[0]["estimate"][-1] - runs[0]["estimate"][0]).max() > 1e-3

@@ -108,7 +108,7 @@ def test_a_run_is_inside_the_tube_of_its_outputs(plans: bool) -> None:
     prediction = fp.predict_response(problem, controller, compiled=False)
     assert prediction.tube is not None
     first = round(problem.measure_from / problem.period)
-    away = np.abs(simulated(problem, controller)["output"] - prediction.nominal.outputs)[first:].max(axis=0)
+    away = np.abs(simulated(problem, controller)["output"] - prediction.nominal.motion)[first:].max(axis=0)
     half = prediction.tube[first:].max(axis=0)
     assert (away < half).all()
     assert (away > 0.1 * half).all()

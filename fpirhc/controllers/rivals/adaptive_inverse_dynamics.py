@@ -16,15 +16,15 @@ from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
-from fpirhc.errors import NotSupported
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.live import following, live_numbers, settled
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.live import following, live_numbers, nominal, settled
+from fpirhc.symbolic.queue import Queue, room
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, integral_signal
 from fpirhc.tracking.linear_law import Exponential
@@ -52,8 +52,8 @@ class AdaptiveInverseDynamics(Controller):
         combinations: expressions of parameters that enter linearly as a whole, by name.
         deformation: the fixed-point map between desired response and request.
 
-    `check` raises NotSupported where the plant is not fully actuated mechanics, or set-points stand behind dead time, and
-    InvalidValue where parameters enter nonlinearly or the bounds do not keep the mass matrix positive definite.
+    `check` raises NotSupported where the plant is not fully actuated mechanics, and InvalidValue where parameters enter
+    nonlinearly or the bounds do not keep the mass matrix positive definite.
 
     References:
         J. J. Craig, P. Hsu, S. S. Sastry, Adaptive control of mechanical manipulators, Int. J. Robotics Research 6(2), 1987.
@@ -70,17 +70,8 @@ class AdaptiveInverseDynamics(Controller):
         return True
 
     def check(self, problem: Problem) -> None:
-        """Raise if plant, bounds or rule do not fit, as `Learning.check` does.
-
-        Raises:
-            NotSupported: errors of an earlier instant, to set-points.
-        """
+        """Raise if plant, bounds or rule do not fit, as `Learning.check` does."""
         self._learning.check(problem, inverts=True)
-        if _late(problem) and given_signals(problem) and not self.rule.reads_response:
-            raise NotSupported(
-                f"{type(self.rule).__name__} pairs a response with the error of the same instant, and behind dead time set-points "
-                "are not remembered for it; use Projection, or a Trajectory"
-            )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         plant, regressor = problem.plant, self._learning.regressor(problem)
@@ -88,6 +79,7 @@ class AdaptiveInverseDynamics(Controller):
         believed = like(regressor.believed.parameter, "_believed")
         blocks = [
             *desired_blocks(problem, self.tracking),
+            *([_earlier_targets(problem)] if self._remembers(problem) else []),
             self._learn_block(problem),
             *(fed(block, "parameters", believed) for block in closing),
             bounded(problem, self.tracking).update(plant, problem.period),
@@ -128,7 +120,8 @@ class AdaptiveInverseDynamics(Controller):
         """The reference when the response was realised, and what it reads; no sample is older than the start."""
         plant, pairs = problem.plant, ResponsePairs(problem, problem.dead_time)
         if not _late(problem) or given_signals(problem):
-            return lambda s: s._target, (like(plant.output, "_target"),)
+            target = like(plant.output, _EARLIER if self._remembers(problem) else "_target")
+            return lambda s: getattr(s, target.name), (target,)
         reference = motion_of(problem)
 
         def then(s: Signals) -> Expression:
@@ -136,12 +129,38 @@ class AdaptiveInverseDynamics(Controller):
 
         return then, (replace(time_signal(plant), name=MEASURED_TIME), *own_signals(problem))
 
+    def _remembers(self, problem: Problem) -> bool:
+        """Whether it learns from errors of an earlier instant, to set-points, which only a memory knows."""
+        return bool(_late(problem) and given_signals(problem) and not self.rule.reads_response)
+
     def lyapunov_row(self) -> np.ndarray:
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""
         gains = self.tracking.gains(2)
         size = len(gains)
         weights = np.diag([self.tracking.rate ** (2.0 * (size - 1 - k)) for k in range(size)])
         return np.asarray(solve_continuous_lyapunov(companion(gains).T, -weights)[-1])
+
+
+_EARLIER = "_target_earlier"
+
+
+def _earlier_targets(problem: Problem) -> Block:
+    """Block (target, time, measured time) -> the target that the measured state was led to; before the run the first one."""
+    plant, period, pairs = problem.plant, problem.period, ResponsePairs(problem, problem.dead_time)
+    late = nominal(problem.dead_time.at_longest)
+    whole = late.measurement + max(late.inputs.values(), default=0.0)
+    queue = Queue(0.0, longest=room(whole) / period + problem.sensing.delay(plant, period))
+    target, time = like(plant.output, "_target"), time_signal(plant)
+    first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
+    memory = queue.memory("targets", target.elements, tuple(map(float, first)))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        column, remembered = queue.column(s, "targets", s._target)
+        ahead = s.time - getattr(s, MEASURED_TIME)  # of a prediction
+        return {_EARLIER: queue.at(column, target.size, (ahead + pairs.late) / period), **remembered}
+
+    reads = Layout((target, time, replace(time, name=MEASURED_TIME)))
+    return Block("earlier_targets", reads, Layout((like(target, _EARLIER),)), step, Layout(memory))
 
 
 def _late(problem: Problem) -> bool:
