@@ -9,7 +9,7 @@ Loops in C call the parts, because they need Jacobians later, or not at all: `ev
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 
 from fpirhc.fields.checked import Checked
-from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 
 _OPERANDS = 2  # most operands of an elementary operation
 _Edges = list[dict[int, ca.SX]]  # for every result, its partial derivatives by the result that they are of
@@ -328,6 +328,10 @@ class HessianModel(Checked, ABC):
         """Whether the model says nothing useful of a cost that does not bend upwards."""
         return True
 
+    def of(self, ocp: OptimalControl) -> OptimalControl:
+        """Return the problem whose second derivatives are the model's: itself, or one with another cost in their place."""
+        return ocp
+
     @abstractmethod
     def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:
         """Return the scalar whose Hessian with respect to (s, u) the sweep uses."""
@@ -335,7 +339,18 @@ class HessianModel(Checked, ABC):
 
 @dataclass(frozen=True)
 class GaussNewton(HessianModel):
-    """The Hessian of the stage cost alone."""
+    """The Hessian of the stage cost alone.
+
+    Args:
+        linear_outputs: whether outputs of the plant count as linear in the state: the Hessian of a squared error of y = h(x) is
+            then 2 h' h'^T, which bends upwards, also where the curve h saturates. Without it a squared error of a curve may bend
+            downwards far from the reference, and is refused.
+    """
+
+    linear_outputs: bool = field(default=False, metadata={"setting": "where given"})
+
+    def of(self, ocp: OptimalControl) -> OptimalControl:
+        return _with_linear_outputs(ocp) if self.linear_outputs else ocp
 
     def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:  # noqa: ARG002
         return cost
@@ -371,10 +386,11 @@ def hessian_stage(ocp: OptimalControl, hessian: HessianModel) -> ca.Function:
     """Function (s, u, theta, lambda of s+) -> (Q (ns, ns), S (nu, ns), R (nu, nu))."""
     s, u, theta = stage_symbols(ocp)
     costate = ca.SX.sym("lambda", ocp.state.size)
-    cost, _ = ocp.stage_cost(s, u, theta)
+    cost, at = _bending_cost(ocp, s, u, theta)
     curved = hessian.curved(cost, ocp.dynamics(s, u, theta), costate)
     slope = ca.gradient(curved, u)
     results = [ca.hessian(curved, s)[0], ca.jacobian(slope, s), ca.jacobian(slope, u)]
+    results = [ca.substitute(r, at, ca.vertcat(s, u)) for r in results] if ocp.frozen else results
     return _dense("fpirhc_hessian_stage", [s, u, theta, costate], results)
 
 
@@ -383,12 +399,46 @@ def hessian_end(ocp: OptimalControl) -> ca.Function:
     s, _, theta = stage_symbols(ocp)
     final = ocp.terminal_cost(s, theta)
     hessian, slope = ca.hessian(final, s)
+    if ocp.frozen:
+        at = ca.SX.sym("at", s.numel())
+        hessian = ca.substitute(ca.hessian(ocp.frozen[1](s, theta, at), s)[0], at, s)
     return _dense("fpirhc_hessian_end", [s, theta], [final, slope, hessian])
 
 
 def stage_symbols(ocp: OptimalControl) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Symbols (s, u, theta) of one stage."""
     return ca.SX.sym("s", ocp.state.size), ca.SX.sym("u", ocp.input.size), ca.SX.sym("theta", ocp.data.size)
+
+
+def _bending_cost(ocp: OptimalControl, s: ca.SX, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """The stage cost whose second derivatives are used, and the symbols at which its outputs are linearised, if they are."""
+    if ocp.frozen is None:
+        return ocp.stage_cost(s, u, theta)[0], ca.SX(0, 1)
+    at = ca.SX.sym("at", s.numel() + u.numel())
+    return ocp.frozen[0](s, u, theta, at), at
+
+
+_linear: WeakKeyDictionary[OptimalControl, OptimalControl] = WeakKeyDictionary()
+
+
+def _with_linear_outputs(ocp: OptimalControl) -> OptimalControl:
+    """The problem with second derivatives of the cost on linearised outputs; scale and expansion are theirs too."""
+    if ocp.frozen is not None or ocp.linear_outputs is None:
+        return ocp
+    if ocp not in _linear:
+        changed = replace(ocp, frozen=ocp.linear_outputs())
+        s, u, theta = stage_symbols(ocp)
+        next_state = ocp.dynamics(s, u, theta)
+        second = hessian_stage(changed, GaussNewton())(s, u, theta, ca.SX.zeros(s.numel()))
+        slopes = [ca.densify(ca.jacobian(next_state, v)) for v in (s, u)]
+        functions: dict[object, ca.Function] = {
+            "linearised": ca.Function("fpirhc_linearised", [s, u, theta], [*slopes, *second]),
+            "final": ca.Function("fpirhc_final", [s, theta], [hessian_end(changed)(s, theta)[2]]),
+        }
+        along = expand_along(ocp.dynamics, ocp.stage_cost, ocp.terminal_cost, ocp.nodes, functions)
+        curvature = input_curvature(along, ocp.step)
+        _linear[ocp] = replace(changed, along=along, curvature=curvature, functions=functions)
+    return _linear[ocp]
 
 
 def _dense(name: str, arguments: list[ca.SX], results: list[ca.SX]) -> ca.Function:
@@ -452,13 +502,14 @@ def _bent(ocp: OptimalControl, hessian: HessianModel) -> _Parts:
     ns = ocp.state.size
     s, u, theta = stage_symbols(ocp)
     after, variables = ca.SX.sym("lambda", ns), ca.vertcat(s, u)
-    cost, _ = ocp.stage_cost(s, u, theta)
+    cost, at = _bending_cost(ocp, s, u, theta)
     slope = ca.gradient(hessian.curved(cost, ocp.dynamics(s, u, theta), after), variables)
-    parts = chain_rule(ca.cse(ca.densify(slope)), variables, ca.vertcat(theta, after))
+    parts = chain_rule(ca.cse(ca.densify(slope)), variables, ca.vertcat(theta, after, at))
+    partials = ca.substitute(parts.partials, at, variables) if ocp.frozen else parts.partials
     # Only the lower triangle is computed.
     whole = ca.tril2symm(ca.tril(parts.jacobian))
     return {
-        "bend": _dense("fpirhc_bend_stage", [s, u, theta, after], [parts.partials]),
+        "bend": _dense("fpirhc_bend_stage", [s, u, theta, after], [partials]),
         "curve": _dense("fpirhc_curve_stage", [parts.symbols], [whole[:ns, :ns], whole[ns:, :ns], whole[ns:, ns:]]),
     }
 

@@ -59,6 +59,9 @@ class OptimalControl:
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).
         functions: Functions that were built for it; problems that differ in numbers of settings only share them.
+        linear_outputs: function that returns the Functions (s, u, theta, at (ns + nu)) -> l and (s, theta, at (ns)) -> T, with the
+            plant's outputs linearised at `at`.
+        frozen: these Functions, where second derivatives are to be theirs.
     """
 
     stages: int
@@ -88,6 +91,8 @@ class OptimalControl:
     inner: tuple[tuple[int, float], ...] = ()
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
+    linear_outputs: Callable[[], tuple[ca.Function, ca.Function]] | None = None
+    frozen: tuple[ca.Function, ca.Function] | None = None
 
     @property
     def scale(self) -> np.ndarray:
