@@ -138,6 +138,21 @@ def shares_as_described(of: Task, names: list[str], folder: Path) -> dict[str, d
     return shares
 
 
+def test_order_five_is_at_its_limits_and_unsafe():
+    """Nearly every cycle is at a limit of the dose, and every row is below 70 mg/dl for more than 4 % of the time."""
+    of = task("diabetes_order_five")
+    assert of.problem.plant.response_orders == {"glucose": 5}
+    table = described(of, "shares of the time")
+    assert set(table) == set(of.controllers)
+    for name, controller in of.controllers.items():
+        run = fp.simulate(of.problem, controller, seed=0, compiled=False)
+        glucose = run["output.glucose"]
+        shares = [np.mean((glucose >= 70) & (glucose <= 180)), np.mean(glucose < 70), np.mean(run["clipped"] > 0.5)]
+        assert table[name] == pytest.approx([*(100 * share for share in shares), glucose.min()], abs=0.6)
+        assert shares[1] > 0.04
+        assert shares[2] > 0.95
+
+
 @pytest.mark.slow
 def test_nobody_of_thirty_breaks_the_rule(tmp_path):
     """Below 70 mg/dl for 4 % of the time, with no controller."""
