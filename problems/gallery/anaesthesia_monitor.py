@@ -111,14 +111,5 @@ controllers = {
 }
 headline = ("cascade, no filter", "cascade, Haar")
 cases = people.cases
-
-
-def travel(problem, run):
-    """How far the target moves up and down in a minute, mg/l."""
-    late = run.time >= problem.measure_from
-    moves = np.abs(np.diff(run["command.target"][late]))
-    return float(moves.sum() / (problem.duration - problem.measure_from))
-
-
-metrics = (*people.metrics, fp.Metric("travel", travel, unit="mg/l/min", headline=True, finite=True))
+metrics = people.metrics
 headline_metric, pictures = "in_band", people.pictures

@@ -39,14 +39,16 @@ Of the settings that were tried on "A tuned" those were taken with which nobody 
 time, and of these the one with the highest lowest bis; with the best worst share where there are none.
 
 It is a draw of `cascade in mg/l` with a PID law on the pump's target, which needs no curve. Both add up the error, and both begin
-with little drug. What makes the difference to the other rows:
+with little drug. Three things make the difference to the other rows.
 
-- The form. A plain cascade begins at the target that is in force, and awake that is none. The model-referenced one begins with the
-  target that its model has for 50, as the pump alone does, and sensitive patients go as low in the induction.
-- The unit. The slope of the curve changes along it and from patient to patient, and with it the gain from a target to the bis. In
-  mg/l, through the model's curve, nobody fares worse, and patients of set B fare better.
-- What is corrected. The offset-free plan adds its estimate to the bis, at a slope that is not the patient's. In set B, where the
-  kinetics are not the pump's, it is the least safe one but the model-referenced.
+The form: a plain cascade begins at the target that is in force, and awake that is none. The model-referenced one begins with the
+target that its model has for 50, as the pump alone does, and sensitive patients go low in the induction.
+
+The unit: the slope of the curve changes along it and from patient to patient, and with it the gain from a target to the bis. In
+mg/l, through the model's curve, the worst patient of every set is longer in the range.
+
+What is corrected: the offset-free plan adds its estimate to the bis, at a slope that is not the patient's. In set B, where the
+kinetics are not the pump's, its worst patient is outside the range for more than a sixth of the time.
 """
 
 from dataclasses import replace
