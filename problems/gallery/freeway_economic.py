@@ -33,6 +33,9 @@ The iteration loses. What is wrong in the model are the speeds and the light's c
 whatever they are. To let the density follow the plan of the wrong model is to undo what a new plan every minute corrects. The
 offset-free plan finds nothing to estimate, for the same reason. Both queues are too long: a wrong model has no plan that keeps a
 hard limit, and then the last plan is held.
+
+Speed limits on the third and the fourth segment, a second input with a minimum in the model, save nothing: the plan leaves the
+signs beyond what is driven, and the published coordinated run spends more time than the metered one too.
 """
 
 from dataclasses import replace

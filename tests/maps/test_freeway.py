@@ -155,6 +155,66 @@ def test_an_economic_plan_is_the_published_run(which: str) -> None:
     assert run["plant_state.spent"][16] == pytest.approx(96.813, abs=0.011)
 
 
+FREE = 102.0  # km/h
+
+
+def with_signs(lowest: float, highest: float, before: float = FREE) -> fp.Problem:
+    """The economic task with speed limits on the third and the fourth segment: traffic settles at min(V(rho), 1.1 sign).
+
+    What the signs show is a state, and an output, because a plant has as many outputs as inputs.
+    """
+    shipped = task("freeway_economic").problem
+    road = shipped.plant
+
+    def later(x, u, p):
+        after = road.next(x, u, p)
+        for i in (3, 4):
+            settled = p.v_free * ca.exp(-((x[f"rho{i}"] / p.rho_crit) ** p.a) / p.a)
+            after[f"v{i}"] += T / p.tau * (ca.fmin(settled, 1.1 * u.sign) - settled)
+        return {**after, "shown": u.sign}
+
+    def cost(v):
+        change = (v.input.r - v.input_before.r) ** 2 + ((v.input.sign - v.input_before.sign) / FREE) ** 2
+        return {"change": 0.4 / (6 * T) * change}
+
+    return replace(
+        shipped,
+        plant=fp.Plant.discrete(
+            states={**road.coordinates, "shown": "km/h"},
+            inputs={"r": "1", "sign": "km/h"},
+            next=later,
+            step=T,
+            outputs={**road.outputs, "shown": fp.Output("km/h", lambda x, _: x.shown)},
+            parameters=road.parameters,
+            time_unit="h",
+        ),
+        start={**shipped.start, "shown": before},
+        input_before={"r": 1.0, "sign": before},
+        reference=fp.Trajectory(lambda t: {"density": 33.5 + 0 * t, "shown": FREE + 0 * t}),
+        limits=replace(shipped.limits, inputs={"r": (0.0, 1.0), "sign": (lowest, highest)}),
+        cost=fp.CustomCost(cost, terminal=lambda v: v.state.spent, rate=True),
+        judged=("density",),
+    )
+
+
+@pytest.mark.slow
+def test_speed_limits_save_no_time_here() -> None:
+    """A plan that may use signs too, with their minimum in the model, leaves them beyond what is driven; held at 70 they cost time.
+
+    In the source the coordinated run spends more time than the metered one as well, 102.077 after 101.977 veh h in 100 steps.
+    """
+    known = task("freeway_economic").controllers["RHC exact model"]
+    free, slow = (
+        fp.simulate(problem, known, seed=0, compiled=False)
+        for problem in (with_signs(20.0, FREE), with_signs(70.0, 70.01, 70.0))
+    )
+    driven = np.maximum(free["plant_state.v3"], free["plant_state.v4"])
+    assert (1.1 * free["command.sign"] > driven).all()
+    assert (free["status"] == 0).all()
+    assert free["plant_state.spent"].max() == pytest.approx(216.448, abs=2e-3)
+    assert slow["plant_state.spent"].max() == pytest.approx(216.91, abs=0.02)
+
+
 @pytest.mark.slow
 def test_the_iteration_spends_more_time() -> None:
     """The second table of the description: a wrong model, where the density is not what is wrong."""
