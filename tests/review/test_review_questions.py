@@ -99,6 +99,17 @@ def test_limits_that_the_reference_leaves(limits, verdict):
     assert bool(one.change) == (verdict != "yes")
 
 
+def test_no_limit_is_left_where_nobody_is_drawn_to_the_reference():
+    """An economic cost has no reference in it: what it would need is no question; with the error in the cost it is one."""
+    for weight, count in ((0.0, 0), (1.0, 1)):
+        cost = fp.CustomCost(
+            lambda v, weight=weight: {"effort": v.input.u**2, "error": weight * (v.state.q - v.reference.q) ** 2}
+        )
+        problem = replace(mass(states={"q": (-0.4, 0.6)}), cost=cost)
+        asked = fp.review(problem, {}, mismatch=0.0, seed=0).answers
+        assert sum(KEEPS in one.question for one in asked) == count
+
+
 def test_limits_that_are_touched_are_not_covered():
     """At rest on the limit: the linear loop leaves it out, which is no yes."""
     one = answer(mass(0.0, states={"q": (0.0, 1.0)}), None, KEEPS)

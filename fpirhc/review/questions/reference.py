@@ -142,7 +142,7 @@ _TOUCHES = 1e-6  # of the interval's size, within which a value is at its limit
 
 
 def reference_keeps_limits(grid: ReviewGrid) -> Answer | None:
-    """Return the limits that the reference leaves or touches; None without such limits or without a plan."""
+    """Return the limits that the reference leaves or touches; None without such limits, or where no plan is drawn to it."""
     problem, limits = grid.problem, grid.problem.limits
     if problem.horizon is None or problem.cost is None or not (limits.states or limits.rates or limits.paths):
         return None
@@ -152,6 +152,8 @@ def reference_keeps_limits(grid: ReviewGrid) -> Answer | None:
         ocp = transcribe(problem.plant, problem.reference, horizon, problem.cost, all_hard, start=start)
     except FpirhcError as error:
         return Answer(LIMITS, Verdict.UNKNOWN, str(error))
+    if not _drawn_to_reference(ocp):
+        return None
     values = _values(grid, ocp)
     usable = np.isfinite(values).all(axis=1)
     if not usable.any():
@@ -175,6 +177,16 @@ def reference_keeps_limits(grid: ReviewGrid) -> Answer | None:
     softened = soft | {f"{i} rate" for i in soft - {*problem.plant.state.elements}}
     hard = [name for name in outside if name not in softened]
     return Answer(LIMITS, Verdict.NO if hard else Verdict.UNKNOWN, text, change, numbers)
+
+
+def _drawn_to_reference(ocp: OptimalControl) -> bool:
+    """Whether a cost has the reference in it, or the command that it needs; an economic one has not."""
+    s, u, theta = (
+        ca.SX.sym(n, size) for n, size in zip("sut", (ocp.state.size, ocp.input.size, ocp.data.size), strict=True)
+    )
+    depends = ca.which_depends(ca.vertcat(ocp.stage_cost(s, u, theta)[0], ocp.terminal_cost(s, theta)), theta, 1, False)
+    wanted = [ocp.data.slice(name) for name in ("reference", "feedforward") if name in ocp.data.names]
+    return any(any(depends[places]) for places in wanted)
 
 
 def _rooms(ocp: OptimalControl, low: np.ndarray, high: np.ndarray) -> np.ndarray:
