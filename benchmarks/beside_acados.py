@@ -12,7 +12,6 @@ median wall time of a command, both from .3 rad with the right masses.
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +25,7 @@ import fpirhc as fp
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+from acados_plans import again_with_acados  # noqa: E402
 from beside import Step, flown, ours  # noqa: E402
 from table import write_table  # noqa: E402
 
@@ -167,20 +167,6 @@ def main() -> None:
     )
     write_table("beside acados", heads, rows, ROOT / "docs" / "beside-acados.md")
     print(f"A command of fpirhc's RHC takes {unit:.3g} ms.")
-
-
-def again_with_acados() -> None:
-    """Start again with the folders that acados asks for in its environment."""
-    import acados
-
-    inside = Path(acados.DIR) / "interfaces" / "acados_template"
-    inside.mkdir(parents=True, exist_ok=True)
-    if not (inside / "acados_template").exists():
-        (inside / "acados_template").symlink_to(Path(acados.__file__).parent / "acados_template")
-    wanted = {"ACADOS_SOURCE_DIR": acados.DIR, "TERA_PATH": acados.TERA_PATH, "LD_LIBRARY_PATH": acados.LIB_DIR}
-    sys.path.insert(0, str(Path(acados.__file__).parent))
-    if any(os.environ.get(name) != value for name, value in wanted.items()):
-        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **wanted})
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Optimisers on horizons of other people's plants with active limits of states: who solves them, how exactly, how fast.
 
-Called by `python benchmarks/optimisers.py --constrained [PLANT ...] [--plans=200] [--write]`. Warm: a closed loop is recorded, the
-plant with its exact parameters and a little noise, planned for with the approximate ones; every optimiser solves its horizons one
-after the other, warm-started with its own last plan shifted by one stage. Cold: horizons from random first states, each from
+Called by `python benchmarks/optimisers.py --constrained [PLANT ...] [--plans=200] [--acados] [--write]`; with --acados beside
+acados alone, which is installed as `beside_acados.py` says. Warm: a closed loop is recorded, the plant with its exact parameters
+and a little noise, planned for with the approximate ones; every optimiser solves its horizons one after the other, warm-started
+with its own last plan shifted by one stage. Cold: horizons from random first states, each from
 nothing. All plans are judged by the one judge of `judging.py`: solved is a plan with a residual of 1e-6 and a violation of 1e-6 of
 the range at most; counted are horizons that some optimiser solved. An optimiser whose solved plan costs more than the best one by
 1e-4 or more has ended in a worse local optimum.
@@ -15,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from acados_plans import acados_plans, again_with_acados
 from deadline import Solve, WithDeadline
 from foreign import FOREIGN, Foreign, first_states
 from judging import Judge, Judgement
@@ -26,7 +28,7 @@ from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic.native import native
 
-SOLVED, ROUGHLY = 1e-6, 1e-4
+SOLVED, ROUGHLY, ACADOS = 1e-6, 1e-4, "--acados"
 WORSE = 1e-4  # IPOPT relaxes limits by 1e-8, which alone is worth up to 1e-5 of a cost
 NOISE = 1e-3  # of the limits' half ranges
 DEADLINE = 2.0  # s; fatrop alone does not return from some horizons
@@ -120,8 +122,15 @@ def ways(ocp: OptimalControl) -> dict[str, Callable[[], Solve]]:
 
     fixed, accuracy = fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), 1e-9
     shape = ocp.input.size, ocp.stages
+    own = {"FixedPoint": lambda: follow(fixed, ocp, native(fixed.converging(ocp)).function)}
+    if ACADOS in sys.argv:
+        return {
+            **own,
+            "acados, SQP with HPIPM": lambda: acados_plans(ocp, exact=False, accuracy=1e-6),
+            "the same, exact Hessian": lambda: acados_plans(ocp, exact=True, accuracy=1e-6),
+        }
     return {
-        "FixedPoint": lambda: follow(fixed, ocp, native(fixed.converging(ocp)).function),
+        **own,
         "IPOPT": lambda: rival(fp.Ipopt(accuracy=accuracy), ocp, {}),
         "fatrop, functions compiled": lambda: WithDeadline(
             rival(fp.Fatrop(accuracy=accuracy), ocp, JIT), shape, DEADLINE
@@ -165,10 +174,19 @@ def _row(answers: Answers, best: np.ndarray, counted: np.ndarray) -> tuple[str, 
 
 def main() -> None:
     """Measure the plants named on the command line, or all."""
-    names = [a for a in sys.argv[1:] if not a.startswith("--")] or list(FOREIGN)
+    beside_acados = ACADOS in sys.argv
+    if beside_acados:
+        again_with_acados()
+    names = [a for a in sys.argv[1:] if not a.startswith("--")] or (
+        ["arm", "chain"] if beside_acados else list(FOREIGN)
+    )
     count = next((int(a.partition("=")[2]) for a in sys.argv if a.startswith("--plans=")), 200)
     heads = (
         *("plant", "set", "optimiser", "solved", "to 1e-4", "in a worse optimum", "worst violation called OK"),
         *("median us", "p95 us", "iterations, median / most"),
     )
-    write_table("constrained", heads, [row for name in names for row in rows_of(name, count)])
+    write_table(
+        "limits beside acados" if beside_acados else "constrained",
+        heads,
+        [row for name in names for row in rows_of(name, count)],
+    )

@@ -413,7 +413,25 @@ def double_tank() -> Foreign:
     )
 
 
-PLANTS = (quadrotor, arm, reactor, tanks, bicycle, body, crane, pendulum, stirred, servo, rocket, double_tank)
+def chain() -> Foreign:
+    """The shipped chain of three masses (acados' benchmark) in front of a wall, which its end would swing through."""
+    problem = fp.load_problem("chain_of_masses").problem
+    assert problem.horizon is not None
+    assert isinstance(problem.cost, fp.Quadratic)
+    wall = dict.fromkeys(("y1", "ye"), (-0.01, np.inf))
+    limits = fp.Limits(inputs=problem.limits.inputs, states=wall)
+    return Foreign(
+        problem.plant,
+        dict(problem.start),
+        problem.reference,
+        problem.horizon,
+        problem.cost,
+        limits,
+        spread=dict.fromkeys(problem.start, 0.1),
+    )
+
+
+PLANTS = (quadrotor, arm, reactor, tanks, bicycle, body, crane, pendulum, stirred, servo, rocket, double_tank, chain)
 FOREIGN: dict[str, Callable[[], Foreign]] = {f.__name__: f for f in PLANTS}
 
 
