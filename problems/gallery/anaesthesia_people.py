@@ -186,9 +186,9 @@ patient = fp.Plant.discrete(
 )
 
 
-def concentration(bis, p):
-    """At which the model's curve has a bis, mg/l; the bis is kept inside the curve."""
-    inside = ca.fmin(ca.fmax(bis, 2.0), p.E0 - 0.5)
+def concentration(bis, p, from_top=0.5):
+    """At which the model's curve has a bis, mg/l; the bis is kept inside the curve, so far from its upper end."""
+    inside = ca.fmin(ca.fmax(bis, 2.0), p.E0 - from_top)
     return p.C50 * (p.E0 / inside - 1) ** (1 / p.steepness)
 
 
@@ -206,7 +206,7 @@ def settling(x, u, p):
 def needed_target(x, r, p):
     """The target for a wanted change of the bis; that of the curve's end where the curve does not reach so far."""
     kept = ca.exp(-CYCLE / p.lag)
-    return {"target": concentration(x.bis + CYCLE * r.bis / (1 - kept), p)}
+    return {"target": concentration(x.bis + CYCLE * r.bis / (1 - kept), p, from_top=1e-4)}
 
 
 model = fp.Plant.discrete(

@@ -85,4 +85,4 @@ metrics = (
     fp.figures.TimeOver(fp.Quantity("-glucose", "mg/dl", lambda run: -run[GLUCOSE]), -70.0, name="below_70"),
     fp.figures.Nadir(GLUCOSE),
 )
-headline_metric = "in_range"
+headline_metric = "below_70"

@@ -35,6 +35,7 @@ from fpirhc.task.reality import Reality
 
 Guided: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
 _LEFT = 1e-6  # of an equation, relative to the size of its terms
+_MOST_STEPS = 6  # of a map that are looked ahead: every one more doubles an expression
 _POINTS = 5  # of the reference
 _SLOW = 0.05  # frequency of slow requests, as a share of the slowest of the poles that the model lacks
 _MOVES = 1e-9  # rate, as a share of the fastest, below which a pole is an integrator's
@@ -190,7 +191,8 @@ def _carrying(reality: Reality, model: Plant) -> Guided | None:
         model: of the controllers; the wanted values are in the order of its state, then its controlled responses.
 
     Returns:
-        None where the numbers of derivatives and of states do not match, or the model has coordinates that are not controlled.
+        None where the numbers of derivatives and of states do not match, the model has coordinates that are not controlled, or a
+        map has many states.
     """
     plant, names = reality.plant, model.names
     count, rest = divmod(plant.state.size, len(names))
@@ -198,6 +200,8 @@ def _carrying(reality: Reality, model: Plant) -> Guided | None:
     if not on_reference or rest or len(model.controlled_names) != len(names) or len(plant.inputs) != len(names):
         return None
     if min(model.orders) != max(model.orders) or count < max(model.orders):
+        return None
+    if plant.step is not None and count > _MOST_STEPS:
         return None
     x, u, p = plant.symbols()
     wanted = ca.SX.sym("wanted", model.state.size + len(names))
