@@ -73,9 +73,9 @@ def test_plants_side_by_side_have_the_box_of_plants_one_after_the_other(monkeypa
         return point(self, value, *run)
 
     monkeypatch.setattr(Judge, "point", noted)
-    found = robust_boxes(pump())
+    found = robust_boxes(pump(), risk=0.1, confidence=0.9)
     assert len(asked) < 2 * found.draws
-    alone = robust_boxes(pump(), compiled=False)
+    alone = robust_boxes(pump(), risk=0.1, confidence=0.9, compiled=False)
     assert len(asked) > 4 * found.draws
     for one, other in zip(found.boxes, alone.boxes, strict=True):
         assert (one.percent, one.fails_at, one.why) == (other.percent, other.fails_at, other.why)
