@@ -17,7 +17,7 @@ from fpirhc.horizon.cost import View
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value, expression
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.task.limits import Limits
+from fpirhc.task.limits import Limit, Limits
 
 _GAP = 1e-9  # half width of the bounds of a terminal equality
 
@@ -40,10 +40,11 @@ class ConstraintState:
 
 def limited(limits: Limits, plant: Plant, view: View, step: float) -> list[ConstraintState]:
     """Limited expressions of state and input of stages 0 ... N-1: rates of inputs, and paths."""
-    return [
-        ConstraintState(name, one.unit, one.named_value(name, view), one.lower, one.upper)
-        for name, one in limits.members(plant, step).items()
-    ]
+    return [_entry_of(name, one, view) for name, one in limits.written(plant, step).items()]
+
+
+def _entry_of(name: str, one: Limit, view: View) -> ConstraintState:
+    return ConstraintState(name, one.unit, one.named_value(name, view), one.lower, one.upper)
 
 
 def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> list[ConstraintState]:
@@ -56,14 +57,9 @@ def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> 
         seen: the state then, as it will be measured.
         step: number of the steps, for the names.
     """
-    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
-    nodes_alone = limits.soft.keys() | limits.prices.keys()
-    states = [ConstraintState(e, units[e], seen[e], *ends) for e, ends in limits.states.items()]
-    paths = [
-        ConstraintState(name, one.unit, one.named_value(name, view), one.lower, one.upper)
-        for name, one in limits.paths.items()
-        if not one.uses_rate
-    ]
+    nodes_alone, measured_view = limits.soft.keys() | limits.prices.keys(), replace(view, state=seen)
+    states = [_entry_of(name, one, measured_view) for name, one in limits.boxes(plant).items()]
+    paths = [_entry_of(name, one, view) for name, one in limits.paths.items() if not one.uses_rate]
     return [replace(w, name=f"{w.name}, step {step}") for w in (*states, *paths) if w.name not in nodes_alone]
 
 
@@ -97,8 +93,7 @@ def narrowed(
     A state between two limits c - h and c + h keeps |x - c| <= h - m, which is |z - c| <= h for z = c + (x - c) h / (h - m).
     With one limit only, the entry is x + m or x - m.
     """
-    places = {e: k for k, e in enumerate(plant.state.elements)}
-    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
+    places, boxes = {e: k for k, e in enumerate(plant.state.elements)}, limits.boxes(plant)
 
     def value(x: Expression, m: Expression, lower: float, upper: float) -> Expression:
         if math.isinf(lower) or math.isinf(upper):
@@ -106,19 +101,18 @@ def narrowed(
         centre, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
         return centre + (x - centre) * (half / (half - m))
 
+    bounds = {e: (boxes[e].lower, boxes[e].upper) for e in margin}
     return [
-        ConstraintState(
-            f"{e} with margin", units[e], value(next_state[places[e]], m, *limits.states[e]), *limits.states[e]
-        )
+        ConstraintState(f"{e} with margin", boxes[e].unit, value(next_state[places[e]], m, *bounds[e]), *bounds[e])
         for e, m in margin.items()
     ]
 
 
 def measured(names: Collection[str], limits: Limits, plant: Plant, next_state: Expression) -> list[ConstraintState]:
     """Limits of states that hold for the measured state, as entries; `next_state` is as it will be measured."""
-    places = {e: k for k, e in enumerate(plant.state.elements)}
-    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
-    return [ConstraintState(_as_measured(e), units[e], next_state[places[e]], *limits.states[e]) for e in names]
+    places, boxes = {e: k for k, e in enumerate(plant.state.elements)}, limits.boxes(plant)
+    entries = [(_as_measured(e), boxes[e], next_state[places[e]]) for e in names]
+    return [ConstraintState(name, one.unit, value, one.lower, one.upper) for name, one, value in entries]
 
 
 def hard(written: list[ConstraintState], soft: frozenset[str]) -> list[ConstraintState]:

@@ -183,7 +183,7 @@ def _stage_expressions(
     keeps_input = (
         cost.uses_rate
         or bool(horizon.blocks)
-        or any(one.uses_rate for one in limits.members(plant, horizon.step).values())
+        or any(one.uses_rate for one in limits.written(plant, horizon.step).values())
     )
     x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size * keeps_input)
     u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)

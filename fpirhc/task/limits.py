@@ -1,6 +1,6 @@
 """Limits of inputs, states, rates and paths by name. A quantity that is not named is free.
 
-A limit on what is no state is a member of the contract `Limit`: one scalar of a stage, in an interval.
+Every limit is a member of the contract `Limit`: one scalar of a stage, in an interval.
 """
 
 from __future__ import annotations
@@ -140,6 +140,25 @@ class Ellipsoid(Limit):
 
 
 @dataclass(frozen=True, eq=False)
+class _Box(Limit):
+    """An input or a state.
+
+    Args:
+        name: of it.
+        lower: lower end of the interval.
+        upper: upper end of the interval.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    unit: str
+
+    def value(self, view: OfStage) -> Value:
+        return view.input[self.name] if self.name in view.input else view.state[self.name]
+
+
+@dataclass(frozen=True, eq=False)
 class _Rate(Limit):
     """The change of an input per unit of time, from stage to stage.
 
@@ -215,7 +234,17 @@ class Limits(Checked):
         mistakes.raise_if_any()
 
     def members(self, plant: Plant, step: float) -> dict[str, Limit]:
-        """Return the limits on what is no state by name: rates of inputs, with stages of length `step`, and paths."""
+        """Return all limits by name: boxes of inputs and states, rates of inputs, with stages of length `step`, and paths."""
+        inputs = {name: _Box(name, *ends, unit=plant.inputs[name]) for name, ends in self.inputs.items()}
+        return {**inputs, **self.boxes(plant), **self.written(plant, step)}
+
+    def boxes(self, plant: Plant) -> dict[str, Limit]:
+        """Return the limits of states, which every optimiser keeps as bounds."""
+        units = dict(zip(plant.state.elements, plant.state.entry_units, strict=True))
+        return {name: _Box(name, *ends, unit=units[name]) for name, ends in self.states.items()}
+
+    def written(self, plant: Plant, step: float) -> dict[str, Limit]:
+        """Return rates and paths, which a plan writes as further entries of its state."""
         rates: dict[str, Limit] = {
             f"{name} rate": _Rate(name, step, *ends, unit=derivative_unit(plant.inputs[name], 1, plant.time_unit))
             for name, ends in self.rates.items()

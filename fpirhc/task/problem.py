@@ -21,7 +21,7 @@ from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of
 from fpirhc.plant.maps import response_age
-from fpirhc.plant.motion import derivative_unit, disturbed, followed, followed_units, with_exact_parameters, words
+from fpirhc.plant.motion import disturbed, followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
 from fpirhc.sensing.sensing import Sensing
@@ -597,14 +597,10 @@ def _time_rows(problem: Problem) -> list[tuple[str, str]]:
 
 
 def _limit_rows(problem: Problem) -> list[tuple[str, str]]:
-    limits, plant = problem.limits, problem.plant
-    states = dict(zip(plant.state.elements, plant.state.entry_units, strict=True))
-    rates = {name: derivative_unit(unit, 1, plant.time_unit) for name, unit in plant.inputs.items()}
-    rows = [(f"limits of {name}", _interval(ends, plant.inputs[name])) for name, ends in limits.inputs.items()]
-    rows += [(f"limits of {name}", _interval(ends, states[name])) for name, ends in limits.states.items()]
-    rows += [(f"limits of the rate of {name}", _interval(ends, rates[name])) for name, ends in limits.rates.items()]
-    rows += [(f"limits of {name}", _interval((p.lower, p.upper), p.unit)) for name, p in limits.paths.items()]
-    return rows
+    limits = problem.limits
+    rates = {f"{name} rate": f"the rate of {name}" for name in limits.rates}
+    members = limits.members(problem.plant, 1.0).items()  # of stages of any length: an interval is the same for all
+    return [(f"limits of {rates.get(n, n)}", _interval((one.lower, one.upper), one.unit)) for n, one in members]
 
 
 def _other_rows(problem: Problem) -> list[tuple[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -14,6 +15,7 @@ from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.horizon.rollout import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.symbolic.layout import Named
 from fpirhc.task.limits import Limit
 
 PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
@@ -291,3 +293,22 @@ def test_a_plan_stays_in_its_ellipsoid():
     states = fp.solve(ocp, FIXED, first, data).states
     inside = ((states[0, :-1] - 0.1) / 0.7) ** 2 + (states[1, :-1] / 0.9) ** 2
     assert inside.max() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_every_limit_is_a_member_with_an_interval_and_a_unit():
+    """Boxes, rates, paths and a stranger's own stand side by side, and each says of a stage what it limits."""
+    own = {"calm": fp.Ellipsoid({"angle": 0.5, "torque": 2.0}), "softly": Softly()}
+    limits = fp.Limits(
+        inputs={"torque": (-3.0, 4.0)}, states={"angle'": (-1.0, 2.0)}, rates={"torque": (-9.0, 8.0)}, paths=own
+    )
+    members = limits.members(PLANT, step=0.05)
+    names = {"state": ("angle", "angle'"), "input": ("torque",), "input_before": ("torque",)}
+    numbers = {"state": [0.1, 0.7], "input": [1.5], "input_before": [1.0]}
+    stage = SimpleNamespace(output={}, **{part: Named(names[part], ca.SX(numbers[part]), part) for part in names})
+    values = {name: float(ca.SX(one.value(stage))) for name, one in members.items()}
+    expected = {"torque": 1.5, "angle'": 0.7, "torque rate": 10.0, "calm": 0.04 + 0.5625, "softly": 1.25}
+    assert values == pytest.approx(expected)
+    assert [members[n].unit for n in ("torque", "angle'", "torque rate")] == ["N m", "rad/s", "N m/s"]
+    held = {n for n, one in members.items() if one.lower <= values[n] <= one.upper}
+    assert {"torque", "angle'", "calm"} <= held
+    assert "torque rate" not in held
