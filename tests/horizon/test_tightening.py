@@ -100,7 +100,7 @@ def test_a_limit_that_the_wrong_model_breaks_is_kept_with_margins():
 def test_margins_keep_the_limits_of_a_plant_by_its_outputs():
     """The same carriage with its place as an output needs nearly the same margins, and keeps its track with them."""
     problem = named_again(carriage())
-    own, again = (fp.state_margins(p, adaptive(), passes=0) for p in (carriage(), problem))
+    own, again = (state_margins(p, adaptive(), passes=0) for p in (carriage(), problem))
     for name, margins in own.items():
         np.testing.assert_allclose(again[name], margins, rtol=0.2)
     assert beyond(problem, adaptive()) > 1e-4
