@@ -46,7 +46,6 @@ BOARDS: tuple[tuple[str, str, Limited], ...] = (
     ("two_mass", "RHC+FPI", {}),
     ("two_mass", "RHC+FPI", {"q1": (1.85, 2.35)}),
     ("leaking_tanks", "RHC+FPI", {}),
-    ("fishery", "RHC+FPI", {}),
 )
 UNITS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"))
 SMALL = (("two_mass", "CTC+FPI (eq 6)"), ("fishery", "RHC+FPI"), ("two_mass", "RHC+FPI"))
