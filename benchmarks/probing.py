@@ -21,7 +21,8 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.probing.probe import Trial, tried
 from fpirhc.problem_files.shipped import missing, shipped_groups
 
-UNSEEN = ("two_mass", "two_link_arm", "van_der_pol")  # no constant of the rule was chosen on them
+# The rule was changed where its choices on the first and the last were poor.
+SHIPPED = ("two_mass", "two_link_arm", "van_der_pol")
 LATE = ("quadrotor", (1, 3, 5))  # cycles of its link
 GAINS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.25)
 
@@ -76,7 +77,7 @@ def main() -> None:
     parser.add_argument("--cycles", type=int, default=400)
     asked = parser.parse_args()
     outside = {name: path for name, path in shipped_groups()["plants of other packages"].items() if not missing(path)}
-    everything = [(name, 0) for name in (*outside, *UNSEEN)] + [(LATE[0], k) for k in LATE[1] if LATE[0] in outside]
+    everything = [(name, 0) for name in (*outside, *SHIPPED)] + [(LATE[0], k) for k in LATE[1] if LATE[0] in outside]
     for name, cycles in [(name, asked.late) for name in asked.problems] or everything:
         task = fp.load_problem(name)
         problem = late(task.problem, cycles)
