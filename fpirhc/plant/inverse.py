@@ -18,6 +18,7 @@ from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Named
 
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN
+NEWTON_ITERATIONS = 50  # CasADi's own largest number, said here because the worst case of an exported step counts it
 
 
 def inverse_function(plant: Motion, response: ca.Function) -> ca.Function:
@@ -80,7 +81,8 @@ def inverse_by_newton(plant: Motion, response: ca.Function) -> ca.Function:
     x, u, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
     error = ca.Function("fpirhc_inversion", [u, x, r, p], [response(x, u, p) - r])
-    finder = ca.rootfinder("fpirhc_newton", "fast_newton", error, {"error_on_fail": False})
+    options = {"error_on_fail": False, "max_iter": NEWTON_ITERATIONS}
+    finder = ca.rootfinder("fpirhc_newton", "fast_newton", error, options)
     xm, rm, pm = (ca.MX.sym(n, s) for n, s in (("x", x.numel()), ("r", r.numel()), ("p", p.numel())))
     count = len(plant.inputs)
     gain_at_zero = ca.sparsify(ca.substitute(ca.jacobian(response(x, u, p), u), u, ca.SX.zeros(count)))

@@ -20,6 +20,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.export.device import Device, c_of
 from fpirhc.export.footprint import operations, worst_case
 from fpirhc.export.target import device_of, target_called, write
+from fpirhc.plant.inverse import NEWTON_ITERATIONS
 from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.native import find_compiler
 
@@ -65,7 +66,7 @@ def test_a_bare_step_has_no_live_settings():
 
 
 def test_operations_are_those_of_the_longest_way():
-    """Scalar code, a map, a switch and a product of matrices, counted by hand."""
+    """Scalar code, a map, a switch and a product of matrices, counted by hand; Newton's method to its last iteration."""
     x = ca.SX.sym("x")
     three = ca.Function("three", [x], [ca.sin(x) * x + 1])
     one = ca.Function("one", [x], [2 * x])
@@ -77,6 +78,9 @@ def test_operations_are_those_of_the_longest_way():
     assert operations(both) == 5
     a = ca.MX.sym("a", 4, 4)
     assert operations(ca.Function("product", [a, y], [a @ y])) == 2 * 16
+    error = ca.Function("error", [x], [x * x * x])
+    newton = ca.rootfinder("newton", "fast_newton", error, {"max_iter": NEWTON_ITERATIONS})
+    assert operations(newton) > NEWTON_ITERATIONS * operations(error)
 
 
 @needs_compiler
