@@ -21,9 +21,10 @@ The first rms error of every shipped problem, or the figure that it is judged by
 of problems without a baseline, which tests compare with runs; nothing is computed a second time. FPI is the best row with a
 deformation, the rival the best row of `fp.rivals` or with an estimator, and the bound the row of the exact model. Where a problem
 has no rival, `python docs/make_rivals.py` tries PID, ADRC and offset-free plans over a grid of settings, and writes the best of
-them to `docs/rivals.json`; it is tuned on the run that it is judged by, with exact measurements where the problem has them, which a
-large gain likes. None holds a problem where the best has ten times the largest error of the table. A row that is not there has a
-dash. An exact model that does not know a disturbance, or has one iteration per plan, is no bound. Within a tenth it is a draw.
+them to `docs/rivals.json`; it is tuned on the run that it is judged by, with exact measurements where the problem has them, which
+favour a large gain. "None holds it" means that even the best has more than ten times the largest error of the table. A row that is
+not there has a dash. An exact model that does not know a disturbance, or has one iteration per plan, is no bound. Within a tenth it
+is a draw.
 Problems that are judged by another figure than an error and have no baseline are not here: `anaesthesia_people`,
 `anaesthesia_monitor`, `diabetes`, `diabetes_announced` and `diabetes_order_five` have tables of their own.
 

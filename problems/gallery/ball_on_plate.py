@@ -1,4 +1,4 @@
-"""A ball on a plate that a camera watches: an eight, with two servos that nobody told the model about.
+"""A ball on a plate that a camera watches: an eight, with two servos that the model does not have.
 
 A table-tennis ball rolls on a plate that is tilted about two axes. With h the share of gravity that moves a rolling ball (5/7 for a
 solid one, 3/5 for a hollow one), the tilt a across and b along,

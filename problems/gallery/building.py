@@ -31,8 +31,8 @@ The error is only a distance from the thermostat's set-point, which no plan has 
 A plan saves a tenth of the thermostat's bill, because it heats at noon for the evening; a plan for a wrong house is too cold when
 people come home. The iteration mends nearly all of it, as soon as it shows. The offset-free plan is a little better: the iteration
 holds the room on the way that the plan foresees, but a plan of a day still believes in the wrong house, while the filter gives it
-what air and walls lose, and it begins earlier. The exact model is no better than
-that, because it knows nothing of sun and people.
+what air and walls lose, and it begins earlier. The exact model is no better than that, because sun and people are missing from it
+too.
 
 References: two capacities are usual in models of houses (P. Bacher, H. Madsen, Identifying suitable models for the heat dynamics
 of buildings, Energy and Buildings 43, 2011); the numbers are our own.

@@ -296,7 +296,7 @@ ELSEWHERE = "map", "late", "late curve", "encoder", "believed", "outside"  # whe
 @pytest.mark.parametrize("name", ELSEWHERE)
 @pytest.mark.parametrize("deformation", MAPS, ids=["plain", "referenced"])
 def test_one_slot_is_computed_torque_where_responses_are_measured(name, deformation):
-    """On maps, late, behind estimators, of a body outside: the plain form bit by bit but for rounding.
+    """On maps, late, behind estimators, of a body outside: the plain form to rounding.
 
     The model-referenced one begins with the difference of model and plant at the start, and ends in the same motion.
     """

@@ -134,7 +134,7 @@ class InConcentrations:
     [("pump alone", lambda: lambda _: 4.53 * 0.84 ** (1 / 1.57)), ("cascade in mg/l", InConcentrations)],
 )
 def test_a_loop_of_its_own_has_the_same_run(name, controller, law):
-    """With exact compartments in place of Runge-Kutta steps, without noise, over the induction and the begin of surgery."""
+    """With exact compartments in place of Runge-Kutta steps, without noise, over the induction and the beginning of surgery."""
     cases = task().cases
     assert cases is not None
     problem = replace(cases.problem(name, task().problem), sensing=fp.Sensing(), duration=25.0)
