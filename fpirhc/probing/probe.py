@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -122,8 +122,8 @@ def probe(
         f_i = sum_j lambda_ij (f^_j, late by d cycles and a lag) + drift + noise,      f^: the model's response to the same commands
 
     The controller keeps the plant safe, without its deformation, while a small random binary sequence adds to its desired response.
-    Candidates are chosen on the plant as estimated, keep their margins at every corner of the intervals, and are then run on the
-    plant itself, beside the controller alone: the best one is kept, or none.
+    Candidates are chosen on the plant as estimated and keep their margins at every corner of the intervals, two of them at the
+    estimate alone. They are then run on the plant itself, beside the controller alone: the best one is kept, or none.
 
     Args:
         problem: with the plant that is to be probed, mostly an `ExternalPlant`.
@@ -169,7 +169,8 @@ def probe(
     if try_them and not results:
         why = "the loop refuses every candidate"
     elif try_them and name is None:
-        why = "in trials on the plant no candidate made the error clearly less, and that of no coordinate larger"
+        bearing = "" if all(one.bears for one in results.values()) else f" and bore {_MARGIN:g} times its gain"
+        why = f"in trials on the plant no candidate made the error clearly less, that of no coordinate larger{bearing}"
     elif candidates and name is None:
         why = "no candidate bears twice the gain, which one that is not tried has to"
     elif name is not None:
@@ -206,7 +207,7 @@ def _trials(
             if not name.startswith(DARING) or _bears_more(problem, bare, shortlist[name].deformation, seed):
                 return results
             notes.append(f"{name} is not kept: on the plant it does not bear {_MARGIN:g} times its gain")
-            del results[name]
+            results[name] = replace(results[name], bears=False)
 
 
 def _bears_more(problem: Problem, bare: Controller, chosen: Deformation, seed: int) -> bool:
@@ -300,7 +301,7 @@ def _interval(one: Interval) -> str:
 LONGEST = 2000  # cycles
 _WORSE = 1.03  # largest ratio of any coordinate's error to that of the controller alone
 _WORTH = 0.95
-_MARGIN = 1.4  # times its gain that such a candidate has to bear in a trial
+_MARGIN = 1.4  # times its gain that a daring candidate has to bear in a trial
 _DARED = 0.9  # ratio of errors, from which a candidate that is stable at the estimate alone is kept
 
 
@@ -311,15 +312,17 @@ class Trial:
     Args:
         error: rms error over that of the controller alone, in the mean over the coordinates.
         worst: of any coordinate.
+        bears: False where a run with a larger gain, which a daring candidate has to bear, does not pass.
     """
 
     error: float
     worst: float
+    bears: bool = True
 
     @property
     def passes(self) -> bool:
-        """Whether it makes the error clearly less, and that of no coordinate more."""
-        return self.error <= _WORTH and self.worst <= _WORSE
+        """Whether it makes the error clearly less, and that of no coordinate more, and bears what it has to."""
+        return self.error <= _WORTH and self.worst <= _WORSE and self.bears
 
 
 def tried(

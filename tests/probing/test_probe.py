@@ -13,6 +13,7 @@ from bodies import PERIOD, RHC, body_problem
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
+from fpirhc.probing import probe as probing
 from fpirhc.probing.identification import Channel, identify
 from fpirhc.probing.probe import Trial, best, tried
 from fpirhc.probing.recording import excited, sequence
@@ -161,6 +162,18 @@ def test_trials_keep_none_that_is_worse():
         best({"bold": Trial(0.5, 1.0), "daring, share 0.4": Trial(0.48, 1.0)}) == "bold"
     )  # a tenth is no reason to dare
     assert best({"bold": Trial(0.5, 1.0), "daring": Trial(0.4, 1.0)}) == "daring"
+
+
+def test_a_daring_candidate_that_bears_no_more_gain_is_told_as_such(monkeypatch):
+    """It passes, but not with 1.4 times its gain: its trial is shown, and nobody says that the loop refuses it."""
+    shortlist = Rule.shortlist
+    monkeypatch.setattr(Rule, "shortlist", lambda rule: {"daring": next(iter(shortlist(rule).values()))})
+    monkeypatch.setattr(probing, "tried", lambda *given, seed: {n: Trial(0.5 if n else 1.5, 1.0) for n in given[2]})
+    found = fp.probe(body_problem(1.0, 0, 0.0, 0.05), RHC, cycles=100)
+    assert found.deformation is None
+    assert "bore 1.4 times its gain" in found.why
+    assert found.trials["daring"] == Trial(0.5, 1.0, bears=False)
+    assert "daring is not kept: on the plant it does not bear 1.4 times its gain" in found.notes
 
 
 def test_no_neighbour_of_the_choice_is_better():
