@@ -355,8 +355,9 @@ def _public(contract: type) -> Iterator[tuple[str, type]]:
 
 def _declared_in(package: ModuleType, part: str) -> list[str]:
     """Public names that the stub of a package imports from one part of it; all public names without a stub."""
-    stub = Path(package.__file__ or "").with_suffix(".pyi")
-    if not stub.is_file():
+    file = getattr(package, "__file__", None)  # Python's own classes are in no file
+    stub = Path(file).with_suffix(".pyi") if file else None
+    if stub is None or not stub.is_file():
         return list(getattr(package, "__all__", ()))
     lines = (one for one in ast.parse(stub.read_text(encoding="utf-8")).body if isinstance(one, ast.ImportFrom))
     of_part = (one for one in lines if (one.module or "").partition(".")[0] == part)

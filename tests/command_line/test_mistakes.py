@@ -42,6 +42,9 @@ optimiser by name
 optimiser by a name of the command line
   fp.RecedingHorizon(optimiser), -> fp.RecedingHorizon(optimiser="fixed-point"),
     expected an Optimiser ... write fp.FixedPoint(iterations=..., tolerance=...)
+text for True or False
+  fp.RecedingHorizon(optimiser), -> fp.RecedingHorizon(fp.FixedPoint(3, second_start="no")),
+    FixedPoint.second_start: expected True or False, got the text 'no'
 path of two arguments
   lambda view: view.state.y + view.state.z -> lambda x, u: x.y
     expected a function of 1 argument
