@@ -79,6 +79,7 @@ class Cases(Checked):
         return line(self, f"{len(self.names)} cases", *([f"groups {', '.join(groups)}"] if groups else []))
 
     @classmethod
+    @checked_call
     def from_csv(
         cls,
         path: str | Path,
@@ -93,7 +94,7 @@ class Cases(Checked):
 
         Args:
             path: of the file; a relative one begins at the folder of the file that calls this.
-            needed: heads of columns that must be there, with a number in every row.
+            needed: heads of columns that must be there, filled in every row.
             words: by head of a column, the words of its cells and the number that each means: {"exact.sex": {"m": 0, "f": 1}}.
 
         Raises:
@@ -403,19 +404,23 @@ def _check_head(row: str, head: Sequence[str], needed: Sequence[str], mistakes: 
     mistakes.raise_if_any()
 
 
+_FORMS = {
+    _GROUP: (str, "the name of a group"),
+    _SEED: (int, "a whole number of at least 0"),
+}  # cells of other columns are numbers
+
+
 def _cell(column: str, cell: str, words: Mapping[str, float] | None) -> object:
-    if column == _GROUP:
-        return cell
     if words is not None:
         if cell not in words:
             raise ValueError(f"expected {' or '.join(map(repr, words))}, got '{cell}'")
         return words[cell]
+    form, what = _FORMS.get(column, (float, "a number, such as 3.5"))
     if not cell:  # of a column that is needed
-        raise ValueError("it is empty; expected a number, such as 3.5")
+        raise ValueError(f"it is empty; expected {what}")
     try:
-        return int(cell) if column == _SEED else float(cell)
+        return form(cell)
     except ValueError:
-        what = "a whole number of at least 0" if column == _SEED else "a number, such as 3.5, or nothing"
         raise ValueError(f"expected {what}, got '{cell}'") from None
 
 

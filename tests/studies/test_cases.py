@@ -18,7 +18,7 @@ from line import line_text
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
-from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
+from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidValue, ProblemFileError
 from fpirhc.problem_files.problem_file import Task, in_case
 from fpirhc.studies.comparison.compare import check_gains
 from fpirhc.studies.scenarios.bench import Bench, Conditions
@@ -175,6 +175,12 @@ def test_a_table_may_have_words_and_columns_that_every_case_needs(task):
     assert "row 3 (two), column 'exact.b': it is empty; expected a number, such as 3.5" in str(wrong.value)
     with pytest.raises(InvalidProblem, match=r"row 1: there is no column 'exact\.k', which every case needs\."):
         fp.Cases.from_csv(written("case,exact.b\none,0.9\n").resolve(), **cases)
+    with pytest.raises(
+        InvalidProblem, match=r"row 3 \(two\), column 'group': it is empty; expected the name of a group"
+    ):
+        fp.Cases.from_csv(written("case,group\none,old\ntwo,\n").resolve(), needed=["group"])
+    with pytest.raises(InvalidField, match=r"from_csv\.needed: expected .*, got the text 'exact\.b'"):
+        fp.Cases.from_csv(written("case,exact.b\none,0.9\n").resolve(), needed="exact.b")
 
 
 # --- Comparisons ------------------------------------------------------------------------------------------------------
