@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.controllers.contract import Controller
 
 Step = Callable[[float, np.ndarray], np.ndarray]  # time and measured state -> command
 
@@ -35,7 +36,7 @@ def flown(
     return np.array(states), np.array(commands), 1e3 * float(np.median(seconds))
 
 
-def ours(problem: fp.Problem, controller: fp.Controller) -> Step:
+def ours(problem: fp.Problem, controller: Controller) -> Step:
     """The controller's own step from its first memory on."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fp.HarmfulAdaptation)  # the table shows it

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.controllers.contract import Controller
 
 
 class Master:
@@ -68,7 +69,7 @@ def master(path: Path) -> Iterator[Master]:
 
 
 def apart_from_a_run(
-    problem: fp.Problem, controller: fp.Controller, path: Path, cycles: int, *, late: bool = False
+    problem: fp.Problem, controller: Controller, path: Path, cycles: int, *, late: bool = False
 ) -> tuple[float, float]:
     """Return how far states and commands of unit and plant are from those of `simulate`, at most.
 

@@ -28,6 +28,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
 import fpirhc as fp
+from fpirhc.controllers.contract import Controller
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.comparison import Comparison
@@ -53,7 +54,7 @@ class ForeignPlant:
     chain: Chain | None = None
 
     @property
-    def controllers(self) -> dict[str, fp.Controller]:
+    def controllers(self) -> dict[str, Controller]:
         """Computed torque without and with adaptation."""
         law = fp.ComputedTorque(fp.Exponential(rate=self.rate, integral=False))
         return {"CTC": law, "CTC+FPI": law.with_deformation(fp.ModelReferenced(fp.Affine(gain=self.gain)))}
@@ -672,7 +673,7 @@ def _moved(one: ForeignPlant, x: np.ndarray, u: np.ndarray, p: SimpleNamespace) 
     )
 
 
-def plans(one: ForeignPlant) -> tuple[fp.Problem, fp.Controller]:
+def plans(one: ForeignPlant) -> tuple[fp.Problem, Controller]:
     """The task of a plant of order 2 with plans of fifteen stages, one per cycle of 0.1 s."""
     [name], [force] = one.problem.plant.coordinates, one.problem.plant.inputs
     problem = replace(

@@ -25,6 +25,7 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.controllers.contract import Controller
 from fpirhc.problem_files.problem_file import Task
 
 FOLDER = Path(__file__).parents[1] / "problems" / "outside" / "quadbench"
@@ -208,7 +209,7 @@ def circle(task: Task) -> None:
         print(f"{name:34s}" + "".join(f"{cell:14.4f}" for cell in cells), flush=True)
 
 
-def _circled(task: Task, name: str, controller: fp.Controller | None, told: Mapping[str, float]) -> float:
+def _circled(task: Task, name: str, controller: Controller | None, told: Mapping[str, float]) -> float:
     first, speed = (
         (2.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         float(np.sqrt(vehicle.BENCHMARK["mass"] * 9.81 / 4 / vehicle.BENCHMARK["k_eta"])),
