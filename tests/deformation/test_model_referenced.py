@@ -355,15 +355,21 @@ def test_review_says_which_form():
     assert advice.verdict == "unknown"
     assert "it is plain; measurements speak for model-referenced" in advice.evidence
     assert advice.change == f"Try ModelReferenced(map={affine(0.5)!r})."
-    for own, verdict in ((1.0, "yes"), (1.2, "unknown"), (math.nan, "unknown")):
+    for own, other, verdict in (
+        (1, 1, "yes"),
+        (1.2, 1, "unknown"),
+        (math.nan, 1, "unknown"),
+        (math.inf, math.inf, "unknown"),
+    ):
         ran = right_form(
             TWO_MASS.problem,
             affine(0.5),
             harmless,
-            lambda form, own=own: (own if form == affine(0.5) else 1.0, "q1", "1 m"),
+            lambda form, own=own, other=other: (own if form == affine(0.5) else other, "q1", "1 m"),
         )
         assert ran.verdict == verdict
-        assert ("the rms error of q1 is 1 m with the form in use, 1 m with that" in ran.evidence) == math.isfinite(own)
+        told = "the rms error of q1 is 1 m as it is, 1 m with the model-referenced form" in ran.evidence
+        assert told == math.isfinite(own)
     decided = right_form(TWO_MASS.problem, affine(0.5), lambda form: "it loses" if form != affine(0.5) else "")
     assert decided.verdict == "yes"
     assert decided.evidence.endswith("; but here it loses, and the form in use does no harm")

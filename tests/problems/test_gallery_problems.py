@@ -352,7 +352,7 @@ def test_where_the_plain_form_is_right():
     ]
     [form] = [answer for answer in reviewed if answer.question == FORM]
     assert (form.verdict.value, form.change) == ("yes", "")
-    assert "the rms error of bis is 0.0126 with the form in use, 0.02 with that" in form.evidence
+    assert "the rms error of bis is 0.0126 as it is, 0.02 with the model-referenced form" in form.evidence
     run, plant, answers = run_of(name, "RHC exact model"), one.problem.plant, []
     answer = plant.equations.controlled_response
     for state, command in zip(run["state"][60::60], run["command"][60::60], strict=False):

@@ -88,8 +88,8 @@ def right_form(
         return Answer(FORM, Verdict.UNKNOWN, text, change)
     (own, of, size), (other, _, other_size) = error(deformation), error(proposed)
     if math.isfinite(own + other):
-        text += f"; in a run of at most {TRIED} cycles the rms error of {of} is {size} with the form in use, {other_size} with that"
-    if own <= SIMILAR * other:
+        text += f"; in a run of at most {TRIED} cycles the rms error of {of} is {size} as it is, {other_size} with the {form} form"
+    if math.isfinite(own) and own <= SIMILAR * other:
         return Answer(FORM, Verdict.YES, text)
     return Answer(FORM, Verdict.UNKNOWN, text, f"Try {as_written(proposed)}.")
 
