@@ -13,9 +13,9 @@ from plants import sine_of_three
 from scipy.signal import lfilter
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, InvalidValue, NotSupported
+from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported
 from fpirhc.review.grid import review_grid
-from fpirhc.review.questions.noise import Noisy, Suggestion, noisy_points
+from fpirhc.review.questions.noise import Noisy, Suggestion, _largest_within, noisy_points
 
 SETTINGS = [(0.198, 0.0, 1.5), (0.5, 0.0, 1.0), (0.59, 0.78, 1.5), (0.97, 0.91, 1.5), (1.9, 0.8, 1.0)]
 BUDGET = {"Q1": 0.32, "Q2": 0.555}  # N; what the plain gain -0.5 makes of a noise of 1 m/s^2
@@ -97,6 +97,13 @@ def test_generous_budget_ends_at_the_deadbeat_gain():
     assert max(suggestion.chatter.values()) < 10
     assert "gain" in repr(suggestion)
     assert "Suggested" in suggestion._repr_html_()
+
+
+def test_no_gain_within_a_budget_is_told_apart_from_no_gain_at_all():
+    """Chatter that is three times the budget with every gain is a matter of the budget; a loop that always grows is not."""
+    for steps, words in ((3.0, "at least 3 times as large"), (np.inf, "converges with no effective gain")):
+        with pytest.raises(NotContractive, match=words):
+            _largest_within(lambda size, steps=steps: np.array([steps]), np.array([1.0]), 1.0)
 
 
 def test_a_suggestion_that_a_run_speaks_against_says_so():

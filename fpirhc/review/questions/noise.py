@@ -185,6 +185,10 @@ def _largest_within(steps: Callable[[float], np.ndarray], budget: np.ndarray, mo
     place = next((k for k, size in enumerate(sizes) if fits(size)), None)
     if place is None:
         least = min(float((steps(size) / budget).max()) for size in sizes)
+        if not math.isfinite(least):
+            raise NotContractive(
+                f"the loop converges with no effective gain from {sizes[-1]:.3g} to {most:.3g} in size"
+            )
         raise NotContractive(
             f"no gain is within the budget: its chatter is at least {least:.3g} times as large with every gain with which the loop "
             "converges; allow more, or measure with less noise"
