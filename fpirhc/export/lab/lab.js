@@ -118,12 +118,12 @@ function verdict(answers) {
   return "rms error of " + specs.map((c) => c.title.slice(9)).join(", ") + ": " + texts.join("; ");
 }
 
-// By how much an error of the response is multiplied from cycle to cycle, at most
+// The contraction factor of the cycles that are looked at, one for every frame
 function contraction({ factors }, k) {
   if (!factors) return "";
   const largest = factors.reduce((a, b) => Math.max(a, b), 0), growing = factors.filter((one) => one >= 1).length / factors.length;
-  const said = growing ? "errors of the response grow in " + short(100 * growing) + " % of the cycles" : "below 1, so errors of the response shrink in every cycle";
-  return "Contraction factor of " + DATA.loops[k].name + ": at most " + short(largest) + ", " + said;
+  const said = growing ? "1 or more in " + short(100 * growing) + " % of " : "below 1 in each of ";
+  return "Contraction factor of " + DATA.loops[k].name + ": at most " + short(largest) + ", " + said + factors.length + " cycles of the run";
 }
 
 // The address, and the same in Python
