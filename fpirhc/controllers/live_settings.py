@@ -34,7 +34,10 @@ from fpirhc.task.problem import Problem
 OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances", "reality")
 MOVING = "_exact"  # signal of the parameters of what moves, in the memory of a loop
 _MOVED = re.compile(r"reality\.plant\.parameters\.(.+)\.exact")
-_ALWAYS_DATA = "Parameters (exact and approximate) and the start are data of every loop; they need no live setting"
+_ALWAYS_DATA = (
+    "Parameters (exact and approximate) and the start are data of every loop; they need no live setting: --set takes exact.NAME, "
+    "approximate.NAME and start.NAME"
+)
 _IN_TABLES = ("sensing", "disturbances")  # of what Python makes tables before a run
 _NUDGES, _SMALLEST = (0.07, 2.0), 1e-3  # shares by which a number is changed to see whether the loop depends on it
 _OF_INPUTS = "limits.inputs."
