@@ -51,7 +51,7 @@ def finite_numbers(where: str, given: object, names: Iterable[str]) -> np.ndarra
     except (TypeError, ValueError):
         numbers = np.empty(0)
     if numbers.shape != (len(wanted),) or not np.isfinite(numbers).all():
-        raise InvalidValue(f"{where}({given!r}): expected {len(wanted)} finite numbers: {', '.join(wanted)}")
+        raise InvalidValue(f"{where}({given!r}): expected a finite number for each of {', '.join(wanted)}")
     return numbers
 
 

@@ -57,5 +57,5 @@ def test_what_a_package_raises_has_the_adapters_name(call, message):
 @pytest.mark.parametrize("given", [np.zeros(3), "up", [1.0, np.nan], None, [[1.0, 2.0]]])
 def test_numbers_have_names(given):
     assert finite_numbers("step", [1, 2.0], ("Q1", "Q2")) == pytest.approx([1.0, 2.0])
-    with pytest.raises(InvalidValue, match=r"step\(.*\): expected 2 finite numbers: Q1, Q2"):
+    with pytest.raises(InvalidValue, match=r"step\(.*\): expected a finite number for each of Q1, Q2"):
         finite_numbers("step", given, ("Q1", "Q2"))
