@@ -1,9 +1,10 @@
 """Microseconds per cycle and plant of a closed loop: plants side by side in vector registers beside the ordinary compiled loop, and
 beside what somebody writes by hand in C, numpy, numba and JAX.
 
-    python benchmarks/batch.py [--write] [--many]      --write puts the tables into docs/performance.md
-                                                       --many runs a million plants for 500 cycles, and 100 000 for 100 plans
-                                                       --device NAME runs 65 536 plants on an OpenCL device, too
+    python benchmarks/batch.py [--write] [--many] [--device NAME]
+
+--write puts the tables into docs/performance.md; --many runs a million plants for 500 cycles, and 100 000 for 100 plans; --device
+runs 65 536 plants on an OpenCL device, too.
 
 Processor time in one process, in turn, the smallest of five; the ordinary runs keep their log and are measured by the same errors,
 the loops written by hand keep nothing but sums of squares. numba and JAX are left out where they are not installed.

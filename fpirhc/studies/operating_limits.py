@@ -232,7 +232,7 @@ def _limit(name: str, quantity: Quantity, loops: _Loops) -> OperatingLimit:
             points[value] = _tried(quantity, value, loops)
         return bool(points[value].why)
 
-    holds, fails = (math.nan, quantity.start) if failed(quantity.start) else _limits(quantity, failed)
+    holds, fails = (math.nan, quantity.start) if failed(quantity.start) else _bracket_of(quantity, failed)
     why = points[fails].why if fails in points else ""
     return OperatingLimit(name, quantity, holds, fails, why, tuple(points[v] for v in sorted(points)))
 
@@ -247,7 +247,7 @@ def _tried(quantity: Quantity, value: float, loops: _Loops) -> Point:
         return Point(value, math.inf, str(error).partition(";")[0])
 
 
-def _limits(quantity: Quantity, failed: Callable[[float], bool]) -> tuple[float, float]:
+def _bracket_of(quantity: Quantity, failed: Callable[[float], bool]) -> tuple[float, float]:
     step = quantity.first if quantity.whole else 0.0
     return bracket(failed, quantity.start, quantity.first, quantity.most, step=step)
 

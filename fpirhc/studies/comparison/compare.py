@@ -32,7 +32,7 @@ from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.causes import yardstick_of
 from fpirhc.studies.comparison.changes import Finding, Outcome, scales
 from fpirhc.studies.comparison.comparison import Comparison
-from fpirhc.studies.comparison.entry import Contraction, Entry, has_exact_model, information, plan_every, sentences
+from fpirhc.studies.comparison.entry import Contraction, Entry, has_exact_model, information, lines_of, plan_every
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.comparison.pairwise import (
     Built,
@@ -137,7 +137,7 @@ def compare(
         nulls=nulls,
         time_unit=task.problem.time_unit,
         steps=task.problem.real_integrator.steps_maps,
-        information=(*sentences(task.problem, {e.name: e.information for e in entries if e.information}), *broken),
+        information=(*lines_of(task.problem, {e.name: e.information for e in entries if e.information}), *broken),
     )
 
 

@@ -62,7 +62,7 @@ def information(problem: Problem, controller: Controller, loop: Composite, cycle
     return Information(_used(problem, loop), _rate(controller, cycles), waits)
 
 
-def sentences(problem: Problem, known: Mapping[str, Information]) -> tuple[str, ...]:
+def lines_of(problem: Problem, known: Mapping[str, Information]) -> tuple[str, ...]:
     """Return the lines of a comparison: what all are given, what each uses, and when each acts.
 
     Args:

@@ -1,7 +1,7 @@
 """Who answers the jobs of a study: worker processes of this machine, replaced when they die, or a cluster of Dask.
 
 A worker is a command that reads one JSON value per line and answers each with one line, in order; its first line is a greeting.
-It ends at the end of its input, so that no worker outlives its parent. Of a cluster the client alone writes the ledger; a worker
+It ends at the end of its input, so that no worker outlives its parent. With a cluster the client alone writes the ledger; a worker
 builds the study from the file's content, and answers only where the facts on which its numbers depend are the client's.
 """
 
