@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import fpirhc as fp
+from fpirhc.baselines.places import baseline_path, problems_here
 from fpirhc.controllers.contract import innermost
 from fpirhc.plant.motion import followed_units
 from fpirhc.problem_files.problem_file import Task
@@ -74,6 +75,13 @@ def test_a_table_is_what_runs_give(path):
     for controller, *numbers in table[1:]:
         for name, number in zip(names, numbers, strict=True):
             assert float(number) == pytest.approx(errors(path, controller)[name], rel=0.05), (controller, name)
+
+
+def test_every_problem_has_a_baseline_or_a_reason_why_not():
+    """`fpirhc check` fails for any other."""
+    problems, _ = problems_here(ROOT.parent)
+    assert [path.stem for path in problems if not baseline_path(path).exists()] == []
+    assert len(problems) > 20
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
