@@ -9,12 +9,12 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, fed
+from fpirhc.controllers.base import Controller, fed, under_names
 from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.gate import Gate, across_gaps, gap_of, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
@@ -30,7 +30,7 @@ from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, compose
 from fpirhc.symbolic.driver import every_finite
-from fpirhc.symbolic.expression import FINITE, Signals, expression
+from fpirhc.symbolic.expression import FINITE, Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.limits import Interval
@@ -171,7 +171,7 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, monitor: 
         gate: around the controller's step.
         monitor: the limits of the monitor.
     """
-    block = _renamed(gate.block(), "status", _GATED)
+    block = under_names(gate.block(), {"status": _GATED})
     longest = round(monitor.saturated_after / problem.period)
     watched = watch_block(problem, controller, _STATUS, longest=longest, window=monitor.window)
     own = _identity_block(fingerprint(problem, controller, block.memory))
@@ -204,18 +204,6 @@ def _count_block() -> Block:
         return {SKIPPED: total, f"{count.name}_next": total}
 
     return Block("count", Layout((scalar("status"),)), Layout((scalar(SKIPPED),)), step, Layout((count,)))
-
-
-def _renamed(block: Block, name: str, other: str) -> Block:
-    """The block with one of its written signals under another name."""
-    writes = Layout(tuple(replace(s, name=other) if s.name == name else s for s in block.writes.signals))
-
-    def step(s: Signals) -> dict[str, Expression]:
-        values = dict(block.step(s))
-        values[other] = values.pop(name)
-        return {key: expression(value) for key, value in values.items()}
-
-    return replace(block, writes=writes, step=step)
 
 
 def composed_step(
