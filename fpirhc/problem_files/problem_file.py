@@ -19,7 +19,7 @@ import io
 import linecache
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -166,18 +166,24 @@ def in_case(task: Task, name: str) -> Task:
     return replace(task, problem=task.cases.problem(name, task.problem))
 
 
-def with_numbers_of_all(task: Task, values: Mapping[str, Any]) -> Task:
-    """Return the task with other numbers: of the problem, at paths of a case, and of every controller that has the setting.
+def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection[str] | None = None) -> Task:
+    """Return the task with other numbers: of the problem, at paths of a case, and of every named controller that has the setting.
+
+    Args:
+        task: the task.
+        values: by path.
+        names: of controllers; None: all.
 
     Raises:
-        InvalidName: a setting that no controller has.
+        InvalidName: a setting that none of these controllers has.
         InvalidProblem: a number that does not fit the problem.
         InvalidValue: a number that a controller does not accept.
     """
     own = {path: word for path in values if (word := of_problem(task.problem, path))}
     problem, controllers = with_numbers(task.problem, {word: values[path] for path, word in own.items()}), {}
+    chosen = {name: one for name, one in task.controllers.items() if not names or name in names}
     lacking: dict[str, list[InvalidName]] = {path: [] for path in values if path not in own}
-    for name, controller in task.controllers.items():
+    for name, controller in chosen.items():
         has = {}
         for path, lacked in lacking.items():
             try:
@@ -187,9 +193,9 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any]) -> Task:
                 lacked.append(error)
         controllers[name] = with_settings(controller, as_declared(controller, has))
     for lacked in lacking.values():
-        if len(lacked) == len(controllers):
+        if chosen and len(lacked) == len(chosen):
             raise lacked[-1]
-    return replace(task, problem=problem, controllers=controllers)
+    return replace(task, problem=problem, controllers={**task.controllers, **controllers})
 
 
 def _problem(module: ModuleType, mistakes: Mistakes) -> Problem | None:

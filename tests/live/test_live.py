@@ -233,6 +233,7 @@ def check_numbers_of_the_problem(capsys):
     for words, why in (
         (["run", "line.py", "C", "--set", "exact.mm=1"], "there is no 'mm'. Did you mean 'm'?"),
         (["compare", "line.py", "--set", "deformation.gian=1"], "gain"),
+        (["compare", "two_mass", "--controllers", "CTC", "--set", "deformation.gain=-1"], "(Identity) has no 'gain'"),
         (["compare", "line.py", "--set", "start.q=1", "--scenarios", "2"], "--set cannot be combined with --scenarios"),
     ):
         assert main(words) == 2

@@ -95,7 +95,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     task = with_tuned(task, tuned.values) if tuned else task
-    task = with_numbers_of_all(task, numbers(options.settings)) if options.settings else task
+    task = with_numbers_of_all(task, numbers(options.settings), options.controllers) if options.settings else task
     controllers = options.controllers
     if options.optimisers:
         named = list(select(task, controllers)) if controllers else None
