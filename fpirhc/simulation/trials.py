@@ -46,7 +46,8 @@ class ErrorPair:
         adapted: the same with the deformation; infinite where the run ended early.
         ranges: range of the reference, or the largest error of the run without adaptation where that is larger, by coordinate.
         units: of the coordinates.
-        at_limit: share of the cycles in which a command stands at a limit, of the run where it is smaller.
+        at_limit: share of the cycles in which a command stands at a limit, of the run where it is smaller; NaN where one
+            ended before errors count.
     """
 
     without: Mapping[str, float]
@@ -94,7 +95,7 @@ class ErrorPair:
     @property
     def stuck(self) -> str:
         """Why the pair shows nothing: commands stand at a limit in both runs; empty where it shows something."""
-        if not self.at_limit >= MOSTLY:  # no number where a run ended before errors count
+        if not self.at_limit >= MOSTLY:  # NaN is informative
             return ""
         share = f"{100 * self.at_limit:.3g} %"
         return f"not informative: the command stands at a limit in {share} of the cycles, where no adaptation can act"
@@ -134,7 +135,7 @@ def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | Non
         }
         for run in runs
     )
-    stuck = min(at_limit(problem, run) for run in runs)
+    stuck = float(np.min([at_limit(problem, run) for run in runs]))  # NaN where one of them is
     return ErrorPair(before, after, _ranges(problem, runs[0]), followed_units(problem.plant), stuck)
 
 
@@ -142,6 +143,8 @@ def _ranges(problem: Problem, run: Run) -> dict[str, float]:
     """Range of the reference, or the largest error of the whole run where that is larger; its size where both are rounding."""
     errors, motion = run["true_error"], run[judged_motion(run.layout)]
     places = [problem.plant.output.elements.index(name) for name in problem.judged_names]
+    if not run.cycles:
+        return dict.fromkeys(problem.judged_names, 0.0)
     reference = errors + motion[:, places]
     sizes = np.fmax(np.ptp(reference, axis=0), np.abs(errors).max(axis=0))
     largest = np.abs(reference).max(axis=0)

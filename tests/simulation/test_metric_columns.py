@@ -15,6 +15,7 @@ from fpirhc.simulation.metrics import known_metrics
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.metrics.entries.solve import iterations, residual
 from fpirhc.simulation.metrics.measuring import columns
+from fpirhc.simulation.trials import errors_of
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Signal
 
@@ -130,6 +131,15 @@ def test_a_run_that_ended_at_once_has_no_numbers():
     assert metrics.statuses == {"NON_FINITE": 1}
     assert metrics["cycles"] == {"": 0}
     assert metrics.broken == fp.measure(problem(), run(1.0)).broken == ()
+
+
+def test_a_pair_with_a_run_that_ended_before_errors_count_is_informative():
+    """A command at its limit in every cycle shows nothing of adaptation; that one of the runs ended is a fact, whichever it is."""
+    task, ended = problem(limits=fp.Limits(inputs={"u": (-1.0, 1.0)})), "signal 'x' is not finite"
+    whole, short = run(1.0, command=1.0), run(1.0, command=1.0, stop=ended)
+    assert errors_of(task, (whole, whole)).stuck.startswith("not informative: the command stands at a limit in 100 %")
+    assert errors_of(task, (whole, short)).stuck == errors_of(task, (short, whole)).stuck == ""
+    assert errors_of(task, (cut(short, 0), whole)).without == {"y": np.inf}
 
 
 def test_one_cycle_is_enough_for_a_solve():
