@@ -292,8 +292,12 @@ def _movement(plain: Entry, adaptive: Entry) -> str:
         return ""
     before, after = (entry.metrics.values["total_variation"][name] for entry in (plain, adaptive))
     unit = with_space(adaptive.metrics.units.get("total_variation", {}).get(name, "1"))
-    much = f"{times(ratio)} as much as" if math.isfinite(ratio) else "and not"
-    return f"Its command moves {much} that of {plain.name} ({name} {after:.3g} against {before:.3g}{unit})"
+    much = (
+        f" {times(ratio)} as much as that of {plain.name}"
+        if math.isfinite(ratio)
+        else f", that of {plain.name} does not"
+    )
+    return f"Its command moves{much} ({name} {after:.3g} against {before:.3g}{unit})"
 
 
 def _times_moved(plain: Entry, adaptive: Entry) -> tuple[float, str]:

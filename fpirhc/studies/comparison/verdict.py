@@ -84,13 +84,12 @@ def _by_figure(plain: Entry, adaptive: Entry, figure: Objective) -> Finding:
     )
     name = figure.noun
     if not math.isfinite(before + after):
-        lost = " and ".join(e.name for e, v in ((plain, before), (adaptive, after)) if not math.isfinite(v))
+        lost = [e.name for e, v in ((plain, before), (adaptive, after)) if not math.isfinite(v)]
+        none = f"{lost[0]} has none" if len(lost) == 1 else "both have none"
         outcome = {(True, False): Outcome.BETTER, (False, True): Outcome.WORSE}.get(
             (not math.isfinite(before), not math.isfinite(after)), Outcome.NOT_COMPARABLE
         )
-        return Finding(
-            f"By {name} {adaptive.name} and {plain.name} cannot be set side by side: {lost} has none.", outcome, pair
-        )
+        return Finding(f"By {name} {adaptive.name} and {plain.name} cannot be set side by side: {none}.", outcome, pair)
     sign = -1 if metric.better == "larger" else 1
     change = Change(name, abs(before), abs(after))
     gained = sign * (before - after)
