@@ -14,7 +14,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
     text = "names of controllers (default: the pair of the headline)"
     parser.add_argument("--controllers", nargs="+", metavar="NAME", help=text)
-    text = "settings with a slider (default: gain, rate, limits of inputs); parameters always have one"
+    text = "settings with a slider (default: gains, rates, limits of inputs, dead times, the reference); parameters always have one"
     parser.add_argument("--live", nargs="+", default=[], metavar="PATH", help=text)
     parser.add_argument("--out", metavar="FILE", help="the page, or a folder for it (default: results)")
 

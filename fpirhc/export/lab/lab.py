@@ -135,7 +135,7 @@ def make_lab(
         file: name or path of the problem file.
         problem: the task; its equations run in the page, so a reality outside cannot.
         controllers: by name.
-        live: paths of settings with a slider; none: gains, rates, and the limits of inputs.
+        live: paths of settings with a slider; none: gains, rates, limits of inputs, dead times, and numbers of the reference.
         pictures: of the problem; the first `Planar` moves with the loops.
 
     Raises:
