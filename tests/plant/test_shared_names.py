@@ -13,7 +13,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.conformance import check_plant
 from fpirhc.controllers.contract import Controller
-from fpirhc.errors import FpirhcError, InvalidProblem
+from fpirhc.errors import FpirhcError, InvalidProblem, NotContractive
 from fpirhc.members import examples
 from fpirhc.probing.recording import read_recording
 from fpirhc.review.grid import review_grid
@@ -86,7 +86,7 @@ def test_a_run_is_that_of_other_names(form):
         pair = [FORMS[form](one) for one in pair]
     shared, other = (outcome(one, controller) for one in pair)
     if isinstance(shared, type) or isinstance(other, type):
-        assert shared is other
+        assert shared is other is NotContractive  # examples with a gain of the other sign
         return
     assert shared.layout.names == other.layout.names
     for name in other.layout.names:
