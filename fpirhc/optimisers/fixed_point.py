@@ -49,8 +49,8 @@ class FixedPoint(Optimiser):
         most_iterations: of one call with limits of states in a loop. The call ends where the plan is solved, a remembered plan
             usually after a handful. A call that uses all of them is NOT_CONVERGED, and returns the better one of its plan and the
             plan in force.
-        second_start: whether a call also begins without the remembered plan, and takes the cheaper plan of both. An economic cost
-            has several minima, and a remembered plan stays in its own; a call takes twice as long.
+        second_start: whether a call also begins without the remembered plan, and takes the cheaper one of two solved plans. An
+            economic cost has several minima, and a remembered plan stays in its own; a call takes twice as long.
     """
 
     iterations: Count

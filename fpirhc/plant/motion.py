@@ -341,7 +341,7 @@ def _one_step(motion: Motion, step: Callable[..., Mapping[str, Expression]], x: 
 
 
 SECONDS = {"s": 1.0, "us": 1e-6, "ms": 1e-3, "min": 60.0, "h": 3600.0, "day": 86400.0}
-"""By unit of time, where a clock on the wall is asked too."""
+"""Seconds in a unit of time, for what is compared with a real clock."""
 
 
 def derivative_unit(unit: str, derivative: int, time: str = "s") -> str:

@@ -1,4 +1,4 @@
-"""Devices that speak OpenCL, such as graphics processors: a kernel of double precision with a loop in each work item."""
+"""Devices with OpenCL, such as graphics processors: a kernel of double precision with a loop in each work item."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def loaded_kernel(source: str, device: str) -> Callable[..., int]:
     queue = cl.CommandQueue(context)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # compilers are chatty
+            warnings.simplefilter("ignore")  # of compilers about code that they compile
             kernel = cl.Program(context, source).build().run_lanes
     except cl.RuntimeError as error:
         raise NoCode(f"the compiler of '{chosen.name}' failed: {str(error).strip().splitlines()[0]}") from None

@@ -41,7 +41,7 @@ _SIDE_BY_SIDE = {
     ca.OP_AND: "truth(({0}!=0)&({1}!=0))", ca.OP_OR: "truth(({0}!=0)|({1}!=0))", ca.OP_IF_ELSE_ZERO: "where({0}!=0,{1})",
     ca.OP_NOT: "truth({0}==0)", ca.OP_SIGN: "either({0}<0, ALL(-1), either({0}>0, ALL(1), {0}))",
 }  # fmt: skip
-_ON_DEVICES = {  # OpenCL asks no number whether it is true
+_ON_DEVICES = {  # in OpenCL a number of double precision is no condition
     ca.OP_AND: "(({0}!=0)&&({1}!=0))", ca.OP_OR: "(({0}!=0)||({1}!=0))", ca.OP_NOT: "({0}==0)",
     ca.OP_IF_ELSE_ZERO: "({0}!=0?{1}:0.)",
 }  # fmt: skip
@@ -55,11 +55,11 @@ class Unwritten(Exception):
 
 
 class Words(NamedTuple):
-    """How C says operations and constants.
+    """How operations and constants are written in C.
 
     Args:
         operations: by CasADi's number of them; `{0}` and `{1}` are the operands.
-        side_by_side: whether a value is a row of numbers, of loops side by side, as `lanes.c` says.
+        side_by_side: whether a value is a row of numbers, one of each loop, see `lanes.c`.
     """
 
     operations: Mapping[int, str]

@@ -210,7 +210,7 @@ class ThroughModel(Checked):
         return queue.delayed(queue.pushed(s.references_sent, wanted), wanted.numel()) + s.shift_in_force
 
     def undeformed(self, s: Signals, in_force: Expression) -> Expression:
-        """Return the target without its shift: of the shift that was in force, or in the model-referenced form of the last one."""
+        """Return the target less a shift: that in force of the plain form, the last one of the model-referenced form."""
         return in_force - (s.shift_in_force if self.plain else s.shift_last)
 
     def remembered(self, problem: Problem, s: Signals, wanted: Expression, shift: Expression) -> dict[str, Expression]:

@@ -42,7 +42,7 @@ class LinearMap(Deformation):
     Args:
         gain: a at the start.
         weights: W by rows; None: the one matrix.
-        noisy: whether n, which is the next cycle's zero, and p, zero at the start, are in the memory.
+        noisy: whether n and p are in the memory: n is zero again one cycle later, p is zero at the start.
     """
 
     gain: float
