@@ -64,8 +64,8 @@ class DisturbanceKalman(ParameterEstimator):
             outputs also output (y), for a disturbance that adds to it, or response of an output (y'' for order 2), for one that
             adds to the response alone, which is what a deformation sees.
         measured: state (q1, q1', ...), output (y, y', ...) or response (q1'' for order 2) -> deviation of its measurement noise, in
-            its unit. A response shows its disturbance at once, and a deformation reads it too. Behind dead time or an estimator, and
-            on maps, the whole filter is as late as the response. Of responses alone the filter has no state of its own: it
+            its unit. A response shows its disturbance at once, and a deformation reads it too. Behind dead time or an estimator,
+            and on maps, the whole filter is as late as the response. Of responses alone the filter has no state of its own: it
             evaluates the model at the measured one, and moves the disturbance by the gain L times the innovation, as a
             model-referenced deformation of gain L does.
         noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.

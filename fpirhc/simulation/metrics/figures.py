@@ -52,7 +52,7 @@ def TimeOver(what: What, level: float, *, name: str = "time_over", headline: boo
 
 @checked_call
 def Total(what: What, *, name: str = "total", headline: bool = True) -> Metric:
-    """Return the integral of s over time, the sum times the period, in EUR for s in EUR/h; arguments as in `InBand`."""
+    """Return the integral of s over time, its sum over the cycles times the period: EUR for s in EUR/h; see `InBand`."""
     return _figure(name, what, lambda s, period: np.sum(s) * period, _times, headline)
 
 
