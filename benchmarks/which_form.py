@@ -1,6 +1,6 @@
 """Which form of the iteration: plain, increment and model-referenced side by side on all shipped problems.
 
-    python benchmarks/forms.py [names of problems]     prints the tables; --write puts them into docs/which-form.md
+    python benchmarks/which_form.py [names of problems]     prints the tables; --write puts them into docs/which-form.md
 
 Each problem keeps its controller, horizon, limits and measuring time; only the deformation is exchanged: eq (6) with the gains
 -0.5, -1.5, -2.5 in each of the three forms. Five conditions:
