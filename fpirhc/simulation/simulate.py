@@ -387,9 +387,8 @@ def stopped(problem: Problem, cycle: int, what: str) -> str:
 
 _CHUNK = 500  # cycles whose costs are evaluated in one call
 Judgement = tuple[Signal, np.ndarray]
-_COSTS: Latest[tuple[OptimalControl, Evaluator]] = Latest(
-    2
-)  # every controller of a comparison is judged by the same cost
+# Every controller of a comparison is judged by the same cost.
+_COSTS: Latest[tuple[OptimalControl, Evaluator]] = Latest(2)
 
 
 def judgements(

@@ -49,7 +49,7 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.maps import growth_of, response_age
 from fpirhc.plant.motion import time_signal
 from fpirhc.sensing.base import spline_weights
-from fpirhc.sensing.positions import PositionDifference, StepDifference
+from fpirhc.sensing.positions import PositionDifference
 from fpirhc.status import Status
 from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block, Delay
@@ -322,10 +322,8 @@ def _check_gain(problem: Problem, one: Channel) -> None:
     if weights.size == 1:
         return
     late = problem.dead_time.inputs.get(one.chain.input, 0.0) + problem.dead_time.measurement
-    most, size = (
-        limit_behind(deformation, weights, late / problem.period, abs(exact / one.start_gain)),
-        abs(deformation.effective_gain()),
-    )
+    most = limit_behind(deformation, weights, late / problem.period, abs(exact / one.start_gain))
+    size = abs(deformation.effective_gain())
     if size >= most:
         raise NotContractive(
             f"slot '{one.slot.coordinate}': its response is of several cycles, so the iteration converges only for effective gains "
@@ -338,10 +336,8 @@ def _weights(problem: Problem, one: Channel) -> np.ndarray:
     if reads_equations(problem):
         return np.ones(1)
     estimator = problem.sensing.estimator
-    if not one.differences:
+    if estimator.of_steps or not one.differences:
         return estimator.weights(one.chain.order, problem.period)
-    if estimator.of_steps:
-        return StepDifference().weights(one.chain.order, problem.period)
     return spline_weights(one.differences)
 
 
