@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any
+from types import ModuleType
+from typing import Protocol
 
 import numpy as np
 
@@ -45,7 +46,13 @@ def loaded_kernel(source: str, device: str) -> Callable[..., int]:
     return run
 
 
-def _device(cl: Any, name: str) -> Any:
+class _Device(Protocol):
+    name: str
+    extensions: str
+    type: int
+
+
+def _device(cl: ModuleType, name: str) -> _Device:
     try:
         every = [one for platform in cl.get_platforms() for one in platform.get_devices()]
     except cl.LogicError:  # no platform at all

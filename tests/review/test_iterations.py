@@ -109,17 +109,17 @@ def test_the_pair_keeps_its_budget_in_a_run():
 
 
 def test_without_limits_the_price_stays():
-    """No limits, no range: the iteration by itself has the chatter of the gain in use, and adapts faster by its filter.
+    """No limits, no range: the gain in use sets the price, and a filter with four times the gain costs more in the whole loop.
 
-    The tracking law makes the filtered pair swing, which the whole loop knows as a run does.
+    By itself the filtered iteration has the chatter of the gain in use; the tracking law makes it swing, as a run does.
     """
     advice = answer(NOISY, fp.Affine(gain=-0.2), WORDS)
-    pair = fp.Filtered(fp.Affine(gain=-2 * advice.numbers["recommended"]), pole=advice.numbers["recommended_pole"])
+    assert (advice.verdict, advice.change) == ("yes", "")
+    pair = fp.Filtered(fp.Affine(gain=-0.863), pole=0.892)
     told = [answer(NOISY, one, "chatter").numbers["step_u"] for one in (fp.Affine(gain=-0.2), pair)]
     ran = [steps_in_a_run(NOISY, fp.ComputedTorque(fp.Exponential(rate=RATE), m)) for m in (fp.Affine(gain=-0.2), pair)]
     assert told == pytest.approx(ran, rel=0.08)
-    assert told[1] < 1.5 * told[0]
-    assert advice.numbers["recommended"] > 2 * advice.numbers["gain"]
+    assert told[1] > 1.3 * told[0]
 
 
 def test_without_noise_nothing_is_asked():

@@ -161,14 +161,12 @@ def test_feedback_of_a_plan_is_that_of_the_riccati_equation():
 
 
 def test_a_good_problem_is_ready():
-    """Every answer about a mild mismatch is yes, in the form that the problem wants; the plain one is ready too, with advice."""
+    """Every answer about a mild mismatch is yes, in the form that the problem wants and in the plain one, whose run is as good."""
     problem, plain = mass(limits=fp.Limits(inputs={"u": (-20.0, 20.0)})), torque()
     answers_by_question = answers(problem, replace(plain, deformation=fp.ModelReferenced(plain.deformation)))
     assert {a.verdict for a in answers_by_question.values()} == {"yes"}
     assert all(not a.change for a in answers_by_question.values())
-    others = {q: a for q, a in answers(problem, plain).items() if a.verdict != "yes"}
-    assert set(others) == {"Is it the form of the iteration that the problem wants?"}
-    assert "ModelReferenced" in about(others, "form of the iteration").change
+    assert {a.verdict for a in answers(problem, plain).values()} == {"yes"}
 
 
 @pytest.mark.parametrize(

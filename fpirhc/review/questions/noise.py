@@ -175,6 +175,10 @@ def _largest_eigenvalue(spectrum: Spectrum) -> tuple[float, float]:
     return math.copysign(1.0, low), float((np.abs(values) ** 2 / np.abs(values.real)).max())
 
 
+class _OverBudget(NotContractive):
+    """The loop converges with some gains, and none of them is within the budget."""
+
+
 def _largest_within(steps: Callable[[float], np.ndarray], budget: np.ndarray, most: float) -> float:
     """The largest gain within the budget, sought downwards: with a small one the loop itself may grow."""
 
@@ -189,7 +193,7 @@ def _largest_within(steps: Callable[[float], np.ndarray], budget: np.ndarray, mo
             raise NotContractive(
                 f"the loop converges with no effective gain from {sizes[-1]:.3g} to {most:.3g} in size"
             )
-        raise NotContractive(
+        raise _OverBudget(
             f"no gain is within the budget: its chatter is at least {least:.3g} times as large with every gain with which the loop "
             "converges; allow more, or measure with less noise"
         )
@@ -375,9 +379,14 @@ def suits_noise(case: Case) -> Answer | None:
         return None
     try:
         steps = chatter_of(case.grid, case.controller, deformation.effective_gain(), deformation.iteration.error_pole)
-        budget = _budget(case) or steps
+        limited = _budget(case)
+        budget = limited or steps
         pair = _within_budget(case.problem, case.controller, budget)
     except FpirhcError as error:
+        if isinstance(error, _OverBudget) and not limited:
+            return Answer(
+                NOISE_PAIR, Verdict.YES, "no filter with a larger gain has as little chatter as the pair in use"
+            )
         return Answer(NOISE_PAIR, Verdict.UNKNOWN, str(error))
     pole = deformation.iteration.error_pole
     gain, share = abs(deformation.effective_gain()), abs(deformation.effective_gain() / pair.effective_gain)

@@ -13,7 +13,7 @@ from functools import cached_property, reduce
 import numpy as np
 
 NEUTRAL = 1e-6  # distance of |pole| from 1, where a mode neither decays nor grows
-_DOUBLINGS, _OVER = 16, 1e-14  # of a sum over periods, and the share of it below which it is over
+_DOUBLINGS, _OVER = 16, 1e-12  # of a sum over periods, and what is left of a state where it is over
 _SHOWN = 1e-6  # share of a judged error in an eigenvector, in scales
 
 
@@ -172,10 +172,9 @@ class LinearLoop:
             total = one.dynamics @ total @ one.dynamics.T + one.entry @ covariance @ one.entry.T
         with np.errstate(over="ignore", invalid="ignore"):  # a loop that grows has no bound
             for _ in range(_DOUBLINGS):
-                added = moved @ total @ moved.T
-                total, moved = total + added, moved @ moved
-                if not np.abs(added).max(initial=0.0) > _OVER * np.abs(total).max(initial=0.0):
-                    break
+                total, moved = total + moved @ total @ moved.T, moved @ moved
+                if not np.abs(moved).max(initial=0.0) > _OVER:
+                    break  # what is added may be small and grow later, so the motion is asked and not the sum
         return np.asarray(total)
 
     def steps(self, covariance: np.ndarray) -> np.ndarray:
