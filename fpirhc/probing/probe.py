@@ -169,8 +169,8 @@ def probe(
     if try_them and not results:
         why = "the loop refuses every candidate"
     elif try_them and name is None:
-        bearing = "" if all(one.bears for one in results.values()) else f" and bore {_MARGIN:g} times its gain"
-        why = f"in trials on the plant no candidate made the error clearly less, that of no coordinate larger{bearing}"
+        bearing = "" if all(one.bears for one in results.values()) else f", and bore {_MARGIN:g} times its gain"
+        why = f"in trials on the plant no candidate made the error clearly less, and that of no coordinate larger{bearing}"
     elif candidates and name is None:
         why = "no candidate bears twice the gain, which one that is not tried has to"
     elif name is not None:
