@@ -42,8 +42,9 @@ class ErrorPair:
     """Errors of two runs on the same plant.
 
     Args:
-        without: rms tracking error by judged coordinate without adaptation, in the unit of the coordinate.
-        adapted: the same with the deformation; infinite where the run ended early.
+        without: rms tracking error by judged coordinate without adaptation, in the unit of the coordinate; infinite where the run
+            ended early.
+        adapted: the same with the deformation.
         ranges: range of the reference, or the largest error of the run without adaptation where that is larger, by coordinate.
         units: of the coordinates.
         at_limit: share of the cycles in which a command stands at a limit, of the run where it is smaller; NaN where one
@@ -89,6 +90,9 @@ class ErrorPair:
         """Both errors of the worst coordinate, where a run may have ended early."""
         unit = self.unit(self.worst)
         before, after = self.without[self.worst], self.adapted[self.worst]
+        if not math.isfinite(before):
+            other = f"with it the rms error of {self.worst} is {after:.3g}{unit}"
+            return f"the run without adaptation ends early, and {other if math.isfinite(after) else 'so does the one with it'}"
         rest = f"{after:.3g}{unit} with it" if math.isfinite(after) else "a run that ends early with it"
         return f"the rms error of {self.worst} is {before:.3g}{unit} without adaptation, {rest}"
 
@@ -118,8 +122,12 @@ class ErrorPair:
 
     @property
     def fails(self) -> bool:
-        """Whether it makes one worse by a factor of two and a hundredth of its range, or by ten times and a thousandth."""
-        return self._beyond(MUCH_WORSE, CLEAR) or self._beyond(FAR_WORSE, SLIGHT)
+        """Whether it makes one worse by a factor of two and a hundredth of its range, or by ten times and a thousandth.
+
+        Where the run without adaptation ends early there is nothing that it makes worse.
+        """
+        known = all(map(math.isfinite, self.without.values()))
+        return known and (self._beyond(MUCH_WORSE, CLEAR) or self._beyond(FAR_WORSE, SLIGHT))
 
     def _beyond(self, ratio: float, share: float) -> bool:
         return any(not (self.ratio(n) <= ratio or self.added(n) <= share) for n in self.without)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from dataclasses import replace
@@ -14,6 +15,7 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.simulation import trials as harm_warning
+from fpirhc.simulation.trials import ErrorPair
 from fpirhc.studies.comparison.timing import stepper_to_time
 
 PROBLEM = fp.Problem(
@@ -83,6 +85,20 @@ def test_as_an_error_it_stops_the_build():
         warnings.simplefilter("error", fp.HarmfulAdaptation)
         with pytest.raises(fp.HarmfulAdaptation, match="adaptation does harm"):
             fp.Stepper(PROBLEM, GENTLE, compiled=False)
+
+
+@pytest.mark.parametrize(
+    ("without", "adapted", "passes", "fails", "sentence"),
+    [
+        (0.1, math.inf, False, True, "the rms error of y is 0.1 m without adaptation, a run that ends early with it"),
+        (math.inf, 0.1, True, False, "the run without adaptation ends early, and with it the rms error of y is 0.1 m"),
+        (math.inf, math.inf, False, False, "the run without adaptation ends early, and so does the one with it"),
+    ],
+)
+def test_where_the_plant_is_lost_anyway_adaptation_does_no_harm(without, adapted, passes, fails, sentence):
+    """It is harm to lose a run that finishes without adaptation; where both are lost nothing speaks for it or against it."""
+    pair = ErrorPair({"y": without}, {"y": adapted}, {"y": 1.0}, {"y": "m"})
+    assert (pair.passes, pair.fails, pair.sentence) == (passes, fails, sentence)
 
 
 def test_a_run_that_ends_early_is_harm():
