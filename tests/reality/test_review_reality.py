@@ -170,6 +170,21 @@ def test_comparison_shows_belief_beside_reality():
     assert {"reality: F", "CTC+FPI: response of y, observer and reality"} <= set(titles["real"]) - set(titles["model"])
 
 
+def test_comparison_shows_the_responses_of_slots_that_a_reality_has():
+    """Behind encoders the response of the slot on q1 is found from samples, and the log has that of the controlled q2 alone."""
+    file = fp.load_problem("mass_spring_slots")
+    sensing, real = fp.Sensing(estimator=fp.PositionDifference()), fp.Reality(file.problem.plant)
+    problem = replace(
+        file.problem, reality=real, sensing=sensing, horizon=None, cost=None, duration=0.5, measure_from=0.0
+    )
+    names = "slots", "slots+FPI"
+    file = replace(file, problem=problem, controllers={n: file.controllers[n] for n in names}, headline=names)
+    charts = chart_data(fp.compare(file, seed=0, compiled=False), ["#000"])["charts"]
+    titles = {chart["title"] for chart in charts}
+    assert "slots+FPI: response of q2, observer and reality" in titles
+    assert {"slots+FPI: responses of q1", "slots+FPI: responses of q2"} < titles
+
+
 def test_pole_that_is_fast_away_from_the_start():
     """An actuator whose lag shrinks with its force is followed at the start, not on the way, and then with the sub-steps named."""
 
