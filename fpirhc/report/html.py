@@ -413,7 +413,8 @@ def _responses(name: str, run: Run, edges: np.ndarray) -> list[dict[str, Any]]:
     """The response that the model expected of the last command, and the real one, by coordinate."""
     if not {"deformed", "plant_realised"} <= set(run.layout.names):
         return []
-    charts, shown = [], run.layout["plant_realised"].elements  # of what is controlled; slots may serve other coordinates
+    shown = run.layout["plant_realised"].elements  # of what is controlled; slots may serve other coordinates
+    charts = []
     for c in (c for c in run.layout["deformed"].elements if c in shown):
         requested, real = run[f"deformed.{c}"], run[f"plant_realised.{c}"]
         lines = [("the model expected", np.concatenate([real[:1], requested[:-1]])), ("the reality did", real)]
