@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import gzip
 import hashlib
 import io
@@ -274,7 +275,12 @@ TABLES: dict[str, tuple[list[str], Callable[[], list[list[str]]]]] = {
 def main() -> None:
     """Measure and write: every table of the page, or those that are named."""
     warnings.simplefilter("ignore", fp.HarmfulAdaptation)
-    for name in sys.argv[1:] or TABLES:
+    reader = argparse.ArgumentParser(description=main.__doc__)
+    reader.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {', '.join(TABLES)}; all by default")
+    names = reader.parse_args().tables
+    if unknown := [name for name in names if name not in TABLES]:
+        reader.error(f"unknown tables {', '.join(unknown)}; expected some of {', '.join(TABLES)}")
+    for name in names or TABLES:
         head, measured = TABLES[name]
         rows = measured()
         PAGE.write_text(_filled(PAGE.read_text(encoding="utf-8"), name, head, rows), encoding="utf-8")
