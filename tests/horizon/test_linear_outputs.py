@@ -69,6 +69,13 @@ def test_with_limits_of_states():
     assert np.abs(run["true_error.bis"][run.time > 8]).max() < 2.5
 
 
+def test_a_live_weight_is_refused_and_the_cause_is_named():
+    with pytest.raises(
+        NotSupported, match=r"'cost\.outputs\.bis' cannot be live .* and without linear_outputs, or leave"
+    ):
+        fp.simulator(awake(), fp.RecedingHorizon(with_hessian(LINEAR)), live=["cost.outputs.bis"], compiled=False)
+
+
 def test_the_hessian_is_that_of_the_slopes():
     """Q = 2 w h' h'^T plus the rate's, by differences of the output in numpy."""
     problem = awake(cost=fp.Quadratic(outputs={"bis": 1.0}, rate={"infusion": 1e-5}))
