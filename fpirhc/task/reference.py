@@ -149,9 +149,9 @@ class Trajectory(Reference):
         first = {name: ca.substitute(value, still, 0) for name, value in of(still).items()}
         return {name: first[name] + scale * (value - first[name]) for name, value in of(t).items()}
 
-    def function(self, plant: Plant) -> ca.Function:
+    def _function(self, plant: Plant) -> ca.Function:
         if nominal(self.scale) == 1:
-            return super().function(plant)
+            return super()._function(plant)
         t = ca.SX.sym("t")
         results = self._scaled(plant)(t, nominal(self.scale))
         return ca.Function("fpirhc_reference", [t], list(results), ["t"], ["state", "response"])
@@ -177,8 +177,8 @@ class Trajectory(Reference):
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
         if not self.own(plant, 0):
             return None
-        t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
-        columns = [self._scaled(plant)(t + float(time), scale) for time in nodes]
+        t, scale, scaled = ca.SX.sym("t"), ca.SX.sym("scale"), self._scaled(plant)
+        columns = [scaled(t + float(time), scale) for time in nodes]
         tables = [ca.densify(ca.horzcat(*parts)) for parts in zip(*columns, strict=True)]
         return ca.Function("fpirhc_reference_preview", [t, scale], tables, ["t", "scale"], ["states", "responses"])
 
