@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol, cast
 
 import numpy as np
 
@@ -144,18 +144,20 @@ class _Box(Limit):
     """An input or a state.
 
     Args:
-        name: of it.
+        part: of a stage, 'input' or 'state', which may have entries of one name.
+        name: of the entry.
         lower: lower end of the interval.
         upper: upper end of the interval.
     """
 
+    part: str
     name: str
     lower: float
     upper: float
     unit: str
 
     def value(self, view: OfStage) -> Value:
-        return view.input[self.name] if self.name in view.input else view.state[self.name]
+        return cast(Value, getattr(view, self.part)[self.name])
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,15 +235,18 @@ class Limits(Checked):
             mistakes.add(f"'{name}' is both soft and priced; choose one")
         mistakes.raise_if_any()
 
-    def members(self, plant: Plant, step: float) -> dict[str, Limit]:
-        """Return all limits by name: boxes of inputs and states, rates of inputs, with stages of length `step`, and paths."""
-        inputs = {name: _Box(name, *ends, unit=plant.inputs[name]) for name, ends in self.inputs.items()}
-        return {**inputs, **self.boxes(plant), **self.written(plant, step)}
+    def members(self, plant: Plant, step: float) -> list[tuple[str, Limit]]:
+        """Return all limits with their names: boxes of inputs and states, rates of inputs, with stages of length `step`, and paths.
+
+        An input and a state may have one name.
+        """
+        inputs = [(name, _Box("input", name, *ends, unit=plant.inputs[name])) for name, ends in self.inputs.items()]
+        return [*inputs, *self.boxes(plant).items(), *self.written(plant, step).items()]
 
     def boxes(self, plant: Plant) -> dict[str, Limit]:
         """Return the limits of states, which every optimiser keeps as bounds."""
         units = dict(zip(plant.state.elements, plant.state.entry_units, strict=True))
-        return {name: _Box(name, *ends, unit=units[name]) for name, ends in self.states.items()}
+        return {name: _Box("state", name, *ends, unit=units[name]) for name, ends in self.states.items()}
 
     def written(self, plant: Plant, step: float) -> dict[str, Limit]:
         """Return rates and paths, which a plan writes as further entries of its state."""

@@ -599,7 +599,7 @@ def _time_rows(problem: Problem) -> list[tuple[str, str]]:
 def _limit_rows(problem: Problem) -> list[tuple[str, str]]:
     limits = problem.limits
     rates = {f"{name} rate": f"the rate of {name}" for name in limits.rates}
-    members = limits.members(problem.plant, 1.0).items()  # of stages of any length: an interval is the same for all
+    members = limits.members(problem.plant, 1.0)  # of stages of any length: an interval is the same for all
     return [(f"limits of {rates.get(n, n)}", _interval((one.lower, one.upper), one.unit)) for n, one in members]
 
 

@@ -301,7 +301,7 @@ def test_every_limit_is_a_member_with_an_interval_and_a_unit():
     limits = fp.Limits(
         inputs={"torque": (-3.0, 4.0)}, states={"angle'": (-1.0, 2.0)}, rates={"torque": (-9.0, 8.0)}, paths=own
     )
-    members = limits.members(PLANT, step=0.05)
+    members = dict(limits.members(PLANT, step=0.05))
     names = {"state": ("angle", "angle'"), "input": ("torque",), "input_before": ("torque",)}
     numbers = {"state": [0.1, 0.7], "input": [1.5], "input_before": [1.0]}
     stage = SimpleNamespace(output={}, **{part: Named(names[part], ca.SX(numbers[part]), part) for part in names})

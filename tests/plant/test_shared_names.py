@@ -14,6 +14,7 @@ import fpirhc as fp
 from fpirhc.conformance import check_plant
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, NotContractive
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.members import examples
 from fpirhc.probing.recording import read_recording
 from fpirhc.review.grid import review_grid
@@ -100,6 +101,50 @@ def outcome(problem: fp.Problem, controller: Controller) -> Run | type[FpirhcErr
         return fp.simulate(problem, controller, seed=0, compiled=False)
     except FpirhcError as error:
         return type(error)
+
+
+def test_a_problem_shows_the_limits_of_motor_and_joint():
+    """As many intervals as with names of their own, each in its unit."""
+    pages = [one._repr_html_() for one in (SHARED, OTHER)]
+    for interval in ("-5 to 5 N m<", "-2 to 2 rad<", "-60 to 60 N m/s<"):
+        assert pages[0].count(interval) == pages[1].count(interval) > 0
+
+
+def test_limits_inside_a_stage_of_several_steps_are_those_of_the_state():
+    """The level of a tank after each step of a map, where the pump is called level too."""
+    stages = []
+    for pump in ("level", "pump"):
+
+        def later(x, u, p, pump=pump):
+            del p
+            return {"level": x.level + 0.1 * x.flow, "flow": x.flow + 0.1 * getattr(u, pump)}
+
+        plant = fp.Plant.discrete(
+            states={"level": "m", "flow": "m/s"},
+            inputs={pump: "m/s^2"},
+            parameters={},
+            next=later,
+            step=0.1,
+            outputs={"depth": fp.Output("m", lambda x, _: x.level)},
+        )
+        one = fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(lambda _: {"depth": 1.0}),
+            start={"level": 0.5, "flow": 3.0},
+            period=0.1,
+            duration=1.0,
+            horizon=fp.Horizon(stages=2, step=0.3),
+            cost=fp.Quadratic(outputs={"depth": 1.0}),
+            limits=fp.Limits(states={"level": (-1.0, 2.0)}),
+        )
+        assert one.horizon is not None
+        assert one.cost is not None
+        ocp = transcribe(one.plant, one.reference, one.horizon, one.cost, one.limits, start=one.start_state)
+        assert ocp.state.elements[2:] == ("level, step 1", "level, step 2")
+        s, data = np.array([0.5, 3.0, 0.0, 0.0]), ocp.nodes[2][:, 0]
+        stages.append(np.asarray(ocp.dynamics(s, np.array([-7.0]), data).full()).ravel())
+    np.testing.assert_array_equal(stages[0], stages[1])
+    assert stages[0][2:] == pytest.approx([0.8, 1.03])
 
 
 def test_disturbances_act_where_they_are_said_to():
