@@ -129,7 +129,7 @@ def test_limits_inside_a_stage_of_several_steps_are_those_of_the_state():
         )
         one = fp.Problem(
             plant=plant,
-            reference=fp.Trajectory(lambda _: {"depth": 1.0}),
+            reference=fp.Trajectory(lambda t: {"depth": 1.0 + 0 * t}),
             start={"level": 0.5, "flow": 3.0},
             period=0.1,
             duration=1.0,
