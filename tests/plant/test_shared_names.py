@@ -110,6 +110,13 @@ def test_a_problem_shows_the_limits_of_motor_and_joint():
         assert pages[0].count(interval) == pages[1].count(interval) > 0
 
 
+@pytest.mark.parametrize(("what", "unit"), [("command.shoulder", "N m s"), ("error.shoulder", "rad s")])
+def test_a_figure_has_the_unit_of_motor_or_joint(what, unit):
+    metric = fp.figures.Total(what)
+    assert callable(metric.unit)
+    assert metric.unit(SHARED, "") == unit
+
+
 def test_limits_inside_a_stage_of_several_steps_are_those_of_the_state():
     """The level of a tank after each step of a map, where the pump is called level too."""
     stages = []

@@ -164,12 +164,9 @@ def _unit(problem: Problem, what: What) -> str:
     """The unit of a state, an output, an error or an input; nothing for other signals."""
     if isinstance(what, Quantity):
         return what.unit
-    plant = problem.plant
-    units = {
-        **plant.inputs,
-        **followed_units(plant),
-        **dict(zip(plant.state.elements, plant.state.entry_units, strict=True)),
-    }
-    signal, _, element = what.partition(".")
+    plant, (signal, _, element) = problem.plant, what.partition(".")
+    units = {**followed_units(plant), **dict(zip(plant.state.elements, plant.state.entry_units, strict=True))}
+    commanded = signal in ("command", "command_unclipped", "command_shift", "planned")
+    units = {**units, **plant.inputs} if commanded else {**plant.inputs, **units}  # both may have an entry of one name
     higher = signal in ("realised", "nominal", "desired", "deformed", "plant_realised")
     return "" if higher else units.get(element, "")
