@@ -24,6 +24,7 @@ from .deformation.wrappers.damped import Damped
 from .deformation.wrappers.delayed import Increment, Paired
 from .deformation.wrappers.filtered import Filtered
 from .deformation.wrappers.guarded import Guarded
+from .deformation.wrappers.haar import Haar
 from .deformation.wrappers.self_paired import DelayWatched, SelfPaired
 from .deformation.wrappers.tuned import Tuned
 from .errors import FpirhcError, HarmfulAdaptation
@@ -154,6 +155,7 @@ __all__ = [
     "GradientFixedPoint",
     "Grid",
     "Guarded",
+    "Haar",
     "HarmfulAdaptation",
     "HeatMap",
     "HoldPlan",

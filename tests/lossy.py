@@ -30,7 +30,9 @@ class Lossy:
         self.stepper = fp.Stepper(problem, controller, **({"compiled": False} | settings))
         self._advance = problem.integrator.step(plant, problem.period)
         own = checked(problem, controller).response(problem)
-        self._response = (own or true_response(problem)).function
+        response = (own or true_response(problem)).function
+        assert response is not None
+        self._response = response
         self._shows = self._seen if self.stepper.estimates else self._measured
         x, u, p = plant.symbols()
         values = values_of(plant, x, u, p)

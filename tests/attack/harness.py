@@ -76,6 +76,7 @@ class Bench:
         self.limits = problem.limits.input_bounds(plant)
         self._advance = problem.integrator.step(plant, problem.period)
         response = checked(problem, controller).response(problem) or true_response(problem)
+        assert response.function is not None
         self._response = response.function
         self._calm = np.zeros(len(plant.names))
         self.lost = False  # whether the plant itself left its domain, such as a tank below its bottom

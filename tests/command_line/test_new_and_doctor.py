@@ -136,7 +136,7 @@ def test_a_missing_compiler_is_a_warning(monkeypatch):
 
 def test_what_exports_lack_is_named_with_its_package(monkeypatch):
     monkeypatch.setattr(machine, "find_spec", lambda _: None)
-    monkeypatch.setattr(machine.shutil, "which", lambda name: "/usr/bin/avr-gcc" if name == "avr-gcc" else None)
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/avr-gcc" if name == "avr-gcc" else None)
     outcome, said, _ = machine.export_tools()
     assert outcome == Outcome.OK
     assert said.startswith(

@@ -587,7 +587,7 @@ def stepped(t):
 
 
 AIM = fp.Setpoint({"q": 0.3}, rate=4.0, order=2, start={"q": 0.0})
-TAUGHT = {  # dead time, prediction of it, and the size of what a fraction of a cycle interpolates
+TAUGHT: dict[str, Any] = {  # dead time, prediction of it, and the size of what a fraction of a cycle interpolates
     "input": ({"inputs": {"u": 0.02}}, 0.0, 1e-9),
     "measurement": ({"measurement": 0.02}, 0.0, 1e-9),
     "fraction": ({"inputs": {"u": 0.01}, "measurement": 0.0125}, 0.0, 1e-5),

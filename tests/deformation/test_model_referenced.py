@@ -361,12 +361,11 @@ def test_review_says_which_form():
         (math.nan, 1, "unknown"),
         (math.inf, math.inf, "unknown"),
     ):
-        ran = right_form(
-            TWO_MASS.problem,
-            affine(0.5),
-            harmless,
-            lambda form, own=own, other=other: (own if form == affine(0.5) else other, "q1", "1 m"),
-        )
+
+        def error_of(form, own=own, other=other):
+            return own if form == affine(0.5) else other, "q1", "1 m"
+
+        ran = right_form(TWO_MASS.problem, affine(0.5), harmless, error_of)
         assert ran.verdict == verdict
         told = "the rms error of q1 is 1 m as it is, 1 m with the model-referenced form" in ran.evidence
         assert told == math.isfinite(own)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -104,11 +105,15 @@ def test_generous_budget_ends_at_the_deadbeat_gain():
     assert "Suggested" in suggestion._repr_html_()
 
 
+def always(steps: float) -> Callable[[float], np.ndarray]:
+    return lambda _: np.array([steps])
+
+
 def test_no_gain_within_a_budget_is_told_apart_from_no_gain_at_all():
     """Chatter that is three times the budget with every gain is a matter of the budget; a loop that always grows is not."""
     for steps, words in ((3.0, "at least 3 times as large"), (np.inf, "converges with no effective gain")):
         with pytest.raises(NotContractive, match=words):
-            _largest_within(lambda size, steps=steps: np.array([steps]), np.array([1.0]), 1.0)
+            _largest_within(always(steps), np.array([1.0]), 1.0)
 
 
 def test_a_suggestion_that_a_run_speaks_against_says_so():

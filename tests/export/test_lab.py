@@ -126,7 +126,7 @@ def contraction(loop: LabLoop, run: fp.Run, variant: Any) -> np.ndarray:
     states, deformed = (np.reshape(run[name], (run.cycles, -1))[rows] for name in ("state", "deformed"))
     exact = np.tile(variant.plant.exact, (len(rows), 1))
     jacobians = response_jacobians(plant, states, deformed, exact, variant.plant.approximate)
-    return factors_along(len(rows), lambda at: jacobians[at], run.settings["effective_gain"])
+    return factors_along(len(rows), lambda at: jacobians[at], float(str(run.settings["effective_gain"])))
 
 
 def test_reference_dead_time_and_set_points_have_the_numbers_of_a_task_that_states_them(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -297,7 +298,7 @@ def test_a_plan_stays_in_its_ellipsoid():
 
 def test_every_limit_is_a_member_with_an_interval_and_a_unit():
     """Boxes, rates, paths and a stranger's own stand side by side, and each says of a stage what it limits."""
-    own = {"calm": fp.Ellipsoid({"angle": 0.5, "torque": 2.0}), "softly": Softly()}
+    own = {"calm": fp.Ellipsoid({"angle": 0.5, "torque": 2.0}), "softly": Softly(math.inf)}
     limits = fp.Limits(
         inputs={"torque": (-3.0, 4.0)}, states={"angle'": (-1.0, 2.0)}, rates={"torque": (-9.0, 8.0)}, paths=own
     )

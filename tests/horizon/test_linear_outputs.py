@@ -79,6 +79,8 @@ def test_a_live_weight_is_refused_and_the_cause_is_named():
 def test_the_hessian_is_that_of_the_slopes():
     """Q = 2 w h' h'^T plus the rate's, by differences of the output in numpy."""
     problem = awake(cost=fp.Quadratic(outputs={"bis": 1.0}, rate={"infusion": 1e-5}))
+    assert problem.horizon is not None
+    assert problem.cost is not None
     task = problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits
     ocp = transcribe(*task, start=problem.start_state)
     state, command, data = (part[:, 3] for part in ocp.nodes)
@@ -93,6 +95,8 @@ def test_the_hessian_is_that_of_the_slopes():
 
 def test_where_outputs_are_states_nothing_changes():
     problem = fp.load_problem("van_der_pol").problem
+    assert problem.horizon is not None
+    assert problem.cost is not None
     ocp = transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits)
     state, command, data = (part[:, 3] for part in ocp.nodes)
     arguments = state + 0.3, command, data, np.ones(len(state))

@@ -223,7 +223,7 @@ def check_numbers_of_the_problem(capsys):
     assert main(["run", "line.py", "C", "--set", "deformation.gain=-0.7", *own]) == 0
     task = fp.load_problem("line.py")
     problem = replace(task.problem.with_exact(np.array([1.6])), start={"q": 0.2}, duration=0.3)
-    controller = replace(task.controllers["C"], deformation=fp.Affine(gain=-0.7))
+    controller = task.controllers["C"].with_deformation(fp.Affine(gain=-0.7))
     expected = fp.simulate(problem, controller, seed=0, compiled=False)
     np.testing.assert_array_equal(fp.load_run(Path("results/line/C.npz"))["state"], expected["state"])
     assert main(["compare", "line.py", "--set", "deformation.gain=-0.7", *own]) == 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -142,7 +143,8 @@ def test_an_economic_plan_is_the_published_run(which: str) -> None:
         task("freeway_economic"),
         np.loadtxt(DATA.with_name("metering.csv"), delimiter=",", skiprows=1)[:, 1],
     )
-    own = shipped.controllers["RHC"].optimiser
+    plans: Any = shipped.controllers["RHC"]
+    own = plans.optimiser
     optimiser = {"ipopt": fp.Ipopt(), "shipped": own, "one start": replace(own, second_start=False)}[which]
     known = fp.ExactModel(fp.RecedingHorizon(optimiser))
     minutes = 7 if which == "one start" else 17
@@ -167,7 +169,8 @@ def with_signs(lowest: float, highest: float, before: float = FREE) -> fp.Proble
     road = shipped.plant
 
     def later(x, u, p):
-        after = road.next(x, u, p)
+        assert road.next is not None
+        after = dict(road.next(x, u, p))
         for i in (3, 4):
             settled = p.v_free * ca.exp(-((x[f"rho{i}"] / p.rho_crit) ** p.a) / p.a)
             after[f"v{i}"] += T / p.tau * (ca.fmin(settled, 1.1 * u.sign) - settled)

@@ -416,6 +416,11 @@ def test_the_unit_of_the_output_itself_changes_nothing():
     np.testing.assert_allclose(runs[0]["command"], runs[1]["command"], rtol=1e-9)
 
 
+def pair_of(z: ca.SX, p: Any) -> Any:
+    """Two expressions, where one is expected."""
+    return z, p
+
+
 @pytest.mark.parametrize(
     ("units", "message"),
     [
@@ -424,7 +429,7 @@ def test_the_unit_of_the_output_itself_changes_nothing():
             {"y": fp.TargetUnit(dose_of, lambda z, p: z + p.half)},
             r"units\['y'\]: to\(45\) is 1, and back of it 2; expected 45",
         ),
-        ({"y": fp.TargetUnit(dose_of, lambda z, p: (z, p))}, r"units\['y'\]\.back must be one scalar expression"),
+        ({"y": fp.TargetUnit(dose_of, pair_of)}, r"units\['y'\]\.back must be one scalar expression"),
     ],
 )
 def test_a_wrong_unit_is_named(units, message):

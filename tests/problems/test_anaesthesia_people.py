@@ -19,7 +19,8 @@ from scipy.signal import lsim
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
-from fpirhc.problem_files.problem_file import Task, _imported, find_problem
+from fpirhc.problem_files.problem_file import Task, _imported
+from fpirhc.problem_files.shipped import find_problem
 
 NAME = "anaesthesia_people"
 SETS = ("A tuned", "A unseen", "B", "C")
@@ -143,12 +144,13 @@ def test_a_loop_of_its_own_has_the_same_run(name, controller, law):
 
 
 def figures(
-    names: list[str], controllers: list[str], folder: Path, of: str = NAME, **changes: float
+    names: list[str], controllers: list[str], folder: Path, of: str = NAME, **changes: Any
 ) -> dict[str, dict[str, tuple[float, ...]]]:
     """By controller and set: worst share of the time in the range in %, lowest bis, mean share, and moves of the target."""
     judged = replace(task(of), problem=replace(task(of).problem, **changes))
     study = fp.compare_scenarios(judged, cases=names, controllers=controllers, seed=0, folder=folder)
-    cases, found = task().cases, {}
+    cases = task().cases
+    found: dict[str, dict[str, tuple[float, ...]]] = {}
     assert cases is not None
     for controller, records in study.records.items():
         found[controller] = {}

@@ -102,10 +102,11 @@ def test_limits_that_the_reference_leaves(limits, verdict):
 def test_no_limit_is_left_where_nobody_is_drawn_to_the_reference():
     """An economic cost has no reference in it: what it would need is no question; with the error in the cost it is one."""
     for weight, count in ((0.0, 0), (1.0, 1)):
-        cost = fp.CustomCost(
-            lambda v, weight=weight: {"effort": v.input.u**2, "error": weight * (v.state.q - v.reference.q) ** 2}
-        )
-        problem = replace(mass(states={"q": (-0.4, 0.6)}), cost=cost)
+
+        def cost(v, weight=weight):
+            return {"effort": v.input.u**2, "error": weight * (v.state.q - v.reference.q) ** 2}
+
+        problem = replace(mass(states={"q": (-0.4, 0.6)}), cost=fp.CustomCost(cost))
         asked = fp.review(problem, {}, mismatch=0.0, seed=0).answers
         assert sum(KEEPS in one.question for one in asked) == count
 

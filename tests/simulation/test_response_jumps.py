@@ -35,6 +35,7 @@ class Closed:
     def __init__(self, problem: fp.Problem, controller: Controller, *, compiled: bool = False) -> None:
         self.problem, self.stepper = problem, fp.Stepper(problem, controller, compiled=compiled)
         response = checked(problem, controller).response(problem) or true_response(problem)
+        assert response.function is not None
         self.advance, self.response = problem.integrator.step(problem.plant, problem.period), response.function
 
     def run(self, added: dict[int, float], pushed: dict[int, float] | None = None) -> tuple[np.ndarray, list[Status]]:

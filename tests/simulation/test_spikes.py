@@ -76,6 +76,7 @@ def _wide() -> dict[str, tuple[float, float]]:
 def motion(stepper: fp.Stepper, spike: Spike | None, cycles: int) -> np.ndarray:
     """Positions of the two masses, shape (cycles, 2)."""
     advance, response = PROBLEM.integrator.step(PLANT, PROBLEM.period), true_response(PROBLEM).function
+    assert response is not None
     memory, x, u, calm = stepper.start(), np.array(PROBLEM.start_state), np.zeros(2), np.zeros(2)
     positions = []
     for k in range(cycles):

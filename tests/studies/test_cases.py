@@ -166,7 +166,7 @@ def test_a_table_lies_beside_the_problem_file(task, tmp_path, monkeypatch):
 
 def test_a_table_may_have_words_and_columns_that_every_case_needs(task):
     """A word is its number; what is missing, empty or unknown is named by row and column, with what is expected."""
-    cases = {"needed": ("exact.b", "exact.k"), "words": {"exact.k": {"soft": 5.0, "stiff": 8.0}}}
+    cases: dict[str, Any] = {"needed": ("exact.b", "exact.k"), "words": {"exact.k": {"soft": 5.0, "stiff": 8.0}}}
     read = fp.Cases.from_csv(written("case,exact.b,exact.k\none,0.9,stiff\n").resolve(), **cases)
     assert read.changes == {"one": {"exact.b": 0.9, "exact.k": 8.0}}
     with pytest.raises(InvalidProblem) as wrong:
