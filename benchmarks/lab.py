@@ -15,7 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from playwright.sync_api import sync_playwright
 
 import fpirhc as fp
 from fpirhc.export.lab.lab import lab_of, write_lab
@@ -36,6 +35,8 @@ MOVE = """(k) => new Promise((done) => {
 
 def chromium(path: Path) -> list[float]:
     """Milliseconds of every update in Chromium."""
+    from playwright.sync_api import sync_playwright  # of the extra browser, which only this function needs
+
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     with sync_playwright() as playwright:
         page = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"]).new_page()
