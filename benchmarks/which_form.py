@@ -81,7 +81,7 @@ class Task:
     def runs(self, deformation: Deformation) -> Run | None:
         """The run with another deformation; None where it is refused or ends early."""
         try:
-            run = fp.simulate(self.problem, exchanged(self.controller, deformation), seed=0, compiled=False)
+            run = fp.simulate(self.problem, self.controller.with_deformation(deformation), seed=0, compiled=False)
         except FpirhcError:
             return None
         return run if run.stop is None else None
@@ -94,15 +94,6 @@ class Task:
             own = own.map
         scale = own.scale if isinstance(own, fp.Sigmoid) else 50.0
         return fp.Sigmoid(gain=sign * gain, shift=sign * 0.3, scale=scale)
-
-
-def exchanged(value: Any, deformation: Deformation) -> Any:
-    """The controller with another deformation, wherever it keeps it."""
-    if hasattr(value, "controller"):
-        return replace(value, controller=exchanged(value.controller, deformation))
-    if hasattr(value, "slots"):
-        return replace(value, slots=tuple(replace(s, deformation=deformation) for s in value.slots))
-    return replace(value, deformation=deformation)
 
 
 def task(name: str) -> Task:
@@ -205,7 +196,7 @@ def adaptive() -> list[str]:
     for name in shipped_problems():
         one = task(name)
         try:
-            exchanged(one.controller, fp.Identity())
+            one.controller.with_deformation(fp.Identity())
             check_gain_sign(one.problem, resolved(one.problem, one.controller).deformation)
         except (TypeError, FpirhcError):
             continue

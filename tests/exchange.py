@@ -6,17 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import fpirhc as fp
-from fpirhc.deformation import Deformation
 from fpirhc.task.exogenous import really_known
-
-
-def exchanged(value: Any, deformation: Deformation) -> Any:
-    """The controller with another deformation, wherever it keeps it."""
-    if hasattr(value, "controller"):
-        return replace(value, controller=exchanged(value.controller, deformation))
-    if hasattr(value, "slots"):
-        return replace(value, slots=tuple(replace(s, deformation=deformation) for s in value.slots))
-    return replace(value, deformation=deformation)
 
 
 def with_exact_model(problem: fp.Problem) -> fp.Problem:

@@ -39,19 +39,19 @@ def adapter(function: Callable[P, R]) -> Callable[P, R]:
     return adapted
 
 
-def finite_numbers(where: str, given: object, names: Iterable[str]) -> np.ndarray:
-    """Return what is given as an array with one finite number for each name.
+def finite_numbers(where: str, values: object, names: Iterable[str]) -> np.ndarray:
+    """Return values as an array with one finite number for each name.
 
     Raises:
         InvalidValue: it has other ones, or none.
     """
     wanted = tuple(names)
     try:
-        numbers = np.asarray(given, dtype=float)
+        numbers = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         numbers = np.empty(0)
     if numbers.shape != (len(wanted),) or not np.isfinite(numbers).all():
-        raise InvalidValue(f"{where}({given!r}): expected a finite number for each of {', '.join(wanted)}")
+        raise InvalidValue(f"{where}({values!r}): expected a finite number for each of {', '.join(wanted)}")
     return numbers
 
 

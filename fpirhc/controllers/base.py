@@ -58,8 +58,8 @@ def under_names(block: Block, names: Mapping[str, str]) -> Block:
         return Layout(tuple(replace(s, name=names.get(s.name, s.name)) for s in layout.signals))
 
     def step(s: Signals) -> dict[str, Value]:
-        given = {names.get(n, n): n for n in (*block.reads.names, *block.memory.names)}
-        values = block.step(Signals({n: getattr(s, new) for new, n in given.items()}))
+        incoming = {names.get(n, n): n for n in (*block.reads.names, *block.memory.names)}
+        values = block.step(Signals({n: getattr(s, new) for new, n in incoming.items()}))
         later = {f"{n}_next": f"{names.get(n, n)}_next" for n in block.memory.names}
         return {later.get(n, names.get(n, n)): value for n, value in values.items()}
 

@@ -318,8 +318,8 @@ def _with_late(problem: Problem, controller: Controller, least: float = math.ulp
     """The controller with the deformation of `late_deformation`; one with several deformations has its own for each already."""
     own = controller.deformation
     late = late_deformation(own, problem, least)
-    kept = late is own or controller.response(problem) is not None
-    return controller if kept else controller.with_deformation(late)
+    unchanged = late is own or controller.response(problem) is not None
+    return controller if unchanged else controller.with_deformation(late)
 
 
 def late_deformation(deformation: Deformation, problem: Problem, least: float = math.ulp(0.0)) -> Deformation:

@@ -313,11 +313,11 @@ class Rule:
         """Return by share the next smaller and the next larger share of the same form, safe where this one is."""
         at = SHARES.index(one.setting.share)
         others = (SHARES[k] for k in (at - 1, at + 1) if 0 <= k < len(SHARES))
-        found = [self._predicted(one.setting.with_share(share)) for share in others]
+        neighbours = [self._predicted(one.setting.with_share(share)) for share in others]
         safe = self._safe(one)
         return {
             other.setting.share: other
-            for other in found
+            for other in neighbours
             if other.steps <= 1 and (self._safe(other) if safe else self._accepted(other))
         }
 

@@ -49,8 +49,8 @@ def of_problem(problem: Problem, path: str) -> str | None:
     """Return a path as a case has it, 'exact.m1' for 'm1.exact'; None where it does not begin with a word of a case."""
     name, _, word = path.rpartition(".")
     named = word in PARAMETERS and (name in problem.plant.parameters or name in problem.moved.parameters)
-    found = f"{word}.{name}" if named else path
-    return found if found.partition(".")[0] in {*PARAMETERS, START, *(f.name for f in fields(problem))} else None
+    of_case = f"{word}.{name}" if named else path
+    return of_case if of_case.partition(".")[0] in {*PARAMETERS, START, *(f.name for f in fields(problem))} else None
 
 
 def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:

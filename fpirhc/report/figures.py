@@ -405,13 +405,13 @@ def _sweep_maps(result: Sweep) -> Drawing:
     rows = -(-count // columns)
     figure = new_figure(4.6 * columns, 3.9 * rows, f"{result.problem}: {_figure_label(result)}")
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-    told = [np.vectorize(result.aim.told)(np.where(m.outcomes == "finished", m.values, np.inf)) for m in result.maps]
-    numbers = np.concatenate([values[np.isfinite(values)] for values in told])
+    figures = [np.vectorize(result.aim.told)(np.where(m.outcomes == "finished", m.values, np.inf)) for m in result.maps]
+    numbers = np.concatenate([values[np.isfinite(values)] for values in figures])
     low, high = (float(numbers.min()), float(numbers.max())) if numbers.size else (0.1, 1.0)
     high = high if high > low else low + 1
     norm = LogNorm(low, high) if low > 0 else Normalize(low, high)
     drawn = None
-    for axis, one, values in zip(panels, result.maps, told, strict=False):
+    for axis, one, values in zip(panels, result.maps, figures, strict=False):
         drawn = _draw_map(axis, result, values, cmap="viridis", norm=norm)
         axis.set_title(literal(one.controller))
         if all(path.path in one.now for path in result.axes):

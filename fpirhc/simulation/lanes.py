@@ -142,15 +142,15 @@ class _Library:
         groups = -(-len(exact) // self.lanes)
         padded = starts[np.minimum(np.arange(groups * self.lanes), len(exact) - 1)]
         memory = np.ascontiguousarray(padded.reshape(groups, self.lanes, -1).transpose(0, 2, 1))
-        found = np.ones((groups, 2 * count + len(Status) + 1, self.lanes))
+        sums_of_all = np.ones((groups, 2 * count + len(Status) + 1, self.lanes))
 
         def call(begin: int) -> None:
             end = min(begin + self.batch, groups)
-            self.run(end - begin, problem.cycles, _first(problem), memory[begin:end], reads, found[begin:end])
+            self.run(end - begin, problem.cycles, _first(problem), memory[begin:end], reads, sums_of_all[begin:end])
 
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(call, range(0, groups, self.batch)))
-        rows = found.transpose(0, 2, 1).reshape(groups * self.lanes, -1)[: len(exact)]
+        rows = sums_of_all.transpose(0, 2, 1).reshape(groups * self.lanes, -1)[: len(exact)]
         sums, sizes, counts, left = np.split(rows, np.cumsum([count, count, len(Status)]), axis=1)
         return sums.copy(), sizes.copy(), counts.copy(), left.ravel() != 0
 

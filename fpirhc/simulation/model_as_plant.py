@@ -95,8 +95,8 @@ class ModelAsPlant:
     def _made(self, parameters: np.ndarray, signals: Mapping[str, Exogenous], deformation: Deformation) -> Problem:
         own = self._problem.of_model
         plant, longest = with_exact_parameters(own.plant, parameters), own.measure_from + CYCLES * own.period
-        told, duration = as_known(own.plant, signals), min(own.duration, longest)
-        return with_believed_way(replace(own, plant=plant, signals=told, duration=duration), deformation)
+        known, duration = as_known(own.plant, signals), min(own.duration, longest)
+        return with_believed_way(replace(own, plant=plant, signals=known, duration=duration), deformation)
 
     def pair(self, loops: tuple[Simulator, Simulator]) -> tuple[Problem, tuple[Run, Run]]:
         """Return the problem of the second loop's model, and the runs of both loops on it."""

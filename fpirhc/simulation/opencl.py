@@ -36,8 +36,8 @@ def loaded_kernel(source: str, device: str) -> Callable[..., int]:
         raise NoCode(f"the compiler of '{chosen.name}' failed: {str(error).strip().splitlines()[0]}") from None
 
     def run(plants: int, cycles: int, first: int, start: np.ndarray, reads: np.ndarray, results: np.ndarray) -> int:
-        given = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-        both = [cl.Buffer(context, given, hostbuf=np.append(v, 0.0)) for v in (start, reads)]  # none is empty
+        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+        both = [cl.Buffer(context, flags, hostbuf=np.append(v, 0.0)) for v in (start, reads)]  # none is empty
         made = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, results.nbytes)
         kernel(queue, (plants,), None, np.int64(cycles), np.int64(first), *both, made)
         cl.enqueue_copy(queue, results, made)
@@ -58,9 +58,9 @@ def _device(cl: ModuleType, name: str) -> _Device:
     except cl.LogicError:  # no platform at all
         every = []
     able = [one for one in every if "cl_khr_fp64" in one.extensions]
-    found = [one for one in able if name.lower() in one.name.lower()]
+    named = [one for one in able if name.lower() in one.name.lower()]
     if not able:
         raise NotInstalled("no OpenCL device with double precision is here: install the vendor's OpenCL driver")
-    if not found:
+    if not named:
         raise InvalidName(f"no OpenCL device is called '{name}'.{nearest(name, [one.name for one in able])}")
-    return min(found, key=lambda one: one.type != cl.device_type.GPU)
+    return min(named, key=lambda one: one.type != cl.device_type.GPU)

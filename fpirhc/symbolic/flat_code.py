@@ -223,10 +223,10 @@ def _read_later(body: str) -> str:
     """The lines without variables that nothing reads: scalar code may leave an argument alone."""
     while True:
         named = Counter(_VARIABLE.findall(body))
-        kept = _ASSIGNED.sub(lambda line, named=named: line[0] if named[line[1]] > 1 else "", body)  # type: ignore[misc]
-        if kept == body:
+        read = _ASSIGNED.sub(lambda line, named=named: line[0] if named[line[1]] > 1 else "", body)  # type: ignore[misc]
+        if read == body:
             return body
-        body = kept
+        body = read
 
 
 def _expression(step: Operation, at: int, index: str) -> str:

@@ -209,14 +209,14 @@ def curve(c, p):
 
 def settling(x, u, p):
     """A cycle of the model."""
-    kept = ca.exp(-CYCLE / p.lag)
-    return {"bis": kept * x.bis + (1 - kept) * curve(u.target, p)}
+    decay = ca.exp(-CYCLE / p.lag)
+    return {"bis": decay * x.bis + (1 - decay) * curve(u.target, p)}
 
 
 def needed_target(x, r, p):
     """The target for a wanted change of the bis; that of the curve's end where the curve does not reach so far."""
-    kept = ca.exp(-CYCLE / p.lag)
-    return {"target": concentration(x.bis + CYCLE * r.bis / (1 - kept), p, from_top=1e-4)}
+    decay = ca.exp(-CYCLE / p.lag)
+    return {"target": concentration(x.bis + CYCLE * r.bis / (1 - decay), p, from_top=1e-4)}
 
 
 model = fp.Plant.discrete(

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from exchange import exchanged, told, with_exact_model
+from exchange import told, with_exact_model
 from plants import linear
 from test_adaptation import stepping
 from test_anti_windup import overshoot, request_kept, settled, step_of_two_metres
@@ -112,7 +112,7 @@ def null_change(name: str) -> float:
     sign = -1.0 if resolved(problem, controller).deformation.effective_gain() < 0 else 1.0
     map = fp.Sigmoid(gain=-0.5 * sign, shift=0.3 * sign, scale=50.0)
     runs = [
-        fp.simulate(problem, exchanged(controller, d), seed=0, compiled=False)
+        fp.simulate(problem, controller.with_deformation(d), seed=0, compiled=False)
         for d in (fp.Identity(), fp.ModelReferenced(map, **told(problem)))
     ]
     key = "plant_state"
@@ -140,7 +140,7 @@ def test_plain_form_does_not_leave_an_exact_model_alone():
         controller = module.controllers["RHC+FPI"]
         map = fp.Sigmoid(gain=-0.5, scale=50.0)
         runs = [
-            fp.simulate(problem, exchanged(controller, d), seed=0, compiled=False)["state"]
+            fp.simulate(problem, controller.with_deformation(d), seed=0, compiled=False)["state"]
             for d in (fp.Identity(), map, fp.ModelReferenced(map))
         ]
         size = np.abs(runs[0]).max()
@@ -193,7 +193,7 @@ TRACKING = (
 @pytest.mark.parametrize(("name", "deformation", "expected"), TRACKING)
 def test_two_mass_figures(name, deformation, expected):
     """Tracking with the wrong model, against another implementation of the same formulas, within 5 %."""
-    run = fp.simulate(TWO_MASS.problem, exchanged(TWO_MASS.controllers[name], deformation), seed=0)
+    run = fp.simulate(TWO_MASS.problem, TWO_MASS.controllers[name].with_deformation(deformation), seed=0)
     errors = fp.measure(TWO_MASS.problem, run).rms_error
     assert 1e3 * max(errors.values()) == pytest.approx(expected, rel=0.05)
 
@@ -254,7 +254,7 @@ def test_where_it_loses():
         sums = [
             sum(
                 fp.measure(
-                    module.problem, fp.simulate(module.problem, exchanged(adaptive, d), seed=0)
+                    module.problem, fp.simulate(module.problem, adaptive.with_deformation(d), seed=0)
                 ).rms_error.values()
             )
             for d in (map, fp.ModelReferenced(map))
@@ -266,7 +266,7 @@ def test_slots_begin_where_the_last_command_was_realised():
     """In slots the form begins with the deformation that the last command had: the command is continuous at every switch."""
     module = fp.load_problem("crane_slots")
     map = fp.Sigmoid(gain=-0.5, scale=50.0)
-    run = fp.simulate(module.problem, exchanged(module.controllers["slots+FPI"], fp.ModelReferenced(map)), seed=0)
+    run = fp.simulate(module.problem, module.controllers["slots+FPI"].with_deformation(fp.ModelReferenced(map)), seed=0)
     switched = np.flatnonzero(np.diff(run["slot"].ravel())) + 1
     assert switched.size > 2
     jumps = np.abs(np.diff(run["command"], axis=0))
@@ -311,7 +311,7 @@ def test_controllers_that_cannot_use_it():
     ):
         fp.simulate(short(LATE, 10), controller, seed=0)
     module = fp.load_problem("crane_slots")
-    late = exchanged(module.controllers["slots+FPI"], fp.ModelReferenced(fp.Affine(gain=-0.5), measurement=2.5))
+    late = module.controllers["slots+FPI"].with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.5), measurement=2.5))
     with pytest.raises(fp.FpirhcError, match="a measurement is late by whole cycles"):
         fp.simulate(module.problem, late, seed=0)
 

@@ -217,11 +217,11 @@ def _realised_blocks(problem: Problem, channels: Sequence[Channel]) -> list[Bloc
     """Blocks (measured outputs, realised) -> y^(r) of every slot, measured or differenced; none where equations give it."""
     if reads_equations(problem):
         return []
-    plant, motion, found = problem.plant, measured_output(problem.plant), "_slot_differences"
-    given, realised = plant.response_signal("realised"), _realised(problem, channels)
+    plant, motion, differences = problem.plant, measured_output(problem.plant), "_slot_differences"
+    measured, realised = plant.response_signal("realised"), _realised(problem, channels)
     differenced = [c for c in channels if c.differences]
     names = tuple(c.slot.coordinate for c in differenced)
-    blocks, reads = [], [given]
+    blocks, reads = [], [measured]
     if differenced:
         orders = [measured_order(plant, n) for n in names]
         places = [motion.elements.index(n + "'" * k) for n, k in zip(names, orders, strict=True)]
@@ -233,13 +233,13 @@ def _realised_blocks(problem: Problem, channels: Sequence[Channel]) -> list[Bloc
                 Layout((samples,)),
                 lambda s: {samples.name: getattr(s, motion.name)[places]},
             ),
-            _difference_block(problem, differenced, orders, samples, found),
+            _difference_block(problem, differenced, orders, samples, differences),
         ]
-        reads.append(Signal(found, names))
+        reads.append(Signal(differences, names))
 
     def step(s: Signals) -> dict[str, Expression]:
         entries = [
-            getattr(s, found)[names.index(c.slot.coordinate)]
+            getattr(s, differences)[names.index(c.slot.coordinate)]
             if c.differences
             else s.realised[plant.controlled_names.index(c.slot.coordinate)]
             for c in channels
@@ -250,7 +250,7 @@ def _realised_blocks(problem: Problem, channels: Sequence[Channel]) -> list[Bloc
 
 
 def _difference_block(
-    problem: Problem, channels: Sequence[Channel], orders: Sequence[int], samples: Signal, found: str
+    problem: Problem, channels: Sequence[Channel], orders: Sequence[int], samples: Signal, differences: str
 ) -> Block:
     """Block (samples) -> their backward differences, which go on over gaps as those of positions do."""
     plant, at = problem.plant, (problem.start_state, problem.plant.approximate)
@@ -263,7 +263,7 @@ def _difference_block(
     }
     first = np.array([starts[e] for e in light.state.elements])
     estimate = PositionDifference().block(light, problem.period, first, samples)
-    names = {light.state.name: "_slot_chains", "realised": found, "estimate_past": "_slot_past"}
+    names = {light.state.name: "_slot_chains", "realised": differences, "estimate_past": "_slot_past"}
     return under_names(replace(estimate, name="slot_differences"), names)
 
 

@@ -49,15 +49,15 @@ class Haar(Wrapper):
         """Return G(r, d + g, d), and the errors of the last 2^J - 1 cycles."""
         inner, size = discrete(self, memory, request.numel()), request.numel()
         errors = ca.vertcat(response - desired, memory["haar_errors"])
-        smooth, kept = ca.reshape(errors, size, 2**self.levels), 0 * request
+        smooth, jumps = ca.reshape(errors, size, 2**self.levels), 0 * request
         for level in range(1, self.levels + 1):
             apart = 2 ** (level - 1)
             count = smooth.size2() - apart
             coarse = (smooth[:, :count] + smooth[:, apart:]) / 2
             detail, small = smooth[:, 0] - coarse[:, 0], self.threshold * self.noise / math.sqrt(2.0) ** level
-            kept = kept + ca.if_else(ca.fabs(detail) > small, detail, 0)
+            jumps = jumps + ca.if_else(ca.fabs(detail) > small, detail, 0)
             smooth = coarse
-        next_request, next_memory = self.map.step(request, desired + smooth[:, 0] + kept, desired, inner)
+        next_request, next_memory = self.map.step(request, desired + smooth[:, 0] + jumps, desired, inner)
         return next_request, {"haar_errors": errors[:-size], **next_memory}
 
 

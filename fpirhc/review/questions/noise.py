@@ -99,8 +99,8 @@ def suggest(
         whose noise must be given. InvalidName: unknown input or coordinate. NotSupported: a controller without adaptation.
         NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits; a budget that no gain keeps.
     """
-    found = _within_budget(problem, controller, chatter, noise, ringing)
-    return replace(found, harm=_harm(problem, controller, found.deformation))
+    suggestion = _within_budget(problem, controller, chatter, noise, ringing)
+    return replace(suggestion, harm=_harm(problem, controller, suggestion.deformation))
 
 
 def _within_budget(

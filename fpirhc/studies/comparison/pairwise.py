@@ -28,7 +28,7 @@ from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
 from fpirhc.simulation.stepper import Stepper
-from fpirhc.simulation.trials import MOSTLY, SLIGHT, errors_of, weighed
+from fpirhc.simulation.trials import SLIGHT, errors_of, weighed
 from fpirhc.studies.comparison.causes import grows, yardstick_of
 from fpirhc.studies.comparison.changes import ROUNDING, Change, Finding, Outcome, major, outcome_of, scales
 from fpirhc.studies.comparison.entry import Entry, no_bound_because
@@ -98,9 +98,8 @@ def null_test(
     pair = errors_of(null, runs)
     before, after = (_or_nan(errors) for errors in (pair.without, pair.adapted))
     slight = {name: SLIGHT * size for name, size in pair.ranges.items()}
-    stuck = {n: at_limit(null, run) for n, run in zip(names, runs, strict=True)}
-    if stuck[names[0]] >= MOSTLY:
-        text = _not_informative(stuck)
+    if pair.stuck:
+        text = _not_informative({n: at_limit(null, run) for n, run in zip(names, runs, strict=True)})
         return NullTest(
             names, before, after, Outcome.NOT_COMPARABLE, False, text, null.cycles, time.perf_counter() - begin
         )
@@ -358,19 +357,19 @@ def partners(
         compiled: whether the loops are compiled to C.
         metrics: of the task.
     """
-    found: dict[str, tuple[Entry, Simulator]] = {}
+    unadapted: dict[str, tuple[Entry, Simulator]] = {}
     missing: dict[str, str] = {}
     for name in (e.name for e in entries if e.adaptive and e.pair is None):
         try:
             problem.require_equations("its pair is not among the controllers, and the plant is outside")
             loop = simulator(problem, without_deformation(controllers[name]), compiled=compiled)
-            found[name] = _entry(problem, f"{name} without adaptation", loop, seed, metrics), loop
+            unadapted[name] = _entry(problem, f"{name} without adaptation", loop, seed, metrics), loop
         except FpirhcError as error:
             missing[name] = f"it cannot run without adaptation ({error})"
         except KeyboardInterrupt:
             missing[name] = "interrupted before it ran without adaptation"
             break
-    return found, missing
+    return unadapted, missing
 
 
 def _entry(problem: Problem, name: str, loop: Simulator, seed: int, metrics: Sequence[Metric] | None) -> Entry:

@@ -273,10 +273,14 @@ def remarks(
 ) -> list[Finding]:
     """Return the remarks about the first pair; none without a pair that finished."""
     if figure is not None and figure.metric is not None:
-        told = _best_by(entries, pair, figure)
+        sentences = _best_by(entries, pair, figure)
     else:
-        told = [*_worse_learners(entries, scales), *_far_better(entries, pair, scales), *_no_bound(entries, scales)]
-    return [Finding(text) for text in (*told, *_rates(entries))]
+        sentences = [
+            *_worse_learners(entries, scales),
+            *_far_better(entries, pair, scales),
+            *_no_bound(entries, scales),
+        ]
+    return [Finding(text) for text in (*sentences, *_rates(entries))]
 
 
 def _best_by(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, figure: Objective) -> list[str]:
