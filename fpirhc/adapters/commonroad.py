@@ -71,16 +71,14 @@ class _Car:
         self._kind, self._speed, self._steps, self._inputs = kind, speed, steps, inputs
         self.read: list[tuple[int, int]] = []
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, _seed: int) -> np.ndarray:
         """Straight on at the speed; there is nothing random."""
-        del seed
         first = [0.0, 0.0, 0.0, self._speed, 0.0, 0.0, 0.0]
         self._x = np.array(self._start(first, self._car) if self._kind == "std" else self._start(first))
         return self._measured(self._moved(), np.zeros(3))
 
-    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+    def step(self, _time: float, command: np.ndarray) -> np.ndarray:
         """Turn the wheels to their angle, at the car's rate, for a cycle."""
-        del time
         sent, span, before = dict(zip(self._inputs, command, strict=True)), self._steps * _STEP, self._moved()
         limits = self._car.steering
         turn = np.clip((sent.get("steer", self._x[2]) - self._x[2]) / span, limits.v_min, limits.v_max)

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import rmtree
 from typing import Any
 
 import numpy as np
@@ -53,53 +51,52 @@ def fmu_body(
     known = {v.name: v.valueReference for v in described.modelVariables if v.type in ("Real", "Float64")}
     mistakes.unknown("measures: quantity", measures, units)
     mistakes.unknown("variable", measures.values(), known)
-    mistakes.unknown("parameters: variable", fixed, known)
+    mistakes.unknown("parameters: variable", fixed, [v.name for v in described.modelVariables])
     sent = counterparts(mistakes, "input", model.inputs, inputs or {}, known)
     mistakes.raise_if_any()
-    folder = TemporaryDirectory()
-    make = partial(fmpy.instantiate_fmu, fmpy.extract(str(path), folder.name), described, fmi_type="CoSimulation")
-    references = [[known[name] for name in names] for names in (fixed, sent.values(), measures.values())]
-    body = _Body(make, described.fmiVersion[0] == "3", period, list(fixed.values()), references)
-    weakref.finalize(body, folder.cleanup)
+    folder = fmpy.extract(str(path))
+
+    def made() -> Any:
+        unit = fmpy.instantiate_fmu(folder, described, fmi_type="CoSimulation")
+        fmpy.simulation.apply_start_values(unit, described, fixed)
+        return unit
+
+    places = ([known[name] for name in names] for names in (sent.values(), measures.values()))
+    body = _Body(made, described.fmiVersion[0] == "3", period, *places)
+    weakref.finalize(body, rmtree, folder, ignore_errors=True)
     return ExternalPlant(body, measures={name: units[name] for name in measures})
 
 
-@dataclass(eq=False)
 class _Body:
     """An instance of the FMU, made anew for every run.
 
     Args:
-        make: returns an instance.
+        made: returns an instance with its parameters.
         third: whether it is of FMI 3.
         period: of a step.
-        fixed: values of the parameters.
-        references: of the parameters, of the inputs, and of what is measured.
+        sent: references of the inputs.
+        read: references of what is measured.
     """
 
-    make: Callable[[], Any]
-    third: bool
-    period: float
-    fixed: list[float]
-    references: list[list[int]]
-    unit: Any = None
+    def __init__(self, made: Callable[[], Any], third: bool, period: float, sent: list[int], read: list[int]) -> None:
+        self._made, self._third, self._period, self._sent, self._read = made, third, period, sent, read
+        self._unit: Any = None
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, _seed: int) -> np.ndarray:
         """Begin anew at time 0."""
-        del seed
-        if self.unit is not None:
-            self.unit.terminate()
-            self.unit.freeInstance()
-        unit = self.unit = self.make()
-        self._set, self._get = (unit.setFloat64, unit.getFloat64) if self.third else (unit.setReal, unit.getReal)
-        if not self.third:
+        if self._unit is not None:
+            self._unit.terminate()
+            self._unit.freeInstance()
+        unit = self._unit = self._made()
+        self._set, self._get = (unit.setFloat64, unit.getFloat64) if self._third else (unit.setReal, unit.getReal)
+        if not self._third:
             unit.setupExperiment(startTime=0.0)
         unit.enterInitializationMode()
-        self._set(self.references[0], self.fixed)
         unit.exitInitializationMode()
-        return np.array(self._get(self.references[2]))
+        return np.array(self._get(self._read))
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
         """Hold the command for a communication step."""
-        self._set(self.references[1], list(map(float, command)))
-        self.unit.doStep(currentCommunicationPoint=time, communicationStepSize=self.period)
-        return np.array(self._get(self.references[2]))
+        self._set(self._sent, list(map(float, command)))
+        self._unit.doStep(currentCommunicationPoint=time, communicationStepSize=self._period)
+        return np.array(self._get(self._read))

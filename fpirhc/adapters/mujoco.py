@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, base_and_order, counterparts, steps_per_cycle
+from fpirhc.adapters.names import adapter, base_and_order, counterparts, from_path_or_text, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -47,9 +47,7 @@ def mujoco_body(
         InvalidProblem: a name that the body or the model does not have, or a period that is no whole number of time steps.
     """
     mujoco = package("mujoco", "outside")
-    text = str(mjcf)
-    from_text, from_file = mujoco.MjModel.from_xml_string, mujoco.MjModel.from_xml_path
-    body = from_text(text) if text.lstrip().startswith("<") else from_file(text)
+    body = from_path_or_text(mjcf, mujoco.MjModel.from_xml_path, mujoco.MjModel.from_xml_string)
     units, mistakes = quantities(model), Mistakes("mujoco_body")
     free = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
     scalar = [joint for joint in map(body.joint, range(body.njnt)) if int(joint.type[0]) in free]
@@ -81,18 +79,16 @@ class _Body:
         self._mujoco, self._model, self._data = mujoco, model, mujoco.MjData(model)
         self._steps, self._motors, self._places, self._start = steps, motors, places, start
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, _seed: int) -> np.ndarray:
         """Go to the start; there is nothing random."""
-        del seed
         self._mujoco.mj_resetData(self._model, self._data)
         for quantity, value in self._start.items():
             order, place = self._places[quantity]
             (self._data.qpos, self._data.qvel)[order][place] = value
         return self._measured()
 
-    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+    def step(self, _time: float, command: np.ndarray) -> np.ndarray:
         """Hold the command for a cycle."""
-        del time
         self._data.ctrl[self._motors] = command
         self._mujoco.mj_step(self._model, self._data, self._steps)
         return self._measured()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
+from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -64,6 +65,19 @@ def counterparts(
     found = {name: given.get(name, name) for name in own}
     mistakes.unknown(what, found.values(), valid)
     return found
+
+
+def from_path_or_text(source: str | Path, by_path: Callable[[str], R], by_text: Callable[[str], R]) -> R:
+    """Return what a package reads from a file of XML, or from its text, which begins with "<".
+
+    Raises:
+        OSError: the file cannot be read; packages say something else of one that is not there.
+    """
+    text = str(source)
+    if text.lstrip().startswith("<"):
+        return by_text(text)
+    Path(text).open("rb").close()
+    return by_path(text)
 
 
 def steps_per_cycle(where: str, period: float, step: float) -> int:

@@ -147,9 +147,8 @@ class _Device:
         self._link, self._names, self._setup, self._clock = link, names, setup, setup.clock or RealTime()
         self._still = _Standstill(self._clock) if counts else None
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, _seed: int) -> np.ndarray:
         """Connect, and measure."""
-        del seed
         self._link.open()
         self._clock.begin()
         if self._still is not None:

@@ -86,15 +86,13 @@ class _Quadrotor:
     def __init__(self, vehicle: Any, first: _State, period: float, order: list[int], share: float) -> None:
         self._vehicle, self._first, self._period, self._order, self._share = vehicle, first, period, order, share
 
-    def reset(self, seed: int) -> np.ndarray:
+    def reset(self, _seed: int) -> np.ndarray:
         """Go to the start; there is nothing random."""
-        del seed
         self._state = deepcopy(self._first)
         return np.concatenate([self._state["x"], self._state["v"], np.zeros(3)])
 
-    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+    def step(self, _time: float, command: np.ndarray) -> np.ndarray:
         """Fly for a cycle."""
-        del time
         thrust = {"cmd_acc": np.asarray(command)[self._order] * self._share}
         self._state["wind"] = self._first["wind"]
         self._state = self._vehicle.step(self._state, thrust, self._period)

@@ -15,20 +15,21 @@ pytest.importorskip("fmpy", reason="it needs the extra fpirhc[outside]")
 builder = pytest.importorskip("pythonfmu.builder", reason="it needs the extra fpirhc[outside]")
 
 CODE = """
-from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
+from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
 
 
 class Tank(Fmi2Slave):
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self.inflow, self.level, self.outlet = 0.0, 1.0, 0.5
+        self.inflow, self.level, self.outlet, self.pipes = 0.0, 1.0, 0.5, 1
         self.register_variable(Real("inflow", causality=Fmi2Causality.input))
         self.register_variable(Real("level", causality=Fmi2Causality.output))
         self.register_variable(Real("outlet", causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed))
+        self.register_variable(Integer("pipes", causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed))
 
     def do_step(self, time, step):
         for _ in range(100):
-            self.level += step / 100 * (self.inflow - self.outlet * self.level**0.5)
+            self.level += step / 100 * (self.inflow - self.pipes * self.outlet * self.level**0.5)
         return True
 """
 TANK = fp.Plant(
@@ -82,6 +83,14 @@ def test_a_parameter_is_set_and_a_run_begins_anew(unit):
     assert answers == [pytest.approx([1.0]), pytest.approx([1.0])]
     body.reset(0)
     assert float(np.ravel(body.step(0.0, np.array([0.5])))[0]) < 0.99
+
+
+def test_a_parameter_that_is_no_real_number_is_set(unit):
+    """Two pipes of .4 let out what one of .8 does."""
+    many = {"outlet": 0.4, "pipes": 2}
+    body: Any = fmu_body(unit, TANK, period=0.05, measures={"h": "level"}, inputs={"q": "inflow"}, parameters=many).body
+    body.reset(0)
+    assert np.ravel(body.step(0.0, np.array([0.8]))) == pytest.approx([1.0])
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 import fpirhc as fp
 from fpirhc.adapters.urdf import arm
 from fpirhc.errors import InvalidProblem
+
+pinocchio = pytest.importorskip("pinocchio", reason="it needs the extra fpirhc[outside]")
 
 LINK = """<link name="{name}"><inertial><origin xyz="{at}" rpy="{rpy}"/><mass value="{mass}"/>
 <inertia ixx="0.02" ixy="0.001" ixz="-0.002" iyy="0.03" iyz="0.0015" izz="0.025"/></inertial></link>"""
@@ -46,7 +46,6 @@ NAMES = ("shoulder", "elbow", "wrist", "grip")
 
 def test_the_equations_are_those_of_pinocchio():
     """Accelerations under random torques, and torques for random accelerations, to rounding."""
-    pinocchio: Any = pytest.importorskip("pinocchio", reason="it needs the extra fpirhc[outside]")
     plant, random = arm(TEXT), np.random.default_rng(2)
     model = pinocchio.buildModelFromXML(TEXT)
     data = model.createData()
@@ -68,6 +67,22 @@ def test_the_equations_are_those_of_pinocchio():
         assert found == pytest.approx(np.array(expected), rel=1e-9)
         back = plant.equations.inverse(state, found, plant.exact).full().ravel()
         assert back == pytest.approx(sent, rel=1e-9)
+
+
+def test_links_that_stand_on_others_have_masses_of_their_own():
+    """Pinocchio sums what hangs together; a heavier hand, with its inertia, is the file with a heavier hand."""
+    plant = arm(TEXT, exact={"hand": 1.0})
+    assert dict(zip(plant.parameters, plant.approximate, strict=True)) == pytest.approx(
+        {"mass_upper": 3.0, "mass_fore": 2.0, "mass_slide": 0.8, "mass_hand": 0.5, "mass_finger": 0.1}
+    )
+    at, now = TEXT.index('<link name="hand"'), TEXT.index('<link name="finger"')
+    hand = TEXT[at:now].replace('"0.5"', '"1.0"')
+    for number in ("0.02", "0.001", "-0.002", "0.03", "0.0015", "0.025"):
+        hand = hand.replace(f'="{number}"', f'="{2 * float(number)}"')
+    heavier = arm(TEXT[:at] + hand + TEXT[now:])
+    state, sent = [0.3, -0.4, 0.2, 0.5, 1.0, -0.7, 0.3, 0.2], [5.0, 2.0, -3.0, 0.4]
+    one, other = (p.equations.response(state, sent, p.exact).full() for p in (plant, heavier))
+    assert one == pytest.approx(other, rel=1e-9)
 
 
 def test_a_tool_that_nobody_weighed_is_what_adaptation_removes():
@@ -95,9 +110,11 @@ def test_a_tool_that_nobody_weighed_is_what_adaptation_removes():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (TEXT.replace('"prismatic"', '"floating"'), "joint 'wrist' is floating; expected revolute, continuous"),
-        ("<robot name='r'><link name='a'/></robot>", "no joint that moves"),
-        (TEXT.replace('<parent link="base"/>', '<parent link="finger"/>'), "links go round in a circle"),
+        (TEXT.replace('"prismatic"', '"floating"'), "joint 'wrist' has 6 degrees of freedom; expected ones that turn"),
+        ("<robot name='r'><link name='a'/></robot>", "no joint moves from the base on"),
+        (TEXT.replace('<parent link="base"/>', '<parent link="finger"/>'), "no joint moves from the base on"),
+        ("<robot", "arm: ValueError: The XML stream does not contain a valid URDF model"),
+        ("nowhere.urdf", "arm: 'nowhere.urdf' cannot be read: No such file or directory"),
     ],
 )
 def test_what_is_no_arm_is_named(text, words):
