@@ -22,7 +22,8 @@ import numpy as np
 
 from fpirhc.controllers.base import commanding_blocks, like, reference_block
 from fpirhc.controllers.contract import Undeformed
-from fpirhc.errors import InvalidValue, NotSupported, OutputError
+from fpirhc.controllers.sensing_chain import given_states, raw_signal
+from fpirhc.errors import InvalidValue, OutputError
 from fpirhc.fields.kinds import Positive
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
@@ -76,26 +77,18 @@ class Processor(Undeformed):
             )
         object.__setattr__(self, "program", tuple(self.program))
 
-    def check(self, problem: Problem) -> None:
-        """Raise where a program is given something else than the samples of an export.
-
-        Raises:
-            NotSupported: the problem has sensors, whose estimators are part of an export.
-        """
-        if not problem.sensing.ideal:
-            raise NotSupported(
-                "Processor: the estimators of a problem with sensing run inside an exported controller, and the loop has its own; "
-                "leave the sensing out: replace(problem, sensing=Sensing())"
-            )
-
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         closing, delays = commanding_blocks(problem, [scalar(_ANSWER)])
         return [reference_block(problem), self._block(problem), *closing], delays
 
     def _block(self, problem: Problem) -> Block:
-        """Block (time, sample) -> command and status; the model's response to it stands beside, for readers of a log."""
-        plant = problem.plant
-        sample = Layout((time_signal(plant), *measured_signals(plant), plant.response_signal("realised")))
+        """Block (time, sample) -> command and status; the model's response to it stands beside, for readers of a log.
+
+        Where something is estimated the sample is what the sensors show: the program has the estimators of its own.
+        """
+        plant, raw = problem.plant, raw_signal(problem)
+        seen = (*measured_signals(plant), plant.response_signal("realised"))
+        sample = Layout((time_signal(plant), *(seen if raw is None else (*given_states(problem), raw))))
         answers = _answers(self, sample.size, len(plant.inputs))
         response = plant.equations.controlled_response
 

@@ -201,7 +201,10 @@ int arm_raw(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_r
 
 @needs_compiler
 def test_a_solver_that_fails_holds_as_the_stepper_does(tmp_path, monkeypatch):
-    """The last command, the memory as it was, and the cycles made up for later: in C as where a solver raises in Python."""
+    """The last command, the memory as it was, and the cycles made up for later: in C as where a solver raises in Python.
+
+    Scalar code has no loop that can fail.
+    """
     calls, real = [0], fp.Stepper._run
 
     def failing(self):
@@ -220,7 +223,7 @@ def test_a_solver_that_fails_holds_as_the_stepper_does(tmp_path, monkeypatch):
             self._evaluate = evaluate
 
     monkeypatch.setattr(fp.Stepper, "_run", failing)
-    exported("torque", tmp_path, cycles=90)
+    exported("plan", tmp_path, cycles=90)
     raw = tmp_path / "arm_step.c"
     raw.write_text(raw.read_text().replace("arm_raw", "arm_real"))
     (tmp_path / "failing.c").write_text(FAILING)

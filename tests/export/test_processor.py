@@ -16,7 +16,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.cli.main import main
-from fpirhc.errors import InvalidField, InvalidValue, NotSupported, OutputError
+from fpirhc.errors import InvalidField, InvalidValue, OutputError
 from fpirhc.export.cortex import Image
 from fpirhc.export.device import Device
 from fpirhc.export.processor import Processor
@@ -29,6 +29,7 @@ CASES = {
     "plan": ("two_mass", "RHC+FPI"),
     "tanks": ("leaking_tanks", "RHC+FPI"),
     "map": ("fishery", "RHC+FPI"),
+    "motor": ("noisy_motor", "RHC+FPI"),
 }
 
 
@@ -67,9 +68,12 @@ def lines_of(folder: Path) -> str:
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["torque", pytest.param("plan", marks=pytest.mark.slow), "tanks"])
+@pytest.mark.parametrize("name", ["torque", pytest.param("plan", marks=pytest.mark.slow), "tanks", "map", "motor"])
 def test_a_loop_with_the_program_is_the_run(name, tmp_path):
-    """Every state and command, twice from the start: what differs is the last digits of exp and the like."""
+    """Every state and command, twice from the start: what differs is the last digits of exp and the like.
+
+    Where something is estimated the program is sent what the sensors show, noise with it, and has the estimators of its own.
+    """
     device = exported(name, tmp_path, "c")
     run = fp.simulate(device.problem, device.controller, seed=0)
     outside = Processor([program(tmp_path)])
@@ -152,10 +156,16 @@ def test_a_wrong_program_is_named_before_the_run(make, error, message):
         fp.simulate(problem, make(), seed=0)
 
 
-def test_sensors_are_refused_with_what_to_write():
-    task = fp.load_problem("noisy_motor")
-    with pytest.raises(NotSupported, match=r"replace\(problem, sensing=Sensing\(\)\)"):
-        fp.simulate(task.problem, Processor(talking()), seed=0)
+@needs_compiler
+def test_a_sample_that_a_sensor_loses_is_sent_as_its_last_one(tmp_path):
+    """Nothing is estimated, and the program is given what the controller in this process is given."""
+    sensors = {name: fp.Sensor(dropout=0.2) for name in ("q1", "q2'")}
+    two_mass = fp.load_problem("two_mass")
+    problem = replace(two_mass.problem, duration=0.3, measure_from=0.0, sensing=fp.Sensing(sensors))
+    device = device_of(problem, two_mass.controllers["CTC+FPI (eq 6)"], "torque", name="arm", cycles=1, libm="own")
+    write(device, target_called("c"), tmp_path)
+    run, other = (fp.simulate(problem, one, seed=3) for one in (device.controller, Processor([program(tmp_path)])))
+    np.testing.assert_allclose(other["command"], run["command"], rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -228,6 +228,8 @@ def _controller(device: Device) -> str:
         held=str(memory.slice(HELD).start),
         skipped=str(memory.slice(f"{SKIPPED}_before").start),
         skipped_now=str(trace.slice(SKIPPED).start),
+        fails=str(int(not stepper.function.is_a("SXFunction"))),
+        changes=str(int(bool(device.bounds))),
         first=str(device.inputs.slice(device.inputs.names[missing]).start),
         **words,
     )

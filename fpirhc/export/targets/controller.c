@@ -11,6 +11,7 @@
 
 enum { BEFORE = @before@, HELD = @held@, SKIPPED = @skipped@ };                /* in the memory */
 enum { STATUS = @status@, SKIPPED_NOW = @skipped_now@, COMMAND = @command@ };  /* in the trace */
+enum { FAILS = @fails@, CHANGES = @changes@ }; /* whether a loop in it can fail, and whether limits may be changed */
 
 static int run(@name@_controller* c, const @name@_inputs* in, casadi_real* command) {
 @bind@
@@ -65,21 +66,18 @@ void @name@_reset(@name@_controller* c) {
 
 @name@_status @name@_step(@name@_controller* c, const @name@_inputs* in, @name@_command* out) {
   casadi_real *memory = (casadi_real*)&c->memory, *command = (casadi_real*)out, before = memory[BEFORE];
-  int failed = 0;
-  if (in->time - before > (casadi_real)1.5 * PERIOD) {
-    long missed = missed_cycles(in->time, before), k = missed > MISSED ? missed - MISSED : 0, dropped = k;
-    @name@_inputs lost = *in;
-    ((casadi_real*)&lost)[@first@] = (casadi_real)NAN;
-    for (; k < missed && !failed; ++k) {
-      lost.time = before + (casadi_real)(k + 1) * PERIOD;
-      failed = run(c, &lost, command);
-      if (!failed) c->memory = c->next;
-    }
-    if (!failed) memory[SKIPPED] += (casadi_real)dropped;
+  long missed = in->time - before > (casadi_real)1.5 * PERIOD ? missed_cycles(in->time, before) : 0;
+  long k = missed > MISSED ? missed - MISSED : 0, dropped = k;
+  @name@_inputs lost = *in;
+  ((casadi_real*)&lost)[@first@] = (casadi_real)NAN;
+  for (;; ++k) {
+    if (k < missed) lost.time = before + (casadi_real)(k + 1) * PERIOD;
+    if (k == missed && dropped) memory[SKIPPED] += (casadi_real)dropped;
+    if (run(c, k < missed ? &lost : in, command) && FAILS) return hold(c, in->time, command);
+    c->memory = c->next;
+    if (k == missed) break;
   }
-  if (failed || run(c, in, command)) return hold(c, in->time, command);
-  c->memory = c->next;
-  clip(c, command);
+  if (CHANGES) clip(c, command);
   return (@name@_status)((casadi_real*)&c->trace)[STATUS];
 }
 @set@
