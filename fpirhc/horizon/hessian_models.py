@@ -18,6 +18,7 @@ import casadi as ca
 
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
+from fpirhc.symbolic.latest import Latest
 
 _OPERANDS = 2  # most operands of an elementary operation
 _Edges = list[dict[int, ca.SX]]  # for every result, its partial derivatives by the result that they are of
@@ -446,23 +447,24 @@ def _dense(name: str, arguments: list[ca.SX], results: list[ca.SX]) -> ca.Functi
 
 
 _Parts = dict[str, ca.Function]
-_rules: WeakKeyDictionary[OptimalControl, ChainRule] = WeakKeyDictionary()
-_stages: WeakKeyDictionary[OptimalControl, _Parts] = WeakKeyDictionary()
-_hessians: WeakKeyDictionary[OptimalControl, dict[HessianModel, _Parts]] = WeakKeyDictionary()
+_STAGES: Latest[tuple[ChainRule, _Parts]] = Latest(8)  # horizons that differ in their data only have one stage
+_HESSIANS: Latest[_Parts] = Latest(8)
+
+
+def _stage(ocp: OptimalControl) -> tuple[ChainRule, _Parts]:
+    return _STAGES.of((ocp.dynamics, ocp.stage_cost), (), lambda: _split(ocp))
 
 
 def split_stage(ocp: OptimalControl) -> dict[str, ca.Function]:
-    """Return the Functions evaluate and pull, built once for a problem."""
-    if ocp not in _stages:
-        _stages[ocp] = _split(ocp)
-    return _stages[ocp]
+    """Return the Functions evaluate and pull, built once for a stage."""
+    return _stage(ocp)[1]
 
 
 def linearise_stage(ocp: OptimalControl) -> ca.Function:
     """Return the Function linearise as scalar code."""
-    parts = split_stage(ocp)
+    rule, parts = _stage(ocp)
     if "linearise" not in parts:
-        ns, rule = ocp.state.size, _rules[ocp]
+        ns = ocp.state.size
         rates, slopes = rule.jacobian[:ns, :], rule.jacobian[ns, :].T
         results = [rates[:, :ns], rates[:, ns:], slopes[:ns], slopes[ns:]]
         parts["linearise"] = _dense("fpirhc_linearise_stage", [rule.symbols], results)
@@ -480,7 +482,7 @@ def stage_leaves(ocp: OptimalControl, names: tuple[str, ...]) -> tuple[_Parts, s
     sizes = ocp.state.size, ocp.input.size
     if sum(sizes) <= _MANY:
         return {**leaves, "linearise": linearise_stage(ocp)}, ""
-    rule = _rules[ocp]
+    rule = _stage(ocp)[0]
     leaves["slopes"] = slopes_function(rule, "fpirhc_slopes")
     return leaves, tangent_code(rule, "linearise", "slopes", sizes)
 
@@ -491,11 +493,9 @@ def partial_count(ocp: OptimalControl) -> int:
 
 
 def split_hessian(ocp: OptimalControl, hessian: HessianModel) -> dict[str, ca.Function]:
-    """Return the Functions bend and curve of a model of the second derivatives, built once for a problem."""
-    models = _hessians.setdefault(ocp, {})
-    if hessian not in models:
-        models[hessian] = _bent(ocp, hessian)
-    return models[hessian]
+    """Return the Functions bend and curve of a model of the second derivatives, built once for a stage."""
+    same = ocp.dynamics, ocp.stage_cost, ocp.frozen
+    return _HESSIANS.of(same, (hessian,), lambda: _bent(ocp, hessian))
 
 
 def _bent(ocp: OptimalControl, hessian: HessianModel) -> _Parts:
@@ -514,14 +514,14 @@ def _bent(ocp: OptimalControl, hessian: HessianModel) -> _Parts:
     }
 
 
-def _split(ocp: OptimalControl) -> _Parts:
+def _split(ocp: OptimalControl) -> tuple[ChainRule, _Parts]:
     ns, nu = ocp.state.size, ocp.input.size
     s, u, theta = stage_symbols(ocp)
     next_state, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)
-    parts = _rules[ocp] = chain_rule(ca.densify(ca.vertcat(next_state, cost)), ca.vertcat(s, u), theta)
+    parts = chain_rule(ca.densify(ca.vertcat(next_state, cost)), ca.vertcat(s, u), theta)
     after = ca.SX.sym("lambda", ns)
     pulled = ca.substitute(parts.pulled, parts.weights, ca.vertcat(after, 1))
-    return {
+    return parts, {
         "evaluate": _dense("fpirhc_evaluate_stage", [s, u, theta], [next_state, cost, parts.partials]),
         "pull": _dense("fpirhc_pull_stage", [parts.symbols, after], [pulled[:ns], pulled[ns : ns + nu]]),
     }

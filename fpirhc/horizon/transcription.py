@@ -70,17 +70,10 @@ def transcribe(
     Raises:
         InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
     """
-    same = (
-        plant.equations,
-        reference,
-        horizon,
-        cost,
-        limits,
-        signals,
-    )  # the approximate parameters are those of the equations
+    same = plant.equations, reference, cost, limits, signals  # the approximate parameters are those of the equations
     first = None if start is None else np.asarray(start, dtype=float).tobytes()
     arguments = plant, reference, horizon, cost, limits, signals, start, others
-    return _LATEST.of((*same, *others.values()), (first, *others), lambda: _transcribed(*arguments))
+    return _LATEST.of((*same, *others.values()), (first, horizon, *others), lambda: _transcribed(*arguments))
 
 
 def _transcribed(
@@ -96,11 +89,15 @@ def _transcribed(
     nominal(cost).check(plant)
     limits.check(plant)
     _check_names(plant, horizon, limits)
-    stage = _stage_expressions(
-        plant, reference, horizon, cost, limits, [number.of(ca.SX) for number in others.values()]
-    )
+    same, live = (plant.equations, reference, cost, limits, *others.values()), [n.of(ca.SX) for n in others.values()]
+
+    def expressed() -> tuple[_Stage, tuple[ca.Function, ca.Function, ca.Function]]:
+        stage = _stage_expressions(plant, reference, horizon, cost, limits, live)
+        return stage, _stage_functions(stage)
+
+    stage, functions_of_stage = _STAGES.of(same, (horizon, *others), expressed)
     binding, free = stage.binding, stage.before.numel()
-    dynamics, stage_cost, terminal_cost = _stage_functions(stage)
+    dynamics, stage_cost, terminal_cost = functions_of_stage
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
@@ -174,6 +171,9 @@ class _Stage:
     settings: list[ca.SX]
     length: Expression | float
     linear_outputs: Callable[[], tuple[ca.Function, ca.Function]]
+
+
+_STAGES: Latest[tuple[_Stage, tuple[ca.Function, ca.Function, ca.Function]]] = Latest(8)  # whatever signals they meet
 
 
 def _stage_expressions(

@@ -58,6 +58,11 @@ class Optimiser(Checked, ABC):
         """Fields whose numbers may be live, because its code reads them from the data of the stages."""
         return ()
 
+    @property
+    def near_plan(self) -> Optimiser:
+        """The optimiser as it improves a plan that it has solved and remembers, without what looks for other plans."""
+        return self
+
     def longer(self, times: int) -> Optimiser | None:
         """The same optimiser with so many times the iterations per call; None where it has no such setting."""
         if not is_dataclass(self):

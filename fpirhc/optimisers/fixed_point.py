@@ -66,6 +66,10 @@ class FixedPoint(Optimiser):
     def in_data(self) -> tuple[str, ...]:
         return "tolerance", "damping", "map"
 
+    @property
+    def near_plan(self) -> Optimiser:
+        return replace(self, second_start=False) if self.second_start else self
+
     def check(self, ocp: OptimalControl) -> None:
         """Raise if plans cannot be rolled out, the tolerance cannot be met, or the cost is not convex where the Hessian needs that.
 

@@ -5,6 +5,7 @@ Theory: docs/theory-plants.md.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import resources
 
 import casadi as ca
@@ -27,17 +28,34 @@ from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF, Scales, scal
 from fpirhc.optimisers.limited_graph import limited_graph
 from fpirhc.optimisers.limited_phases import guess
 from fpirhc.optimisers.limited_settings import LimitedSettings, limited_memory
+from fpirhc.optimisers.plan_library import LAST, plan_library, with_last
 from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status
-from fpirhc.symbolic.driver import Driver, with_driver
+from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
 from fpirhc.symbolic.expression import FINITE
+from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.native import Native
 
 _TEXTS = ("kernels", "limited_sweep", "limited_bounds", "limited")
 
 
 def limited_step(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
     """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+    if plans_are_compiled():
+        alike = replace(settings, iterations=0)
+        library = _LIBRARIES.of((ocp, settings.map), (alike,), lambda: _library(ocp, alike))
+        if library.compiled:
+            return with_last(ocp, library.function, settings.iterations)
     return with_driver("fpirhc_limited", _driver(ocp, settings), lambda name: limited_graph(ocp, settings, name))
+
+
+def _library(ocp: OptimalControl, settings: LimitedSettings) -> Native:
+    """The driver alone as a library, whose last argument is the number of iterations that a call may take."""
+    driver = _driver(ocp, settings, LAST)
+    return plan_library(ocp, "fpirhc_limited_both", driver, limited_memory(ocp).size)
+
+
+_LIBRARIES: Latest[Native] = Latest(8)
 
 
 def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
@@ -55,7 +73,8 @@ def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
     return layout.join({**parts, **shifted_parts})
 
 
-def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
+def _driver(ocp: OptimalControl, settings: LimitedSettings, iterations: str = "") -> Driver:
+    """The loops in C with what they call; `iterations` are those of the settings unless the text is given."""
     measures = scales(ocp)
     stage, linearise = stage_leaves(ocp, ("evaluate",))
     leaves = {
@@ -70,7 +89,7 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     texts.insert(1, linearise)
     sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
-    constants = {**sizes, **_constants(settings, measures)}
+    constants = {**sizes, **_constants(settings, measures), "ITERATIONS": iterations or settings.iterations}
     return Driver(
         "\n".join(texts), leaves, constants, _room(ocp, measures), in_place=(4, 2), side_by_side=False
     )  # the memory
@@ -127,7 +146,6 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "TOLERANCE": repr(float(settings.tolerance)),
         "FEASIBLE": repr(float(settings.feasible)),
         "SCALED_TOLERANCE": repr(settings.scaled_tolerance(measures)),
-        "ITERATIONS": settings.iterations,
         "PLAIN_FIRST": int(settings.plain_first),
     }
 

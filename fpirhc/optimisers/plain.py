@@ -15,14 +15,15 @@ from fpirhc.horizon.riccati import BOX_PIVOT, rounds
 from fpirhc.horizon.stage_data import SCALE, STEEPEST
 from fpirhc.optimisers import search as line_search
 from fpirhc.optimisers.base import clip, sane, shift, shift_gains, stationarity, status_of
+from fpirhc.optimisers.plan_library import LAST, plan_library, with_last
 from fpirhc.optimisers.search import Anchor, Arguments, Search, deformed_move, first_gamma
 from fpirhc.status import Status
-from fpirhc.symbolic.driver import Driver, plans_are_compiled, registered, with_driver
+from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
 from fpirhc.symbolic.expression import FINITE, is_finite
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import LiveNumber, Number
-from fpirhc.symbolic.native import Native, native
+from fpirhc.symbolic.native import Native
 
 MOST = 100  # iterations of one converging call
 _MOST_PLAIN = 30  # plain steps after which a converging call gives up
@@ -80,28 +81,17 @@ def plain_step(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:
         alike = replace(settings, converging=False)
         library = _LIBRARIES.of((ocp, settings.map), (alike,), lambda: _library(ocp, alike))
         if library.compiled:
-            return _of_library(ocp, settings, library.function)
+            return with_last(ocp, library.function, int(settings.converging))
     name = "fpirhc_fixed_point_converging" if settings.converging else "fpirhc_fixed_point"
     driver = plain_driver(ocp, settings, settings.stops)
     return with_driver(name, driver, lambda unique: plain_graph(ocp, settings, unique))
 
 
 def _library(ocp: OptimalControl, settings: PlainSettings) -> Native:
-    """The driver alone as a library, which a last argument tells whether a call stops where the plan is converged."""
-    stops = {"STOP_EARLY": "(arg[5] && *arg[5] > 0)", "ITERATIONS": f"(STOP_EARLY ? {MOST} : {settings.iterations})"}
-    name = registered("fpirhc_fixed_point_both", plain_driver(ocp, settings, stops))
-    arguments, memory = call_symbols(ocp)
-    sizes = (ocp.input.size, ocp.stages), (5, 1), memory.shape
-    return native(
-        ca.Function(name, [*arguments, memory, ca.MX.sym("converging")], [ca.MX.zeros(*size) for size in sizes])
-    )
-
-
-def _of_library(ocp: OptimalControl, settings: PlainSettings, library: ca.Function) -> ca.Function:
-    """The library's Function without its last argument."""
-    arguments, memory = call_symbols(ocp)
-    results = library.call([*arguments, memory, ca.MX(int(settings.converging))])
-    return ca.Function("fpirhc_fixed_point_library", [*arguments, memory], results, {"always_inline": True})
+    """The driver alone as a library, whose last argument says whether a call stops where the plan is converged."""
+    stops = {"STOP_EARLY": f"({LAST} > 0)", "ITERATIONS": f"(STOP_EARLY ? {MOST} : {settings.iterations})"}
+    driver = plain_driver(ocp, settings, stops)
+    return plan_library(ocp, "fpirhc_fixed_point_both", driver, plain_memory(ocp).size)
 
 
 _LIBRARIES: Latest[Native] = Latest(8)

@@ -24,6 +24,7 @@ from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression
 
 _LATEST: Latest[ca.Function | None] = Latest(8)
+_REAL: Latest[Mapping[str, Exogenous]] = Latest(8)
 _HOLDS = ("zero", "linear")
 
 
@@ -126,7 +127,8 @@ def signals_of(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exog
 
 def really_known(signals: Mapping[str, Exogenous]) -> Mapping[str, Exogenous]:
     """Return the same signals, told to the model as they are: what an exact model knows."""
-    return {name: Known(one.values) for name, one in signals.items()}
+    values = {name: one.values for name, one in signals.items()}
+    return _REAL.of(tuple(values.values()), tuple(values), lambda: {name: Known(one) for name, one in values.items()})
 
 
 def as_known(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exogenous]:

@@ -15,8 +15,9 @@ from reviewed import about
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.review.grid import review_grid
-from fpirhc.review.loops import loops_along
+from fpirhc.review.loops import loops_along, own_loops, points_of
 from fpirhc.review.questions.horizon import plan_gain
+from fpirhc.simulation.linearise.asked_loop import AskedLoop
 
 STEP = 0.05  # s
 
@@ -150,3 +151,35 @@ def test_blocks_have_a_feedback():
         first = plan_gain(problem, problem.horizon)
         sizes.append(np.linalg.norm(first))
     assert sizes[1] < 0.5 * sizes[0]
+
+
+def test_a_plan_that_also_begins_anew_is_linearised_where_it_is_solved():
+    """`freeway_economic` takes the cheaper of two plans, and has none where the queue of its reference is too long.
+
+    Near a solved plan its own step does what the linear loop says, with one start, and other points are left out.
+    """
+    task = fp.load_problem("freeway_economic")
+    problem, controller = replace(task.problem, disturbances={}), task.controllers["RHC"]
+    grid = review_grid(problem, 0.0, 0)
+    points, found = points_of(grid, controller), own_loops(grid, controller)
+    assert found.places == (0,)
+    assert [points.asked.solved(points.quiet(k)) for k in (0, 20, 40)] == [True, False, False]
+    memory, linear, whole = points.quiet(0), points.at(0), AskedLoop(problem, controller)
+    state = whole.loop.memory.slice("_state_before")
+    sizes = 1e-5 * np.abs(memory[state])
+    moved = [memory.copy(), memory.copy()]
+    for one, sign in zip(moved, (1, -1), strict=True):
+        one[state] += sign * sizes
+    ahead, behind = (whole.run(one, 1).memories[1, state] for one in moved)
+    expected = linear.cycles[0].state @ linear.dynamics @ linear.placed @ sizes
+    assert (ahead - behind) / 2 == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max())
+
+
+def test_cycles_that_are_skipped_have_no_linear_loop():
+    """Where the model asks for more than the road carries, the last command is held: that is no loop without feedback."""
+    task = fp.load_problem("freeway_economic")
+    grid, controller = review_grid(task.problem, 0.0, 0), task.controllers["RHC+FPI"]
+    points = points_of(grid, controller)
+    assert points.asked.skips(points.quiet(0))
+    assert not points.asked.skips(points.quiet(20))
+    assert not own_loops(grid, controller).loops

@@ -20,6 +20,7 @@ from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.maps import response_age
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import GAP, Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.latest import Latest
@@ -28,6 +29,7 @@ from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 
 _BELIEVED = "_believed"
+_MODELS: Latest[Plant] = Latest(8)  # what is built of a model is shared by the problems of one plant
 _MODELLED: Latest[Problem] = Latest(8)
 
 
@@ -53,7 +55,8 @@ class Estimating(ControllerWrapper):
         return _MODELLED.of((self.estimator, problem), (), lambda: self._modelled(problem))
 
     def _modelled(self, problem: Problem) -> Problem:
-        model = self.estimator.model(problem.plant)
+        plant = problem.plant
+        model = _MODELS.of((self.estimator, plant), (), lambda: self.estimator.model(plant))
         return problem if model is problem.plant else replace(problem, plant=model)
 
     @property

@@ -20,12 +20,13 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import any_gain
-from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.contract import resolved, with_optimiser
 from fpirhc.deformation.base import Deformation, Iteration, with_inner
 from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -83,7 +84,14 @@ class LinearMap(Deformation):
 
 
 def near_fixed_point(controller: Controller) -> Controller:
-    """Return the controller with its map as it is near the fixed point; itself where the map changes on line, or does not adapt."""
+    """Return the controller with its map as it is near the fixed point, and its optimiser as it is near a plan that is solved.
+
+    A map that changes on line, or does not adapt, stays as it is.
+    """
+    if controller.planner is not None:
+        optimiser = controller.planner.optimiser
+        near = optimiser.near_plan
+        controller = controller if near is optimiser else with_optimiser(controller, near)
     deformation = controller.deformation
     if not deformation.adapts or not deformation.iteration.constant:
         return controller
@@ -151,6 +159,8 @@ class AskedLoop:
         names = self.loop.trace.names
         self._command = self.loop.trace.slice("command")
         self._arriving = self.loop.trace.slice("arriving" if "arriving" in names else "command")
+        self._statuses = [k for k, c in enumerate(self.loop.trace.columns) if c == "status"]
+        self._solves = [k for k, c in enumerate(self.loop.trace.columns) if c.endswith("solve.status")]
         self._errors = self.loop.trace.slice("true_error" if "true_error" in names else "error")
         self._state = self.loop.memory.slice("_state_before")
         self._request = [k for k, c in enumerate(self.loop.memory.columns) if "_deformed_last." in c]
@@ -289,6 +299,14 @@ class AskedLoop:
     def inside(self, memory: np.ndarray) -> bool:
         """Return whether no command of the next cycle stands at a limit."""
         return bool(self._inside(self._step(memory)[1][self._command]))
+
+    def solved(self, memory: np.ndarray) -> bool:
+        """Return whether the next cycle has a plan that is solved; a loop without plans has nothing to solve."""
+        return bool((self._step(memory)[1][self._solves] == Status.OK).all())
+
+    def skips(self, memory: np.ndarray) -> bool:
+        """Return whether the next cycle is skipped, with the last command and every memory as it was."""
+        return any(Status(int(one)).skips for one in self._step(memory)[1][self._statuses])
 
     def _inside(self, commands: np.ndarray) -> np.ndarray:
         """Which commands (..., nu) have room to all limits, shape (...)."""
