@@ -192,7 +192,10 @@ INLINE void box_policy(In slope, In matrix, In low, In high, Out v, Truth* free,
     for (i = 0; i < NU; ++i) free[i] = NOT(held[i]);
     if (!EVERY(same)) factorise(matrix, free, lower, pivots);
     if (round == ROUNDS) return;
-    if (EVERY(same)) continue; /* the same system has the same solution */
+    if (EVERY(same)) { /* the same system has the same solution, in every further round */
+      round = ROUNDS - 1;
+      continue;
+    }
     {
       casadi_real target[NU], value = ALL(0);
       for (i = 0; i < NU; ++i) {

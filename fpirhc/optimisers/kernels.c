@@ -33,25 +33,26 @@ INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
   return EITHER(above < high, above, high);
 }
 
-/* c (rows, columns) += a (rows, inner) b (inner, columns) */
+/* c (rows, columns) += a (rows, inner) b (inner, columns). Blocks of four rows are added up in registers. */
 INLINE void multiply(Out restrict c, In restrict a, In restrict b, int rows, int inner, int columns) {
-  int i, j, k;
-  for (j = 0; j + 1 < columns; j += 2) {
-    Out c0 = c + j * rows, c1 = c0 + rows;
-    for (k = 0; k < inner; ++k) {
-      casadi_real f0 = b[j * inner + k], f1 = b[(j + 1) * inner + k];
-      In column = a + k * rows;
-      for (i = 0; i < rows; ++i) {
-        c0[i] += f0 * column[i];
-        c1[i] += f1 * column[i];
-      }
+  int i, j, k, r;
+  NOT_UNROLLED
+  for (j = 0; j < columns; ++j) {
+    Out column = c + j * rows;
+    In factors = b + j * inner;
+    for (i = 0; i + 4 <= rows; i += 4) {
+      casadi_real sum[4];
+      for (r = 0; r < 4; ++r) sum[r] = column[i + r];
+      for (k = 0; k < inner; ++k)
+        for (r = 0; r < 4; ++r) sum[r] += factors[k] * a[k * rows + i + r];
+      for (r = 0; r < 4; ++r) column[i + r] = sum[r];
+    }
+    for (; i < rows; ++i) {
+      casadi_real sum = column[i];
+      for (k = 0; k < inner; ++k) sum += factors[k] * a[k * rows + i];
+      column[i] = sum;
     }
   }
-  for (; j < columns; ++j)
-    for (k = 0; k < inner; ++k) {
-      casadi_real f = b[j * inner + k];
-      for (i = 0; i < rows; ++i) c[j * rows + i] += f * a[k * rows + i];
-    }
 }
 
 INLINE void transpose(Out restrict to, In restrict from, int rows, int columns) {

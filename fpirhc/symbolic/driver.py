@@ -48,7 +48,14 @@ typedef casadi_real Number; /* of a table */
 #define EVERY(m) (m)
 #define EITHER(m, a, b) ((m) ? (a) : (b))
 #define ALL(a) (a)
+#if defined(__GNUC__) && !defined(__clang__)
+#define NOT_UNROLLED _Pragma("GCC unroll 1") /* small matrices stay in memory, so that their columns fill wide registers */
+#else
+#define NOT_UNROLLED
+#endif
 """
+# CasADi lets every argument and result be absent; those of leaves never are.
+_ABSENT = re.compile(r"if \(res\[\d+\]!=0\) |(?<==)(arg\[\d+\])\? (\1\[\d+\]) : 0(?=;)")
 _LARGE_OR_SMALL = re.compile(r"(?<![\w.])\d\.\d{16}e[+-](?:[3-9]\d|\d{3})\b")
 _drivers: dict[str, tuple[Driver, str]] = {}
 _LATEST: Latest[ca.Function] = Latest(16)
@@ -60,7 +67,8 @@ class Driver:
 
     Args:
         text: C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys.
-            ROOM is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw.
+            ROOM is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw; all their
+            arguments and results have an address.
             Truths are written by `WORDS`, so that the same text computes numbers side by side.
         leaves: generated Functions by key.
         constants: preprocessor definitions by name.
@@ -84,6 +92,7 @@ class Driver:
             generator.add(leaf)
         # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
         generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
+        generated = _ABSENT.sub(lambda found: found[2] or "", generated)
         return "\n".join(
             [of_type(generated), WORDS, self.around({name: f"fpirhc_leaf_{name}" for name in self.leaves})]
         )

@@ -7,6 +7,7 @@
 #define OF_TYPE(of_double, of_float) (of_double)
 #define PORTABLE /* the flags say how wide registers are */
 #define INLINE static inline __attribute__((always_inline, unused))
+#define NOT_UNROLLED
 
 typedef double V __attribute__((vector_size(8 * LANES)));
 typedef long long M __attribute__((vector_size(8 * LANES)));
