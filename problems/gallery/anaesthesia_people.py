@@ -71,6 +71,7 @@ CYCLE = 1 / 12  # min
 LARGEST = 400.0  # mg/min, of the pump
 PARTS = 5  # Runge-Kutta steps of a cycle
 SITES = ("C1", "C2", "C3", "Ce")
+KINETICS = (("V1", "V2", "V3"), ("cleared", "fast", "slow"))
 LEAST, MOST = 0.5, 12.0  # mg/l
 
 
@@ -153,8 +154,8 @@ def person(x, u, p):
     pump, own = (tuple(x[f"{who}_{n}"] for n in SITES) for who in ("pump", "own"))
     believed, other = schnider(p), eleveld(p)
     real = [
-        tuple(ca.if_else(p.eleveld > 0.5, e, s) for e, s in zip(*both, strict=True))
-        for both in zip(other, believed, strict=True)
+        tuple(p[f"times_{n}"] * ca.if_else(p.eleveld > 0.5, e, s) for n, e, s in zip(names, *both, strict=True))
+        for names, *both in zip(KINETICS, other, believed, strict=True)
     ]
     infusion = dose(pump, u.target, believed)
     later = {"pump": moved(pump, infusion, believed, KE0), "own": moved(own, infusion, real, p.ke0)}
@@ -166,7 +167,9 @@ def person(x, u, p):
 
 def depth(x, p):
     """The patient's bis."""
-    return x.surgery + p.E0 - p.Emax / (1 + (p.C50 / ca.fmax(x.own_Ce, 1e-6)) ** p.steepness)
+    reached = ca.fmax(x.own_Ce, 1e-6)
+    steepness = p.steepness * ca.if_else(reached > p.C50, p.times_above, 1)
+    return x.surgery + p.E0 - p.Emax / (1 + (p.C50 / reached) ** steepness)
 
 
 def same(value, unit, low, high):
@@ -191,6 +194,8 @@ patient = fp.Plant.discrete(
         "ke0": same(0.309, "1/min", 0.01, 12),
         "C50": same(4.53, "mg/l", 0.5, 20),
         "steepness": same(1.57, "1", 0.5, 10),
+        "times_above": same(1.0, "1", 0.1, 10),  # the steepness beyond C50
+        **{f"times_{n}": same(1.0, "1", 0.02, 50) for names in KINETICS for n in names},
         "surgery": fp.outside(nominal=0.0, unit="1"),
     },
 )
@@ -279,7 +284,8 @@ controllers = {
     "cascade in mg/l": fp.Cascade(pump, slow, paired, units={"bis": unit}),
 }
 headline = ("pump alone", "cascade in mg/l")
-NEEDED = [*(f"exact.{n}" for n in patient.parameters if n != "surgery"), "dead_time.inputs.target"]
+OWN = ("age", "height", "weight", "sex", "eleveld", "E0", "Emax", "ke0", "C50", "steepness")
+NEEDED = [*(f"exact.{n}" for n in OWN), "dead_time.inputs.target"]
 WORDS = {"exact.sex": {"m": 0.0, "f": 1.0}}
 cases = fp.Cases.from_csv("anaesthesia_people.csv", needed=NEEDED, words=WORDS)
 BIS = "plant_state.bis"

@@ -67,7 +67,7 @@ def test_what_the_cost_weighs_is_judged():
 
 
 def test_a_lost_balance_is_no_success():
-    """A law for the cart alone lets both rods fall: the verdict is about them, and both runs say what they left."""
+    """A law for the cart alone lets both rods fall: the verdict is about them, and says of both once what they left."""
     law = fp.Exponential(rate=5.0)
     pair = {"CTC": fp.ComputedTorque(law), "CTC+FPI": fp.ComputedTorque(law, fp.ModelReferenced(fp.Affine(gain=-1.0)))}
     shipped = fp.load_problem("two_mass")
@@ -79,10 +79,7 @@ def test_a_lost_balance_is_no_success():
     assert errors["pos"] < comparison["CTC"].metrics.rms_error["pos"]
     assert first.outcome is Outcome.NOT_COMPARABLE
     assert first.text.startswith("Neither CTC nor CTC+FPI follows the reference: the rms error of th")
-    assert [f.text.partition(":")[0] for f in others[:2]] == [
-        f"{name} leaves the neighbourhood of its reference, for which its gains and its review are made"
-        for name in pair
-    ]
+    assert not [f.text for f in others if " leaves the neighbourhood " in f.text]
 
 
 @pytest.mark.parametrize(

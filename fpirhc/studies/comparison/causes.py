@@ -209,7 +209,13 @@ def effort_cause(entry: Entry) -> str:
 
 
 def plan_cause(plain: Entry, adaptive: Entry) -> str:
-    """Return a sentence where plans that did not converge are a reason; else nothing."""
+    """Return a sentence where plans that did not converge are a reason; else nothing.
+
+    The status compares a step with the tolerance. A single iteration on a plan that is linear ends at the optimum with a large step;
+    where the sampled plans cost what the optimum costs, nothing is said.
+    """
+    if adaptive.optimality is not None and adaptive.optimality.reached:
+        return ""
     before, after = (_share(e, "status", Status.NOT_CONVERGED.name) / max(1, e.run.cycles) for e in (plain, adaptive))
     swings = before < 0.5 * after and _share(adaptive, "at_limit", "") >= _OFTEN  # plans of a run that swings are hard
     if after < MANY or swings:

@@ -168,7 +168,7 @@ def _plans(comparison: Comparison) -> Table:
             Column("max [us]", "max us"),
             Column("first [us]", "first us"),
         ],
-        "gap: cost above the converged optimum, relative; plan: the cycles that plan",
+        "gap: cost above the converged optimum, relative; plan: median of the cycles that plan; p99, max: of all cycles",
     )
     for e in planners:
         gaps = [gap(v, 1) for v in (e.optimality.median, e.optimality.worst)] if e.optimality else ["", ""]

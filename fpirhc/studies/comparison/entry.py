@@ -260,7 +260,7 @@ def _plans_of(problem: Problem, controller: Controller, metrics: Metrics, optima
     if every > 1:
         reasons.append(f"it plans every {every} cycles, while a deformation acts in each of them")
     missed = 1 - metrics.statuses.get(Status.OK.name, 0) / max(sum(metrics.statuses.values()), 1)
-    if missed > 0:
+    if missed > 0 and not (optimality is not None and optimality.reached):
         reasons.append(f"its optimiser did not converge in {in_percent(missed)} of the cycles")
     if optimality is not None and optimality.median > _MUCH:
         reasons.append(f"the cost of its plans is {100 * optimality.median:.2g} % above the converged optimum")

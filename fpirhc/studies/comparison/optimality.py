@@ -52,6 +52,11 @@ class Optimality:
     plans: int
     stuck: tuple[float, ...] = ()
 
+    @property
+    def reached(self) -> bool:
+        """Whether all of these plans are the optimum, to the accuracy with which costs are compared."""
+        return self.worst < _OTHER
+
 
 def measure_optimality(
     problem: Problem, controller: Controller, run: Run, *, compiled: bool = True

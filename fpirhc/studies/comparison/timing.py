@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
@@ -147,17 +148,18 @@ def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | N
     if cycles < 2:
         return None
     memory = stepper.start()
-    taken = np.empty(cycles)
+    taken, skipped = np.empty(cycles), np.empty(cycles)
     times, step = run.time[:cycles], _step_of(stepper)
     states, realised = (part[:cycles] for part in _samples(stepper, run))
     for k in range(cycles):
         begin = time.perf_counter_ns()
         _, memory = step(times[k], states[k], realised[k], memory)
         taken[k] = time.perf_counter_ns() - begin
+        skipped[k] = stepper.trace()[SKIPPED][0]
     micro = taken / 1e3
     later = micro[1:]
     stride = cycles_per_plan(problem.horizon, problem.period) if problem.horizon and "solve" in run.layout else 1
-    plans = micro[stride::stride] if cycles > stride else micro
+    plans = micro[_planned(skipped, stride)] if cycles > stride else micro
     # Whole plan periods: where every other cycle plans, the median of single cycles would be the one or the other by chance.
     whole = later[: later.size - later.size % stride] if later.size >= stride else later
     periods = whole.reshape(-1, stride) if later.size >= stride else whole[:, None]
@@ -168,3 +170,16 @@ def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | N
         first=float(micro[0]),
         planning=float(np.median(plans)),
     )
+
+
+def _planned(skipped: np.ndarray, stride: int) -> np.ndarray:
+    """Which cycles make a new plan, the first one left out: a skipped cycle keeps the memory, and with it the count to the plan.
+
+    Args:
+        skipped: number of skipped cycles up to each.
+        stride: cycles from one plan to the next.
+    """
+    ran = np.diff(skipped, prepend=0) == 0
+    due = ran & ((np.arange(skipped.size) - skipped) % stride == 0)
+    due[0] = False
+    return np.asarray(due)
