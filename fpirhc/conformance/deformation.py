@@ -171,6 +171,35 @@ def secant_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
         )
 
 
+def only_desired_is_fixed(trial: _Trial, generator: np.random.Generator) -> None:
+    """A larger error of the same direction moves the request the same way, so no response but the desired one leaves it alone.
+
+    A map that turns back, or that fades far out, as a wavelet does, has false fixed points: there the iteration rests although
+    the plant does something else.
+    """
+    sizes = trial.amplitude * np.logspace(-6, 6, 2000)
+    for request in (np.zeros(trial.size), *(trial.vector(generator) for _ in range(_TRIALS))):
+        desired, direction = trial.vector(generator), generator.normal(size=trial.size)
+        responses = desired[:, None] + direction[:, None] / np.linalg.norm(direction) * sizes
+        moved = np.asarray(trial.scalar_function(request, responses, desired, trial.layout.start())[0].full())
+        steps = moved - request[:, None]
+        lengths = np.linalg.norm(steps, axis=0)
+        begin = int(
+            np.argmax(lengths > _SEEN * trial.amplitude)
+        )  # below it a step drowns in the rounding of the request
+        along = steps[:, begin] @ steps[:, begin:] / lengths[begin]
+        lost = along <= _FADES * np.maximum.accumulate(lengths[begin:])
+        where = sizes[begin + int(np.argmax(lost))]
+        hold(
+            not lost.any(),
+            f"an error of {where:.3g} does not move the request the way a smaller one does, so a false fixed point is near: use a "
+            "step that grows with the error or saturates",
+        )
+
+
+_SEEN, _FADES = 1e-9, 1e-6  # of the amplitude; of the longest step that a smaller error causes
+
+
 def step_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
     """No error moves the request by more than largest_step()."""
     bound = trial.deformation.largest_step()
@@ -213,6 +242,7 @@ LAWS = (
     gain_can_be_set,
     contraction_is_predicted,
     secant_is_bounded,
+    only_desired_is_fixed,
     step_is_bounded,
     graphs_agree,
     nan_shows,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -32,8 +33,9 @@ class Reality(Checked):
         plant: with the model's inputs, and a coordinate or an output of the same name and unit for what is measured, controlled or
             judged of the model; without an observer that is all of it. Its exact parameters act; the approximate ones are not used,
             unless it is the model of an `ExactModel`.
-        start: first values of states that the model does not have. Those that are not named settle: their rates are zero while
-            the model's states and the inputs before the first cycle are held.
+        start: first values of states that the model does not have. Of those that are not named, the one on which a derivative of
+            the model's state depends starts where this derivative is the model's, as a speed does. The others settle: their rates
+            are zero while the model's states and the inputs before the first cycle are held.
         integrator: of its motion; None: the problem's.
         seen: coordinate or output of the model -> coordinate of the reality that is measured in its place, such as the output of
             a slow sensor. Errors are judged at the coordinate of the same name where there is one.
@@ -169,14 +171,16 @@ class Reality(Checked):
             command: inputs before the first cycle, shape (nu,).
 
         Raises:
-            InvalidProblem: states that are not named in `start` and have no equilibrium.
+            InvalidProblem: states that are not named in `start` and have no equilibrium, or a derivative of the model's state that
+                depends on several of them.
         """
         elements = self.plant.state.elements
         shared = {elements[there]: start[own] for own, there in self.shared(model).items()}
         known = {**shared, **self.start}
         first = np.array([float(known.get(e, 0.0)) for e in elements])
         free = [k for k, e in enumerate(elements) if e not in known]
-        at_rest = settled(self.plant, first, command, self.plant.exact, free) if free else first
+        tied = self._tied(model, start, free)
+        at_rest = settled(self.plant, first, command, self.plant.exact, free, tied) if free else first
         if at_rest is None:
             missing = ", ".join(elements[k] for k in free)
             raise InvalidProblem(
@@ -185,6 +189,31 @@ class Reality(Checked):
             )
         self._check_shown_start(model, start, at_rest, command)
         return at_rest
+
+    def _tied(self, model: Plant, start: np.ndarray, free: Sequence[int]) -> dict[int, Tied]:
+        """Return what the derivatives of the model's start say of states that are no derivatives here, by place of the state.
+
+        Args:
+            model: of the problem.
+            start: first state of the model, shape (nx,).
+            free: places of the states that nothing else gives.
+        """
+        shared, elements = self.shared(model), self.plant.state.elements
+        tied: dict[int, Tied] = {}
+        for k, e in enumerate(model.state.elements):
+            if k in shared or not e.endswith("'") or self.true_name(e.rstrip("'")) not in self.plant.coordinates:
+                continue
+            value = self.function([e])
+            x, u, p = self.plant.symbols()
+            on = set(ca.jacobian_sparsity(value(x, u, p, 0), x).get_triplet()[1]) & set(free)
+            if len(on) > 1:
+                names = ", ".join(elements[i] for i in sorted(on))
+                raise InvalidProblem(
+                    f"reality: {e} is {start[k]:.4g} at the start of the model and depends on its states {names}; give the first "
+                    f"values of all but one: Reality(start={{'{elements[min(on)]}': ...}})"
+                )
+            tied |= {i: (value, float(start[k])) for i in on}
+        return tied
 
     def _check_shown_start(self, model: Plant, start: np.ndarray, first: np.ndarray, command: np.ndarray) -> None:
         """Raise if outputs stand for the model's coordinates, no start is stated, and they start elsewhere than the model."""
@@ -365,11 +394,17 @@ def _check_expression(plant: Plant, seen: Mapping[str, str], model: Plant, name:
         )
 
 
+Tied = tuple[ca.Function, float]  # (state, input, parameters, forcing) -> a quantity, and its value at the start
 _REST = 1e-8  # largest rate of a state at rest, as a share of its rate at the first guess
 
 
 def settled(
-    plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, free: Sequence[int]
+    plant: Plant,
+    state: np.ndarray,
+    command: np.ndarray,
+    parameters: np.ndarray,
+    free: Sequence[int],
+    tied: Mapping[int, Tied] = MappingProxyType({}),
 ) -> np.ndarray | None:
     """Return the state in which the rates of its free entries are zero; None where there is no such state.
 
@@ -381,6 +416,7 @@ def settled(
         command: held input, shape (nu,).
         parameters: shape (np,).
         free: places of the entries that settle.
+        tied: by place of a free entry, a quantity that has a value there, in place of its rate.
     """
     from fpirhc.symbolic.roots import Equations  # of a start that must settle alone
 
@@ -389,9 +425,10 @@ def settled(
     x = ca.SX(held)
     moving = ca.SX.sym("moving", len(places))
     x[places] = moving
-    root = Equations(moving, [held, u, p], plant.equations.rate(x, u, p)[places]).root(
-        state[places], state, command, parameters
-    )
+    left = plant.equations.rate(x, u, p)
+    for place, (quantity, value) in tied.items():
+        left[place] = quantity(x, u, p, 0) - value
+    root = Equations(moving, [held, u, p], left[places]).root(state[places], state, command, parameters)
     if root is None or root.left > _REST * max(1.0, root.first):
         return None
     at = np.array(state, dtype=float)

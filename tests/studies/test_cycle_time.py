@@ -11,7 +11,7 @@ from fpirhc.task.problem import cycles_per_plan
 
 
 def test_a_skipped_sample_moves_the_next_plans_by_one_cycle():
-    """A current that nobody knows of steps in: the gate doubts the response to it once, and plans come a cycle later from then on."""
+    """An unknown current steps in: the gate doubts the response to it once, and from then on plans come a cycle later."""
     task = fp.load_problem("hodgkin_huxley")
     controller, problem = task.controllers["RHC"], task.problem
     assert problem.horizon is not None

@@ -1,4 +1,4 @@
-"""Twelve deformations that break the contract, each in one thing, and the right one that they are made from."""
+"""Fifteen deformations that break the contract, each in one thing, and the right one that they are made from."""
 
 # ruff: noqa: ARG002 - arguments are those of the contract
 
@@ -88,6 +88,32 @@ class LouderFarOut(Softsign):
     def step(self, request, response, desired, memory):
         step = super().step(request, response, desired, memory)[0] - request
         return request + step * (1 + 0.2 * ca.tanh(ca.sumsqr(request) / 1e6)), {}
+
+
+class Wavelet(Softsign):
+    """Turns back for large errors: r+ = r - gain e (1 - s^2) exp(-s^2 / 2), s = |e| / size, which rests where |e| = size."""
+
+    def step(self, request, response, desired, memory):
+        error = response - desired
+        share = ca.sumsqr(error) / self.size**2
+        return request - self.gain * error * (1 - share) * ca.exp(-share / 2), {}
+
+
+class Fades(Softsign):
+    """Takes a response far away for an outlier: the slope of a Gaussian bell."""
+
+    def step(self, request, response, desired, memory):
+        error = response - desired
+        return request - self.gain * error * ca.exp(-ca.sumsqr(error) / self.size**2 / 2), {}
+
+
+class Rests(Softsign):
+    """Has a second fixed point a little beyond the first: r+ = r - gain e (1 - 1.5 bump), which turns back from 2 to 4 sizes."""
+
+    def step(self, request, response, desired, memory):
+        step = super().step(request, response, desired, memory)[0] - request
+        distance = ca.sqrt(ca.sumsqr(response - desired) / self.size**2 + 1e-12)
+        return request + step * (1 - 1.5 * ca.exp(-((distance - 3) ** 2) * 4)), {}
 
 
 class GivesAnotherGain(Softsign):

@@ -211,8 +211,8 @@ def effort_cause(entry: Entry) -> str:
 def plan_cause(plain: Entry, adaptive: Entry) -> str:
     """Return a sentence where plans that did not converge are a reason; else nothing.
 
-    The status compares a step with the tolerance. A single iteration on a plan that is linear ends at the optimum with a large step;
-    where the sampled plans cost what the optimum costs, nothing is said.
+    The status compares a step with the tolerance. A single iteration on a linear plan ends at the optimum with a large
+    step. Where the sampled plans cost what the optimum costs, nothing is said.
     """
     if adaptive.optimality is not None and adaptive.optimality.reached:
         return ""
