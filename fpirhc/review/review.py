@@ -16,7 +16,7 @@ from fpirhc.review.answer import Answer, Review, Verdict, decided
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.prediction import NominalRuns
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, asked, known_questions
-from fpirhc.review.questions.convergence import CONVERGES
+from fpirhc.review.questions.convergence import converges
 from fpirhc.simulation.model_as_plant import behind_stated_lag
 from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.task.problem import Problem
@@ -60,10 +60,7 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     ready = resolved(grid.problem, controller)
     general = _present(asked(question, grid) for question in known_questions(ProblemQuestion) if question.doubts)
     case = Case(grid, ready, NominalRuns(grid.problem), general)
-    [verdict] = (question for question in known_questions(ControllerQuestion) if question.text == CONVERGES)
-    answer = verdict.ask(case)
-    assert answer is not None
-    return answer
+    return converges(grid, ready, case.loops, case.doubts)
 
 
 def _of(grid: ReviewGrid, controller: Controller, general: tuple[Answer, ...], runs: NominalRuns) -> tuple[Answer, ...]:

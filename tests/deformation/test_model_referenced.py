@@ -19,7 +19,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
 from fpirhc.problem_files.shipped import shipped_problems
-from fpirhc.review.questions.right_model import recommended_form, right_form
+from fpirhc.review.questions.right_model import Tried, recommended_form, right_form
 from fpirhc.symbolic.block import Block
 
 LAW = fp.Exponential(rate=6.0)
@@ -363,12 +363,17 @@ def test_review_says_which_form():
     ):
 
         def error_of(form, own=own, other=other):
-            return own if form == affine(0.5) else other, "q1", "1 m"
+            share = own if form == affine(0.5) else other
+            return {"q1": Tried(share, "1 m")} if not math.isnan(share) else {}
 
         ran = right_form(TWO_MASS.problem, affine(0.5), harmless, error_of)
         assert ran.verdict == verdict
         told = "the rms error of q1 is 1 m as it is, 1 m with the model-referenced form" in ran.evidence
         assert told == math.isfinite(own)
+    two = {"q1": Tried(1.0, "1 m"), "q2": Tried(3.0, "3 m")}, {"q1": Tried(1.1, "1.1 m"), "q2": Tried(2.0, "2 m")}
+    worse = right_form(TWO_MASS.problem, affine(0.5), harmless, lambda form: two[form != affine(0.5)])
+    assert "of q2 is 3 m as it is, 2 m with" in worse.evidence  # that of q1 would speak against the advice
+    assert worse.change.startswith("Try")
     decided = right_form(TWO_MASS.problem, affine(0.5), lambda form: "it loses" if form != affine(0.5) else "")
     assert decided.verdict == "yes"
     assert decided.evidence.endswith("; but here it loses, and the form in use does no harm")

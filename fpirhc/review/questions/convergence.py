@@ -16,6 +16,7 @@ from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.maps import growth_of, step_of
 from fpirhc.review.answer import Answer, Verdict, duration, per_cycle
+from fpirhc.review.by_run import by_run
 from fpirhc.review.grid import ReviewGrid, StateSlopes, is_late, state_slopes
 from fpirhc.review.loops import (
     LITTLE,
@@ -224,6 +225,13 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     return Answer(CONVERGES, Verdict.YES, text, "", numbers)
 
 
+def _converges(case: Case) -> Answer:
+    """The verdict; where there is no linear loop, runs decide."""
+    if not case.loops.loops:
+        return by_run(case, CONVERGES, f"no linear loop: {case.loops.reason}")
+    return converges(case.grid, case.controller, case.loops, case.doubts)
+
+
 def _changing(deformation: Deformation) -> str:
     """The name of the innermost part that changes on line."""
     while deformation.inner is not None and not deformation.inner.iteration.constant:
@@ -319,9 +327,7 @@ def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
 
 
 QUESTIONS = (
-    ControllerQuestion(
-        lambda case: converges(case.grid, case.controller, case.loops, case.doubts), CONVERGES, order=1, of_targets=True
-    ),
+    ControllerQuestion(_converges, CONVERGES, order=1, of_targets=True),
     ControllerQuestion(box_converges, BOX, order=2, of_targets=True),
     ControllerQuestion(_rates, RATES, order=20, adaptive=False),
     ControllerQuestion(_zero_dynamics, ZERO_DYNAMICS, order=21, adaptive=False),

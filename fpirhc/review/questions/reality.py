@@ -22,9 +22,9 @@ from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.by_run import by_run
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Points, thinned, usable
-from fpirhc.review.prediction import TRIED
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.speed import law_of
 from fpirhc.sensing.base import response_names
@@ -267,7 +267,7 @@ def real_pair_converges(case: Case) -> Answer | None:
         adapted = max(one.radius for one in real_loops(case.grid, case.controller))
         bare = max(one.radius for one in real_loops(case.grid, without_deformation(case.controller)))
     except (FpirhcError, np.linalg.LinAlgError) as error:
-        return _by_run(case, f"no linear loop of the real pair: {error}")
+        return by_run(case, LOOP, f"no linear loop of the real pair: {error}")
     text = f"the slowest or fastest growing mode is multiplied by {adapted:.6g} per cycle, without adaptation by {bare:.6g}"
     numbers = {"radius": adapted, "bare_radius": bare}
     if adapted < 1:
@@ -278,19 +278,6 @@ def real_pair_converges(case: Case) -> Answer | None:
     if bare >= 1:
         change = "Lower the rate of the tracking law: the loop does not converge without adaptation either."
     return Answer(LOOP, Verdict.UNKNOWN if adapted < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
-
-
-def _by_run(case: Case, reason: str) -> Answer:
-    """The answer where there is no linear loop: a run with adaptation and one without."""
-    trial = case.trial(case.controller.deformation)
-    pair = None if isinstance(trial, str) else trial[0]
-    if pair is None:
-        return Answer(LOOP, Verdict.UNKNOWN, reason)
-    text = f"{reason}; in a run of at most {TRIED} cycles {pair.sentence}"
-    if pair.lower:
-        return Answer(LOOP, Verdict.YES, text)
-    change = "Lower the gain, use another form, or leave the deformation out."
-    return Answer(LOOP, Verdict.NO if pair.fails else Verdict.UNKNOWN, text, change if pair.fails else "")
 
 
 def plain_pair_converges(case: Case) -> Answer | None:

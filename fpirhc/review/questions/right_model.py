@@ -9,9 +9,10 @@ more than they should.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +24,9 @@ from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.by_run import by_run
 from fpirhc.review.prediction import TRIED, NominalRun, ResponseErrors, errors_without_adaptation, response_errors
-from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
+from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.simulation.model_as_plant import with_believed_way
 from fpirhc.simulation.trials import SLIGHT, ErrorPair
 from fpirhc.summary import beside
@@ -61,7 +63,7 @@ def right_form(
     problem: Problem,
     deformation: Deformation,
     harm: Callable[[Deformation], str],
-    error: Callable[[Deformation], tuple[float, str, str]] | None = None,
+    error: Callable[[Deformation], Mapping[str, Tried]] | None = None,
 ) -> Answer:
     """Whether the form in use is the recommended one, or runs show that it is as good; advice, so never no.
 
@@ -69,7 +71,7 @@ def right_form(
         problem: the problem.
         deformation: in use.
         harm: what runs show against a deformation; empty where it does no harm.
-        error: relative error of a run with a deformation (NaN without one), a coordinate, its error as text; None: nothing is run.
+        error: errors of a run with a deformation by coordinate, none without a run; None: nothing is run.
     """
     form, why = recommended_form(problem)
     used = form_of(deformation)
@@ -86,23 +88,33 @@ def right_form(
     if proposed is None or error is None:
         change = "Try another form." if proposed is None else f"Try {as_written(proposed)}."
         return Answer(FORM, Verdict.UNKNOWN, text, change)
-    (own, of, size), (other, _, other_size) = error(deformation), error(proposed)
-    if math.isfinite(own + other):
-        text += f"; in a run of at most {TRIED} cycles the rms error of {of} is {size} as it is, {other_size} with the {form} form"
-    if math.isfinite(own) and own <= SIMILAR * other:
+    own, other = error(deformation), error(proposed)
+    sizes = [math.hypot(*(one.share for one in tried.values())) if tried else math.nan for tried in (own, other)]
+    if math.isfinite(sum(sizes)):
+        moved = {name: (own[name].share - other[name].share) * (sizes[0] - sizes[1]) for name in own}
+        of = max(moved, key=lambda name: moved[name])  # a coordinate that says what all of them together say
+        as_it_is = f"the rms error of {of} is {own[of].size} as it is, {other[of].size} with the {form} form"
+        text += f"; in a run of at most {TRIED} cycles {as_it_is}"
+    if math.isfinite(sizes[0]) and sizes[0] <= SIMILAR * sizes[1]:
         return Answer(FORM, Verdict.YES, text)
     return Answer(FORM, Verdict.UNKNOWN, text, f"Try {as_written(proposed)}.")
 
 
-def _tried_error(case: Case, deformation: Deformation) -> tuple[float, str, str]:
-    """The error of a run on the plant, all coordinates together as shares of their ranges, and that of the first one as text."""
+class Tried(NamedTuple):
+    """The error of a coordinate in a run: as a share of its range, and as text with its unit."""
+
+    share: float
+    size: str
+
+
+def _tried_error(case: Case, deformation: Deformation) -> Mapping[str, Tried]:
+    """The errors of a run on the plant by coordinate; none without a run."""
     trial = case.trial(deformation)
     pair = None if isinstance(trial, str) else trial[0]
     if pair is None:
-        return math.nan, "", ""
-    shares = [e / max(pair.ranges[n], 1e-300) for n, e in pair.adapted.items()]
-    name, first = next(iter(pair.adapted.items()))
-    return math.hypot(*shares), name, f"{first:.3g}{pair.unit(name)}"
+        return {}
+    every = pair.adapted.items()
+    return {n: Tried(e / max(pair.ranges[n], 1e-300), f"{e:.3g}{pair.unit(n)}") for n, e in every}
 
 
 PLAIN, INCREMENT, REFERENCED = "plain", "increment", "model-referenced"
@@ -144,7 +156,7 @@ def pays(case: Case) -> Answer:
     """Return the rms response errors without adaptation, with it, and with it on a right model, where every change does harm."""
     nominal = case.nominal
     if isinstance(nominal, str):
-        return _by_runs(case, nominal)
+        return by_run(case, PAYS, nominal)
     without = rms(nominal, errors_without_adaptation(nominal))
     adapted = rms(nominal, response_errors(nominal))
     null = rms(nominal, response_errors(nominal, exact=nominal.believed))
@@ -162,23 +174,6 @@ def pays(case: Case) -> Answer:
         change = "Adaptation would do harm with a slightly better model: use a form that leaves a right model alone."
         return Answer(PAYS, Verdict.UNKNOWN, text, change, numbers)
     return Answer(PAYS, Verdict.YES, text, "", numbers)
-
-
-def _by_runs(case: Case, reason: str) -> Answer:
-    """The answer where nothing predicts it: the tracking errors of two runs on the plant decide."""
-    trial = case.trial(case.controller.deformation)
-    pair = None if isinstance(trial, str) else trial[0]
-    if pair is None:
-        why = trial if isinstance(trial, str) else "the plant is outside"
-        return Answer(PAYS, Verdict.UNKNOWN, f"{reason}; and no run, because {why}")
-    numbers = {"without": pair.without[pair.worst], "with": pair.adapted[pair.worst]}
-    text = f"in a run of at most {TRIED} cycles {pair.sentence} ({reason})"
-    if pair.lower:
-        return Answer(PAYS, Verdict.YES, text, "", numbers)
-    if pair.fails and not case.controller.learns:
-        change = "Lower the gain, use another form, or leave the deformation out."
-        return Answer(PAYS, Verdict.NO, text, SEE_CONVERGENCE if case.diverges else change, numbers)
-    return Answer(PAYS, Verdict.UNKNOWN, text, "Run it for longer and compare.", numbers)
 
 
 def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer:

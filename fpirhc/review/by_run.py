@@ -1,0 +1,39 @@
+"""An answer where nothing else gives one: two runs on the plant decide, without adaptation and with it."""
+
+from __future__ import annotations
+
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.prediction import TRIED
+from fpirhc.review.question import SEE_CONVERGENCE, Case
+
+_LEAVE = "Lower the gain, use another form, or leave the deformation out."
+_FREE = "Run it where the commands are free."
+
+
+def by_run(case: Case, question: str, reason: str) -> Answer:
+    """Return the answer to a question whose yes is a smaller tracking error with adaptation.
+
+    A no is a clearly larger error. A controller that learns may still learn, so its short run is no reason for a no; that it does
+    not pay is one only where the run is the whole one.
+
+    Args:
+        case: the controller.
+        question: in the words of a reader.
+        reason: why nothing else answers it.
+    """
+    trial = case.trial(case.controller.deformation)
+    pair = None if isinstance(trial, str) else trial[0]
+    if pair is None:
+        why = trial if isinstance(trial, str) else "the plant is outside"
+        return Answer(question, Verdict.UNKNOWN, f"{reason}; and no run, because {why}")
+    whole, learns = case.problem.cycles <= TRIED, case.controller.learns
+    numbers = {"without": pair.without[pair.worst], "with": pair.adapted[pair.worst]}
+    text = f"in {'the whole run' if whole else f'a run of at most {TRIED} cycles'} {pair.sentence} ({reason})"
+    if pair.stuck:
+        return Answer(question, Verdict.UNKNOWN, f"{text}; {pair.stuck}", _FREE, numbers)
+    if pair.lower:
+        return Answer(question, Verdict.YES, text, "", numbers)
+    if pair.fails and (whole or not learns):
+        return Answer(question, Verdict.NO, text, SEE_CONVERGENCE if case.diverges else _LEAVE, numbers)
+    longer = "Compare it over several scenarios." if whole else "Run it for longer and compare."
+    return Answer(question, Verdict.UNKNOWN, text, longer, numbers)
