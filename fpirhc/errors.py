@@ -129,6 +129,10 @@ class CompileError(FpirhcError, RuntimeError):
     """The C compiler failed on generated code."""
 
 
+class DeviceFailed(FpirhcError, RuntimeError):
+    """A device, such as a graphics processor, that did not finish what it was given."""
+
+
 class WorkerDied(FpirhcError, RuntimeError):
     """Worker processes died repeatedly."""
 

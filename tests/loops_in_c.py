@@ -115,7 +115,7 @@ def within_its_arrays(pair_of: Pair, calls: Iterator[tuple[np.ndarray, ...]]) ->
 
 def in_lanes(graph: ca.Function, calls: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]]:
     """Results of calls that run side by side, as many as there are lanes at a time."""
-    (own, *drivers), callee = written_in_lanes(graph)
+    (own, *drivers), [callee] = written_in_lanes(graph)
     sizes = [[graph.numel_in(k) for k in range(graph.n_in())], [graph.numel_out(k) for k in range(graph.n_out())]]
     ends = [np.cumsum([0, *some]) for some in sizes]
     rows = [", ".join(f"{base} + {at}" for at in end[:-1]) for base, end in zip(("given", "made"), ends, strict=True)]

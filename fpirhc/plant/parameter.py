@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import Annotated
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import JudgedByOwner, Range, finite_number, real_number
+from fpirhc.symbolic.live import copied
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def with_exact_values(parameters: Mapping[str, Parameter], exact: Iterable[float
     """
     # A spread is around the value of the problem file, and not around another plant's.
     others = {
-        name: replace(one, exact=float(value), spread=None)
+        name: copied(one, {"exact": float(value), "spread": None})
         for (name, one), value in zip(parameters.items(), exact, strict=True)
     }
     mistakes = Mistakes("plant")

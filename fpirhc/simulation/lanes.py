@@ -6,30 +6,30 @@ Theory: docs/theory-plants.md, "Many plants side by side".
 from __future__ import annotations
 
 import ctypes
-import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
 
 import numpy as np
 
 from fpirhc.errors import CompileError, InvalidShape, InvalidValue, NoCode
-from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.metrics.base import measured_errors
+from fpirhc.simulation.metrics import known_metrics
+from fpirhc.simulation.metrics.base import Metric, first_measured, measured_errors
 from fpirhc.simulation.opencl import loaded_kernel
-from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.simulate import Simulator, run_tables
+from fpirhc.simulation.sums import Sums, Values
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.dataflow import SIDE_BY_SIDE, Callee
+from fpirhc.symbolic.dataflow import Callee
 from fpirhc.symbolic.lanes import lanes_library, written_for_devices, written_in_lanes
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.task.problem import Problem
 
 _GROUPS, _ITEMS = 256, 65_536  # of lanes in one call, and of a device
+_ROOM = 2**27  # bytes of tables and of what is kept, beyond which runs take turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,22 +77,17 @@ def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str 
         raise InvalidValue(
             f"run_many: parameters of plant {int(np.argmin(np.isfinite(exact).all(axis=1)))} are not finite"
         )
-    why = _why_no_lanes(ready, device)
-    library: _Library | None = None
-    if not why:
-        try:
-            library = _LIBRARIES.of((ready,), (device,), lambda: _built(ready, device))
-        except (CompileError, NoCode) as error:
-            why = str(error)
-    judged, problem = ready.loop.trace["error"].elements, ready.problem
-    sums, largest = (np.full((len(exact), len(judged)), np.nan) for _ in range(2))
-    counts, left = np.zeros((len(exact), len(Status))), np.ones(len(exact), dtype=bool)
-    if library is not None:
-        sums, largest, counts, left = library.results(ready, exact, seed)
-        counts[:, Status.OK] = problem.cycles - counts[:, Status.OK + 1 :].sum(axis=1)
-    rms, stops = np.sqrt(sums / (problem.cycles - _first(problem))), {}
+    judged = ready.loop.trace["error"].elements
+    lanes = _LANES.of((ready,), (device,), lambda: Lanes(ready, _errors_alone(), device))
+    rms, largest = (np.full((len(exact), len(judged)), np.nan) for _ in range(2))
+    counts, left = np.zeros((len(exact), len(Status)), dtype=int), np.ones(len(exact), dtype=bool)
+    if not lanes.why:
+        columns, left = lanes.of_parameters(exact, seed)
+        rms, largest = (np.column_stack([columns[m][n] for n in judged]) for m in ("rms_error", "max_error"))
+        counts = np.column_stack([np.ma.filled(columns["status"][one.name], 0) for one in Status])
+    stops = {}
     for number in map(int, np.flatnonzero(left)):
-        variant = problem.with_exact(exact[number])
+        variant = ready.problem.with_exact(exact[number])
         run = ready.run(seed=seed, variant=variant)
         errors = measured_errors(variant, run)
         rms[number], largest[number] = np.sqrt(np.mean(errors**2, axis=0)), np.max(np.abs(errors), axis=0)
@@ -100,19 +95,114 @@ def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str 
         if run.stop is not None:
             stops[number] = run.stop
     by_name = (dict(zip(judged, columns.T.copy(), strict=True)) for columns in (rms, largest))
-    statuses = {one.name: counts[:, one].astype(int) for one in Status if counts[:, one].any()}
-    return ManyRuns(next(by_name), next(by_name), statuses, stops, 0 if library is None else library.lanes, why)
+    statuses = {one.name: counts[:, one].copy() for one in Status if counts[:, one].any()}
+    return ManyRuns(next(by_name), next(by_name), statuses, stops, lanes.width, lanes.why)
 
 
-def _first(problem: Problem) -> int:
-    """The first cycle that is measured."""
-    return max(0, math.ceil(problem.measure_from / problem.period - 0.5))
+def _errors_alone() -> tuple[Metric, ...]:
+    return tuple(m for m in known_metrics() if m.name in ("rms_error", "max_error", "status"))
+
+
+@dataclass(frozen=True, eq=False)
+class OneRun:
+    """One of several runs of a loop.
+
+    Args:
+        problem: the problem of the loop with the numbers of the run.
+        memory: first one of the loop, see `Simulator.first_memory`.
+        seed: of the noise.
+    """
+
+    problem: Problem
+    memory: np.ndarray
+    seed: int
+
+
+class Lanes:
+    """The runs of one loop side by side, measured without logs.
+
+    Args:
+        ready: the loop.
+        metrics: to measure.
+        device: as in `run_many`.
+        why: somebody else knows why there are none.
+
+    Attributes:
+        why: there are no lanes, because of this; empty where there are some.
+
+    Raises:
+        InvalidName, NotInstalled: no such device.
+    """
+
+    def __init__(
+        self, ready: Simulator, metrics: Sequence[Metric], device: str | None = None, *, why: str = ""
+    ) -> None:
+        self._ready, self.why = ready, why or _why_no_lanes(ready, device)
+        if not self.why:
+            try:
+                self._sums = Sums(ready.loop.trace, tuple(metrics), ready.problem)
+                self._library = _built(ready, self._sums, device)
+            except (CompileError, NoCode) as error:
+                self.why = str(error)
+
+    @property
+    def width(self) -> int:
+        """Runs in one register; 0 without lanes."""
+        return 0 if self.why else self._library.lanes
+
+    def values(self, runs: Sequence[OneRun]) -> list[Values | None]:
+        """Return the metrics of some runs; None for one that the ordinary loop has to run: it ends early, or nothing is summed up.
+
+        Every run has its own noise, that which the ordinary loop draws for its seed. Runs of one call have one duration.
+        """
+        first, kept = runs[0].problem, self._sums.kept.size
+        try:
+            begun = np.array([self._sums.start(one.problem) for one in runs])
+        except NoCode:
+            return [None] * len(runs)
+        size = sum(table.shape[1] for table in run_tables(first, runs[0].seed, 1)) + kept
+        most = max(self._library.lanes, _ROOM // (8 * first.cycles * max(size, 1)))
+        result: list[Values | None] = []
+        for at in range(0, len(runs), most):
+            some = runs[at : at + most]
+            reads = np.array([_tables(one.problem, one.seed) for one in some])
+            memories = np.array([one.memory for one in some])
+            sums, bad, log = self._library.results(first, memories, begun[at : at + most], reads, kept)
+            found = self._sums.values(first, sums, log, some[0].seed)
+            result += [None if ended else value for ended, value in zip(bad, found, strict=True)]
+        return result
+
+    def of_parameters(self, exact: np.ndarray, seed: int) -> tuple[dict[str, Mapping[str, np.ndarray]], np.ndarray]:
+        """Return the metrics of plants with one noise, by name and element, and which ones the ordinary loop has to run.
+
+        Args:
+            exact: parameters, shape (plants, parameters).
+            seed: of the noise.
+        """
+        ready = self._ready
+        memories, reads = _starts(ready, exact), _tables(ready.problem, seed)
+        begun = np.broadcast_to(self._begun, (len(exact), self._sums.size))
+        sums, bad, _ = self._library.results(ready.problem, memories, begun, reads, 0)
+        columns, outside = self._sums.columns(ready.problem, sums)
+        return columns, bad | outside
+
+    @cached_property
+    def _begun(self) -> np.ndarray:
+        return self._sums.start(self._ready.problem)
+
+
+_LANES: Latest[Lanes] = Latest(4)
+
+
+def _tables(problem: Problem, seed: int) -> np.ndarray:
+    """What the cycles read, shape (cycles, entries)."""
+    return np.hstack([*run_tables(problem, seed, problem.cycles), np.empty((problem.cycles, 0))])
 
 
 def _why_no_lanes(ready: Simulator, device: str | None) -> str:
     if not ready.problem.equations_known:
         return "a plant outside is run one after the other"
-    if ready.problem.cycles <= _first(ready.problem):
+    if ready.problem.cycles <= first_measured(ready.problem):
         return "no cycle is measured"
     return "" if device is not None or find_compiler() else "there is no C compiler"
 
@@ -122,7 +212,8 @@ class _Library:
     """The compiled loop over lanes.
 
     Args:
-        run: function of (groups, cycles, first that is measured, first memories, what cycles read, results).
+        run: function of (groups, cycles, first that is measured, whether tables are of lanes, first memories, first sums, tables,
+            results, what is kept).
         lanes: plants of a group.
         batch: groups of a call.
         threads: calls at a time.
@@ -133,41 +224,59 @@ class _Library:
     batch: int
     threads: int
 
-    def results(self, ready: Simulator, exact: np.ndarray, seed: int) -> tuple[np.ndarray, ...]:
-        """Sums of squares and largest sizes of the errors, and cycles by status, a row per plant; which are to be run again."""
-        problem, loop = ready.problem, ready.loop
-        tables = run_tables(problem, seed, problem.cycles)
-        reads = np.ascontiguousarray(np.hstack([*tables, np.empty((problem.cycles, 0))]))
-        starts, count = _starts(ready, exact), loop.trace["error"].size
-        groups = -(-len(exact) // self.lanes)
-        padded = starts[np.minimum(np.arange(groups * self.lanes), len(exact) - 1)]
-        memory = np.ascontiguousarray(padded.reshape(groups, self.lanes, -1).transpose(0, 2, 1))
-        sums_of_all = np.ones((groups, 2 * count + len(Status) + 1, self.lanes))
+    def results(
+        self, problem: Problem, memories: np.ndarray, begun: np.ndarray, reads: np.ndarray, kept: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the last sums, which runs ended, and what was kept, shape (runs, cycles, kept).
 
-        def call(begin: int) -> None:
-            end = min(begin + self.batch, groups)
-            self.run(end - begin, problem.cycles, _first(problem), memory[begin:end], reads, sums_of_all[begin:end])
+        Args:
+            problem: of the runs.
+            memories: first ones, shape (runs, memory).
+            begun: first sums, shape (runs, sums).
+            reads: what cycles read, shape (cycles, entries), or (runs, cycles, entries).
+            kept: numbers that are kept of every cycle.
+        """
+        count, cycles, own = len(memories), problem.cycles, reads.ndim > 2
+        groups = -(-count // self.lanes)
+        batch = min(self.batch, max(1, -(-groups // self.threads)))
+        starts, sums = self._side_by_side(memories), self._side_by_side(begun)
+        tables = self._side_by_side(reads) if own else np.ascontiguousarray(reads)
+        results = np.empty((groups, begun.shape[1] + 1, self.lanes))
+        log = np.empty((groups, cycles, kept, self.lanes))
+
+        def call(at: int) -> None:
+            some = slice(at, min(at + batch, groups))
+            given = starts[some], sums[some], tables[some] if own else tables
+            numbers = some.stop - at, cycles, first_measured(problem), int(own)
+            if not self.run(*numbers, *given, results[some], log[some]):
+                raise MemoryError
 
         with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(call, range(0, groups, self.batch)))
-        rows = sums_of_all.transpose(0, 2, 1).reshape(groups * self.lanes, -1)[: len(exact)]
-        sums, sizes, counts, left = np.split(rows, np.cumsum([count, count, len(Status)]), axis=1)
-        return sums.copy(), sizes.copy(), counts.copy(), left.ravel() != 0
+            list(pool.map(call, range(0, groups, batch)))
+        rows = results.transpose(0, 2, 1).reshape(groups * self.lanes, -1)[:count]
+        logs = np.moveaxis(log, -1, 1).reshape(groups * self.lanes, cycles, kept)[:count]
+        return rows[:, :-1], rows[:, -1] != 0, logs
+
+    def _side_by_side(self, rows: np.ndarray) -> np.ndarray:
+        """Numbers of runs, those of a group next to each other; the last run fills the last group."""
+        groups = -(-len(rows) // self.lanes)
+        padded = rows[np.minimum(np.arange(groups * self.lanes), len(rows) - 1)]
+        return np.ascontiguousarray(np.moveaxis(padded.reshape(groups, self.lanes, *rows.shape[1:]), 1, -1))
 
 
 def _starts(ready: Simulator, exact: np.ndarray) -> np.ndarray:
     """First memories (plants, memory): one and the same but for the parameters, unless the start depends on these."""
     place, ends = ready.loop.memory.slice("_exact"), [exact[0], exact[-1]]
-    first, last = (start_memory(ready.loop, ready.problem.with_exact(one), ready.controller) for one in ends)
+    first, last = (ready.first_memory(ready.problem.with_exact(one))[1] for one in ends)
     rest = np.delete(np.arange(len(first)), np.arange(place.start, place.stop))
     if np.array_equal(first[rest], last[rest]):
         starts = np.tile(first, (len(exact), 1))
         starts[:, place] = exact
         return starts
-    return np.array([start_memory(ready.loop, ready.problem.with_exact(one), ready.controller) for one in exact])
+    return np.array([ready.first_memory(ready.problem.with_exact(one))[1] for one in exact])
 
 
-def _built(ready: Simulator, device: str | None) -> _Library:
+def _built(ready: Simulator, sums: Sums, device: str | None) -> _Library:
     """Compile the loop.
 
     Raises:
@@ -175,42 +284,25 @@ def _built(ready: Simulator, device: str | None) -> _Library:
         InvalidName, NotInstalled: no such device.
         NoCode: a part of the loop is not written for lanes, or for devices.
     """
+    functions = ready.loop.function, sums.function()
     if device is not None:
-        text, step = written_for_devices(ready.loop.function)
-        return _Library(loaded_kernel(text + _around(ready.problem, ready.loop, step), device), 1, _ITEMS, 1)
-    library, lanes = lanes_library(lanes_sources(ready.problem, ready.loop))
+        text, callees = written_for_devices(*functions)
+        return _Library(loaded_kernel(text + _around(ready, sums, *callees), device), 1, _ITEMS, 1)
+    (text, *drivers), callees = written_in_lanes(*functions)
+    library, lanes = lanes_library((text + _around(ready, sums, *callees), *drivers))
     run = library.run_lanes
-    run.argtypes, run.restype = [ctypes.c_long] * 3 + [np.ctypeslib.ndpointer(float)] * 3, ctypes.c_int
+    run.argtypes, run.restype = [ctypes.c_long] * 4 + [np.ctypeslib.ndpointer(float)] * 5, ctypes.c_int
     return _Library(run, lanes, _GROUPS, os.cpu_count() or 1)
 
 
-_LIBRARIES: Latest[_Library] = Latest(4)
-
-
-def lanes_sources(problem: Problem, loop: Composite) -> tuple[str, ...]:
-    """Return the C files of the loop over lanes, whose width is LANES.
-
-    Raises:
-        NoCode: a part of it is not written for lanes.
-    """
-    (text, *drivers), step = written_in_lanes(loop.function)
-    return text + _around(problem, loop, step), *drivers
-
-
-def _around(problem: Problem, loop: Composite, step: Callee) -> str:
+def _around(ready: Simulator, sums: Sums, step: Callee, summing: Callee) -> str:
     """The text of a run, behind that of a cycle."""
+    loop = ready.loop
     before = np.cumsum([0, *(loop.function.numel_in(k) for k in range(1, loop.function.n_in()))])
-    errors = loop.trace.slice("true_error" if "true_error" in loop.trace.names else "error")
     defined = {
-        "STEP": step.name, "ROOM": step.room, "MEMORY": loop.memory.size, "TRACE": loop.trace.size, "READS": before[-1],
-        "TABLES": ", ".join(f"now + {at}" for at in before[:-1]), "ERRORS": errors.stop - errors.start,
-        "FIRST_ERROR": errors.start, "STATUS": loop.trace.slice("status").start, "STATUSES": len(Status),
+        "STEP": step.name, "SUM": summing.name, "ROOM": max(step.room, summing.room), "MEMORY": loop.memory.size,
+        "TRACE": loop.trace.size, "READS": before[-1], "TABLES": ", ".join(f"now + {at}" for at in before[:-1]),
+        "SUMS": sums.size, "KEPT": sums.kept.size,
     }  # fmt: skip
-    limits = ranges_of(problem, loop.trace)
-    outside = "".join(
-        f"  bad |= (trace[{column}] < {SIDE_BY_SIDE.constant(low)}) | (trace[{column}] > {SIDE_BY_SIDE.constant(high)});\n"
-        for column, low, high in zip(limits.columns, limits.lower, limits.upper, strict=True)
-    )
     head = "".join(f"#define {name} {value}\n" for name, value in defined.items())
-    own = resources.files("fpirhc.simulation").joinpath("lanes.c").read_text(encoding="utf-8")
-    return head + own.replace("/* RANGES */", outside)
+    return head + resources.files("fpirhc.simulation").joinpath("lanes.c").read_text(encoding="utf-8")

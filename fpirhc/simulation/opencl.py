@@ -9,11 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-from fpirhc.errors import InvalidName, NoCode, NotInstalled, nearest, package
+from fpirhc.errors import DeviceFailed, InvalidName, NoCode, NotInstalled, nearest, package
 
 
 def loaded_kernel(source: str, device: str) -> Callable[..., int]:
-    """Build the kernel `run_lanes` and return it as a function of (plants, cycles, first, start, reads, results).
+    """Build the kernel `run_lanes` and return it as a function of (plants, cycles, first, own, start, begun, reads, results, log).
 
     Args:
         source: OpenCL C.
@@ -35,12 +35,21 @@ def loaded_kernel(source: str, device: str) -> Callable[..., int]:
     except cl.RuntimeError as error:
         raise NoCode(f"the compiler of '{chosen.name}' failed: {str(error).strip().splitlines()[0]}") from None
 
-    def run(plants: int, cycles: int, first: int, start: np.ndarray, reads: np.ndarray, results: np.ndarray) -> int:
+    def run(plants: int, cycles: int, first: int, own: int, *arrays: np.ndarray) -> int:
+        *given, results, log = arrays
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-        both = [cl.Buffer(context, flags, hostbuf=np.append(v, 0.0)) for v in (start, reads)]  # none is empty
-        made = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, results.nbytes)
-        kernel(queue, (plants,), None, np.int64(cycles), np.int64(first), *both, made)
-        cl.enqueue_copy(queue, results, made)
+        try:
+            both = [cl.Buffer(context, flags, hostbuf=np.append(v, 0.0)) for v in given]  # none is empty
+            made = [cl.Buffer(context, cl.mem_flags.WRITE_ONLY, max(v.nbytes, 8)) for v in (results, log)]
+            kernel(queue, (plants,), None, *map(np.int64, (cycles, first, own)), *both, *made)
+            for values, there in zip((results, log), made, strict=True):
+                if values.size:
+                    cl.enqueue_copy(queue, values, there)
+        except cl.Error as error:
+            raise DeviceFailed(
+                f"device '{chosen.name.strip()}' failed with {plants} plants ({str(error).strip().splitlines()[0]}): run fewer "
+                "plants at once, or leave the device out"
+            ) from None
         return 1
 
     return run

@@ -12,12 +12,14 @@ import numpy as np
 
 from fpirhc.status import STOPPED, Status
 from fpirhc.symbolic.block import Composite
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 
 _Entries: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[str, str]]]
 _RUNAWAY = 1e6  # times the largest value of the reference, or of the start
 _INSTANTS = 200  # of the reference
+_MOTIONS: Latest[np.ndarray] = Latest(4)  # of references
 _ERRORS = ("true_error", "error")  # where they are logged: the first that a run has
 _SIGNALS = (
     "foreign",
@@ -88,8 +90,13 @@ def _of_errors(problem: Problem, trace: Layout) -> _Entries:
     """Errors that no reference explains: the loop has run away, whatever its signals still are."""
     signal = trace[next(name for name in _ERRORS if name in trace)]
     plant, first = problem.plant, trace.slice(signal.name).start
-    times = np.linspace(0.0, problem.duration, _INSTANTS)
-    motion = np.asarray(problem.reference_function.map(_INSTANTS)(times[None, :])[0].full())
+    function = problem.reference_function
+
+    def moved() -> np.ndarray:
+        times = np.linspace(0.0, problem.duration, _INSTANTS)
+        return np.asarray(function.map(_INSTANTS)(times[None, :])[0].full())
+
+    motion = _MOTIONS.of((function,), (problem.duration,), moved)
     places, sizes, words = [], [], []
     for k, name in enumerate(signal.elements):
         row = plant.output.elements.index(name)

@@ -79,6 +79,14 @@ class Simulator:
         """Whether a solver inside starts a run at its last solution (OSQP does), so that a run depends on the runs before."""
         return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
 
+    def first_memory(
+        self, variant: Problem | None = None, settings: Numbers | None = None
+    ) -> tuple[Problem, np.ndarray]:
+        """Return the problem of a run and the first memory of its loop; arguments as in `run`."""
+        problem = variant or self.problem
+        force = in_force(self.live, self.loop, problem, settings or {}, {})
+        return force.problem, start_memory(self.loop, force.problem, force.controller, force.numbers)
+
     def run(
         self,
         *,

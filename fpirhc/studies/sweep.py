@@ -25,7 +25,7 @@ from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, of_problem
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.scenarios.bench import Conditions, Trials, fingerprint
+from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, fingerprint
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 LEDGER = "sweep.jsonl"
 _MOST = 2  # settings of a map
+_BLOCK = 64  # cells that run side by side, and are finished together
 _LOG = "log"
 _FORM = "PATH=LOW:HIGH:COUNT, or PATH=LOW:HIGH:COUNT:log"
 
@@ -119,6 +120,7 @@ class SweepMap:
         reasons: why a first run of each outcome did not finish; '' where it only diverged.
         without: paths of settings that it does not have: its numbers are the same along these axes.
         rebuilt: paths of settings of which every value needed a loop of its own.
+        apart: why its runs were one after the other; empty where they were side by side.
         now: its settings and those of the problem as they stand, by path.
     """
 
@@ -129,6 +131,7 @@ class SweepMap:
     without: tuple[str, ...]
     rebuilt: tuple[str, ...]
     now: Mapping[str, float]
+    apart: str = ""
 
     @property
     def failed(self) -> float:
@@ -376,7 +379,10 @@ class _Runner:
         self._now = {path: value for path in own if (value := self._current(path)) is not None}
         self._without = tuple(path for path in own if path not in self._now)
         self._of_problem = {path: v for path in grid.of_problem if (v := _of_problem(task.problem, path)) is not None}
-        self._trials = Trials(task, name, list(self._now), conditions)
+        cells = math.prod(
+            size for size, axis in zip(grid.shape, grid.axes, strict=True) if axis.path not in self._without
+        )
+        self._trials = Trials(task, name, list(self._now), conditions, side_by_side=cells >= SIDE_BY_SIDE)
 
     def map(self, progress: Progress | None) -> SweepMap:
         """Return the map; cells that the ledger has are not run again."""
@@ -384,13 +390,17 @@ class _Runner:
         places = [p for p in np.ndindex(*self._grid.shape) if self._stands_for_others(p)]
         # Settings are the outer loop: what must be built anew is built once.
         places.sort(key=lambda p: tuple(self._settings(p).values()))
-        for done, place in enumerate(places):
-            cell = self._number(place)
-            if cell not in known:
-                known[cell] = self._record(cell, place)
-                self._ledger.append(known[cell])
-            if progress:
-                progress(self._name, done + 1, len(places))
+        todo, done = [p for p in places if self._number(p) not in known], 0
+        while todo:
+            some, todo = todo[:_BLOCK], todo[_BLOCK:]
+            for record in self._records(some):
+                known[record["cell"]] = record
+                self._ledger.append(record)
+                done = len(known)
+                if progress:
+                    progress(self._name, done, len(places))
+        if progress and not done:
+            progress(self._name, len(places), len(places))
         values, outcomes = np.full(self._grid.shape, math.inf), np.empty(self._grid.shape, dtype=object)
         reasons: dict[str, str] = {}
         for place in np.ndindex(*self._grid.shape):
@@ -401,7 +411,14 @@ class _Runner:
                 reasons.setdefault(record["outcome"], record["reason"])
         rebuilt = () if self._live else tuple(self._now)
         return SweepMap(
-            self._name, values, outcomes, reasons, self._without, rebuilt, {**self._now, **self._of_problem}
+            self._name,
+            values,
+            outcomes,
+            reasons,
+            self._without,
+            rebuilt,
+            {**self._now, **self._of_problem},
+            self._trials.apart,
         )
 
     def _current(self, path: str) -> float | None:
@@ -429,21 +446,18 @@ class _Runner:
     def _live(self) -> bool:
         return self._trials.live()
 
-    def _record(self, cell: int, place: tuple[int, ...]) -> dict[str, Any]:
-        settings, case = self._settings(place), self._grid.case(place)
-        try:
-            record = self._trials.record(case, settings, live=self._live)
-        except FpirhcError as error:
-            record = {"skipped": str(error)}
-        reason = record.get("skipped") or record.get("stop") or ""
-        value = math.inf if "skipped" in record else self._aim.value(record)
-        return {
-            "controller": self._name,
-            "cell": cell,
-            "outcome": record.get("outcome", "refused"),
-            "value": value if math.isfinite(value) else None,
-            "reason": reason.partition(";")[0],
-        }
+    def _records(self, places: Sequence[tuple[int, ...]]) -> Iterator[dict[str, Any]]:
+        """The records of cells; settings that are not live are those of one loop as long as they stay."""
+        jobs = [(self._grid.case(place), self._settings(place)) for place in places]
+        for place, record in zip(places, self._trials.records(jobs, live=self._live), strict=True):
+            value = math.inf if "skipped" in record else self._aim.value(record)
+            yield {
+                "controller": self._name,
+                "cell": self._number(place),
+                "outcome": record.get("outcome", "refused"),
+                "value": value if math.isfinite(value) else None,
+                "reason": (record.get("skipped") or record.get("stop") or "").partition(";")[0],
+            }
 
 
 # --- What is said of it --------------------------------------------------------------------------------------------------
@@ -480,7 +494,8 @@ def _view(result: Sweep) -> View:
         for one in result.maps
         if one.without
     ]
-    lists = {"Why runs failed": reasons, "How it was run": [*built, *same]}
+    apart = [f"{one.controller}: one run after the other, because {one.apart}" for one in result.maps if one.apart]
+    lists = {"Why runs failed": reasons, "How it was run": [*built, *same, *apart]}
     return result.viewed(
         sentences=[(text, None) for text in _sentences(result)],
         conditions=conditions,

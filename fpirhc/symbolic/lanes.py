@@ -23,8 +23,8 @@ from fpirhc.symbolic.native import shared_library
 _KNOWN = {*SIDE_BY_SIDE.operations, ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST}
 
 
-def written_in_lanes(function: ca.Function) -> tuple[tuple[str, ...], Callee]:
-    """Return the C files of a Function, in which LANES is to be defined, and how it is called in the first one.
+def written_in_lanes(*functions: ca.Function) -> tuple[tuple[str, ...], list[Callee]]:
+    """Return the C files of Functions, in which LANES is to be defined, and how they are called in the first one.
 
     The others are the loops of optimisers. Every argument and result needs an address.
 
@@ -32,18 +32,18 @@ def written_in_lanes(function: ca.Function) -> tuple[tuple[str, ...], Callee]:
         NoCode: a part of it is not written for lanes.
     """
     own = _File(SIDE_BY_SIDE)
-    inner = own.flat.callee(function, always=True)
+    inner = [own.flat.callee(function, always=True) for function in functions]
     return (own.text(), *map(_driver_file, own.drivers)), inner
 
 
-def written_for_devices(function: ca.Function) -> tuple[str, Callee]:
-    """Return a Function in OpenCL C, and how it is called: scalar code alone.
+def written_for_devices(*functions: ca.Function) -> tuple[str, list[Callee]]:
+    """Return Functions in OpenCL C, and how they are called: scalar code alone.
 
     Raises:
         NoCode: it has the loops of an optimiser, or tables.
     """
     own = _File(DEVICE)
-    inner = own.flat.callee(function, always=True)
+    inner = [own.flat.callee(function, always=True) for function in functions]
     if own.flat.tables:
         raise NoCode("the loop has tables, which are not written for devices")
     return own.text(), inner

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import numpy as np
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.motion import followed_units
+from fpirhc.simulation.metrics.streamed import Streamed
 from fpirhc.simulation.run import Run
 from fpirhc.summary import written_out
 from fpirhc.task.problem import Problem
@@ -52,6 +54,8 @@ class Metric(Checked):
         floor: size of a difference up to which two numbers count as equal.
         step: (period, number of cycles) -> the smallest step of a number that counts cycles; zero for every other number.
         order: place among the columns, smallest first.
+        streamed: how it is summed up cycle by cycle, for runs side by side that keep no log; None: by its function alone.
+        reads: names of the signals that its function reads, where it reads nothing else of a run; None: anything.
 
     Raises:
         InvalidName: a name that cannot be a key.
@@ -74,6 +78,8 @@ class Metric(Checked):
     floor: float = 1e-12
     step: Callable[[float, int], float] = _no_step
     order: float = 100.0
+    streamed: Streamed | None = None
+    reads: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -134,6 +140,11 @@ class Metric(Checked):
         if isinstance(value, Real):
             return float(value)
         raise InvalidValue(f"metric '{self.name}': expected numbers, got {type(value).__name__}")
+
+
+def first_measured(problem: Problem) -> int:
+    """Return the first cycle that is measured."""
+    return max(0, math.ceil(problem.measure_from / problem.period - 0.5))
 
 
 def measured_cycles(problem: Problem, run: Run) -> np.ndarray:

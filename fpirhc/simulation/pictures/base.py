@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -53,6 +53,8 @@ class Picture(Checked, ABC):
     title: str
     caption: str
     controllers: tuple[str, ...]
+    keeps: ClassVar[bool] = False
+    """Whether `kept` is asked of every run."""
 
     @abstractmethod
     def size(self, count: int) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Band(Picture):
     target: tuple[float, ...] = ()
     caption: str = ""
     controllers: tuple[str, ...] = ()
+    keeps: ClassVar[bool] = True
 
     def size(self, count: int) -> tuple[float, float]:
         return 11.0, 2.1 * count + 0.6
@@ -126,6 +127,7 @@ class Grid(Picture):
     beyond: float = 0.0
     caption: str = ""
     controllers: tuple[str, ...] = ()
+    keeps: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name, edges, sign, way in (("low", self.low, -1, "falling"), ("high", self.high, 1, "rising")):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -23,6 +24,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import with_settings
+from fpirhc.simulation.lanes import Lanes, OneRun
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
@@ -32,6 +34,8 @@ from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario
 from fpirhc.task.problem import Problem
 
 FORMAT = 5  # of records
+_BLOCK = 64  # scenarios that run side by side
+SIDE_BY_SIDE = 64  # scenarios from which it pays to compile a loop for lanes
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,15 @@ class RecordFields(Checked):
     stop: str | None
 
 
+@dataclass(frozen=True, eq=False)
+class _InLanes:
+    """A scenario that runs beside others, and its place among the jobs."""
+
+    place: int
+    scenario: Scenario
+    run: OneRun
+
+
 class Bench:
     """Runs scenarios by number and controller.
 
@@ -96,19 +109,83 @@ class Bench:
         task: the loaded problem file.
         conditions: conditions of the scenarios.
         live: paths of the settings that `record` may change, by name of the controller.
+        side_by_side: whether runs are side by side where they can be, see `records`.
 
     Raises:
         InvalidProblem, InvalidValue: draws that could leave the parameters' physical bounds.
     """
 
-    def __init__(self, task: Task, conditions: Conditions, live: Mapping[str, Sequence[str]] | None = None) -> None:
-        self._live = live or {}
+    def __init__(
+        self,
+        task: Task,
+        conditions: Conditions,
+        live: Mapping[str, Sequence[str]] | None = None,
+        *,
+        side_by_side: bool = False,
+    ) -> None:
+        self._live, self._side_by_side = live or {}, side_by_side and conditions.compiled is not False
+        self.apart: dict[str, str] = {}
         self._task, self._conditions = task, conditions
         self._scenarios = scenarios(task, conditions)
         self._ranges, self._held = ranges(task.problem), held(task.problem)
         self._simulators: dict[tuple[str, object], Simulator | FpirhcError] = {}
         self._shared: dict[tuple[str, object], Simulator | None] = {}
+        self._lanes: dict[int, Lanes] = {}
         self._last: tuple[int, Scenario] | None = None
+
+    def records(
+        self, numbers: Sequence[int], name: str, settings: Sequence[Mapping[str, float] | None] | None = None
+    ) -> Iterator[dict[str, Any]]:
+        """Yield the results of one controller in several scenarios, as `record` does for each.
+
+        Where the loop can be written for lanes its runs are side by side: metrics are summed up without logs and equal to rounding,
+        whatever the other scenarios are. A run that ends early is the ordinary one. `apart` says why a controller's are ordinary.
+        """
+        jobs = list(zip(numbers, settings or [None] * len(numbers), strict=True))
+        found: dict[int, dict[str, Any]] = {}
+        for lanes, some in self._groups(name, jobs):
+            for one, values in zip(some, lanes.values([one.run for one in some]), strict=True):
+                if values is not None:
+                    metrics = Metrics(values, {}, {m.name: m for m in self._task.metrics})
+                    found[one.place] = self._told(jobs[one.place][0], name, one.scenario, metrics)
+        for place, (number, own) in enumerate(jobs):
+            yield found[place] if place in found else self.record(number, name, own)
+
+    def blocks(self, name: str, numbers: Sequence[int]) -> Iterator[Sequence[int]]:
+        """Yield the scenarios in pieces for `records`: single ones where a controller's runs are one after the other."""
+        if self._side_by_side and numbers and self._scenarios.has_many_alike(numbers[0]):
+            with contextlib.suppress(FpirhcError):  # it is said by the first record
+                self._lanes_of(name, self._scenario(numbers[0]))
+        size = _BLOCK if self._side_by_side and name not in self.apart else 1
+        yield from (numbers[at : at + size] for at in range(0, len(numbers), size))
+
+    def _groups(
+        self, name: str, jobs: Sequence[tuple[int, Mapping[str, float] | None]]
+    ) -> list[tuple[Lanes, list[_InLanes]]]:
+        """The lanes, and those jobs that may run in them: of one loop and one duration."""
+        groups: dict[tuple[int, int], tuple[Lanes, list[_InLanes]]] = {}
+        for place, (number, settings) in enumerate(jobs if self._side_by_side else ()):
+            if not self._scenarios.has_many_alike(number):
+                continue
+            scenario = self._scenario(number)
+            with contextlib.suppress(FpirhcError):  # what is wrong is said by the record
+                lanes, ready = self._lanes_of(name, scenario)
+                if lanes.why:
+                    return []
+                problem, memory = ready.first_memory(scenario.problem, settings)
+                group = groups.setdefault((id(lanes), problem.cycles), (lanes, []))
+                group[1].append(_InLanes(place, scenario, OneRun(problem, memory, scenario.seed)))
+        return list(groups.values())
+
+    def _lanes_of(self, name: str, scenario: Scenario) -> tuple[Lanes, Simulator]:
+        ready = self._simulator(name, scenario)
+        if id(ready) not in self._lanes:
+            shown = [one.title for one in self._pictures(name) if one.keeps]
+            why = f"the picture '{shown[0]}' keeps something of every run" if shown else ""
+            self._lanes[id(ready)] = lanes = Lanes(ready, self._task.metrics, why=why)
+            if lanes.why:
+                self.apart[name] = lanes.why
+        return self._lanes[id(ready)], ready
 
     def record(self, number: int, name: str, settings: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Return the result of one controller in one scenario, as plain data; a number that is not finite becomes None.
@@ -123,19 +200,26 @@ class Bench:
         except FpirhcError as error:
             return {"controller": name, "skipped": str(error)}
         metrics = measure(scenario.problem, run, self._task.metrics)
+        return self._told(number, name, scenario, metrics, run)
+
+    def _told(
+        self, number: int, name: str, scenario: Scenario, metrics: Metrics, run: Run | None = None
+    ) -> dict[str, Any]:
+        """The record; without a run, that of one which finished and of which nothing is kept."""
         size = relative_error(metrics, self._ranges)
+        stop = None if run is None else run.stop
         return {
             "scenario": number,
             "name": scenario.name,
             "group": scenario.group,
             "controller": name,
             "mismatch": scenario.mismatch,
-            "outcome": outcome(run, self._judged(scenario, metrics, size)),
+            "outcome": outcome(stop, self._judged(scenario, metrics, size)),
             "error": _finite(size),
             "metrics": _finite(metrics.values),
-            "pictures": _finite(self._kept(name, run)),
-            "lasted": run.cycles / scenario.problem.cycles,
-            "stop": run.stop,
+            "pictures": {} if run is None else _finite(self._kept(name, run)),
+            "lasted": 1.0 if run is None else run.cycles / scenario.problem.cycles,
+            "stop": stop,
         }
 
     def _judged(self, scenario: Scenario, metrics: Metrics, size: float) -> float:
@@ -148,9 +232,11 @@ class Bench:
 
     def _kept(self, name: str, run: Run) -> dict[str, Kept]:
         """What the pictures of many runs need of this one, by title."""
-        shown = [one for one in self._task.pictures if not one.controllers or name in one.controllers]
-        kept = {one.title: _kept_of(one, run) for one in shown if run.cycles > 1}
+        kept = {one.title: _kept_of(one, run) for one in self._pictures(name) if run.cycles > 1}
         return {title: facts for title, facts in kept.items() if facts}
+
+    def _pictures(self, name: str) -> list[Picture]:
+        return [one for one in self._task.pictures if not one.controllers or name in one.controllers]
 
     def _scenario(self, number: int) -> Scenario:
         """The scenario; the last one is kept, because controllers take turns on it."""
@@ -216,34 +302,52 @@ class Trials:
         name: of the controller.
         paths: of the settings.
         conditions: of the scenarios.
+        side_by_side: as of `Bench`.
     """
 
-    def __init__(self, task: Task, name: str, paths: Sequence[str], conditions: Conditions) -> None:
+    def __init__(
+        self, task: Task, name: str, paths: Sequence[str], conditions: Conditions, *, side_by_side: bool = False
+    ) -> None:
         self._task, self._name, self._paths = replace(task, controllers={name: task.controllers[name]}), name, paths
-        self._conditions = conditions
+        self._conditions, self._side_by_side = conditions, side_by_side
         self._rebuilt: tuple[dict[str, float], Bench] | None = None
 
     @cached_property
     def _bench(self) -> Bench:
-        return Bench(self._task, self._conditions, {self._name: self._paths})
+        return Bench(self._task, self._conditions, {self._name: self._paths}, side_by_side=self._side_by_side)
+
+    @property
+    def apart(self) -> str:
+        """Why runs were not side by side; empty where they were."""
+        bench = self._bench if self._rebuilt is None else self._rebuilt[1]
+        return bench.apart.get(self._name, "")
 
     def live(self, scenarios: Sequence[int] = (0,)) -> bool:
         """Whether the settings can be live in these scenarios."""
         return not self._paths or all(self._bench.changes(self._name, k) for k in scenarios)
 
-    def record(self, number: int, settings: Mapping[str, float], *, live: bool) -> dict[str, Any]:
-        """Return the record of a scenario with these numbers; the loop that is built for numbers that are not live is kept.
+    def records(self, jobs: Sequence[tuple[int, Mapping[str, float]]], *, live: bool) -> Iterator[dict[str, Any]]:
+        """Yield the records of scenarios with these numbers; the loop that is built for numbers that are not live is kept.
 
-        Raises:
-            FpirhcError: numbers that the controller does not take.
+        Numbers that the controller does not take are a reason why a scenario is skipped.
         """
         if live:
-            return self._bench.record(number, self._name, settings or None)
+            numbers, settings = [k for k, _ in jobs], [own or None for _, own in jobs]
+            yield from self._bench.records(numbers, self._name, settings)
+            return
+        for settings, group in itertools.groupby(jobs, key=lambda job: job[1]):
+            some = [k for k, _ in group]
+            try:
+                yield from self._built(settings).records(some, self._name)
+            except FpirhcError as error:
+                yield from [{"controller": self._name, "skipped": str(error)}] * len(some)
+
+    def _built(self, settings: Mapping[str, float]) -> Bench:
         if self._rebuilt is None or self._rebuilt[0] != settings:
             changed = with_settings(self._task.controllers[self._name], settings)
             task = replace(self._task, controllers={self._name: changed})
             self._rebuilt = dict(settings), Bench(task, self._conditions)
-        return self._rebuilt[1].record(number, self._name)
+        return self._rebuilt[1]
 
 
 def scenario_numbers(
@@ -344,8 +448,8 @@ def relative_error(metrics: Metrics, sizes: dict[str, float]) -> float:
     return error if math.isfinite(error) else math.inf
 
 
-def outcome(run: Run, error: float) -> str:
+def outcome(stop: str | None, error: float) -> str:
     """Return 'finished', 'diverged' or 'ended early'."""
-    if run.stop is not None:
+    if stop is not None:
         return "ended early"
     return "finished" if error <= DIVERGED else "diverged"

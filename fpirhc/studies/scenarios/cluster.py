@@ -212,7 +212,7 @@ _WAIT = 10  # s for an answer of the scheduler
 _THREADS = {f"{name}_NUM_THREADS": 1 for name in ("OMP", "MKL", "OPENBLAS")}  # of the libraries of a worker
 _ONE_AT_A_TIME = threading.Lock()  # a worker may have several threads, and a loop serves one
 
-Job = tuple[int, str]
+Job = tuple[Sequence[int], str]
 
 
 class Cluster:
@@ -308,25 +308,25 @@ def _lost(what: str, why: Any) -> WorkerDied:
 
 def run_jobs(
     opening: str, content: bytes, greeting: Mapping[str, Any], jobs: Sequence[Job]
-) -> tuple[list[dict[str, Any]], float]:
-    """Answer jobs on a worker; return the records and the seconds that they took.
+) -> tuple[list[list[dict[str, Any]]], float]:
+    """Answer jobs on a worker; return the records of each and the seconds that they took.
 
     Args:
         opening: what the study is built from, as JSON.
         content: of the problem file.
         greeting: facts on which the client's numbers depend.
-        jobs: (number of the scenario, name of the controller).
+        jobs: (numbers of scenarios, name of the controller).
     """
     with _ONE_AT_A_TIME:
         try:
             ready = _study(opening, content)
         except FpirhcError as error:
-            return [{"error": f"a worker cannot load the problem: {error}"}], 0.0
+            return [[{"error": f"a worker cannot load the problem: {error}"}]], 0.0
         other = _differences(greeting, {**ready.greeting, **machine_facts()})
         if other:
-            return [{"error": f"a worker would compute other numbers: {other}"}], 0.0
+            return [[{"error": f"a worker would compute other numbers: {other}"}]], 0.0
         begin = time.perf_counter()
-        return [answered(ready.bench, number, name) for number, name in jobs], time.perf_counter() - begin
+        return [answered(ready.bench, numbers, name) for numbers, name in jobs], time.perf_counter() - begin
 
 
 def _differences(wanted: Mapping[str, Any], there: Mapping[str, Any]) -> str:

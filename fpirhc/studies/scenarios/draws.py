@@ -10,6 +10,7 @@ or longer, rounded away from it to whole cycles: another length of a queue is an
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -21,6 +22,7 @@ from fpirhc.review.grid import is_late, live_paths, roomy, scaled
 from fpirhc.task.cases import Cases
 from fpirhc.task.problem import Problem
 
+_REGISTER = 8  # numbers in one, at most
 COMPARING, TUNING, SEARCHING = range(3)  # uses: a controller is never compared on the scenarios on which it was tuned
 
 
@@ -128,6 +130,10 @@ class Scenarios(ABC):
         """Return the controller with those settings that it has whatever the scenario is."""
         return controller
 
+    def has_many_alike(self, number: int) -> bool:  # noqa: ARG002
+        """Whether the loop of a scenario serves all scenarios, or a register of them at least."""
+        return True
+
 
 @dataclass(frozen=True, eq=False)
 class RandomScenarios(Scenarios):
@@ -210,6 +216,15 @@ class NamedCases(Scenarios):
         mismatch = _mismatch(problem.plant, moved, exact)
         group, seed = self.cases.group(name), seed if own is None else own
         return Scenario(name, group, seed, mismatch, key, built, problem, self._shared(name, built))
+
+    def has_many_alike(self, number: int) -> bool:
+        alike = self._alike[self.cases.key(self.cases.names[number], self._live)]
+        return alike == len(self.cases.names) or alike >= _REGISTER
+
+    @cached_property
+    def _alike(self) -> Counter[object]:
+        """Number of cases of every loop."""
+        return Counter(self.cases.key(name, self._live) for name in self.cases.names)
 
     def _shared(self, name: str, built: Problem) -> Shared | None:
         """The loop in which the numbers that cases change are live."""

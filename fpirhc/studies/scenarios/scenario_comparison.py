@@ -50,6 +50,7 @@ class ScenarioComparison(Study, FoundByName):
         tuning: sentences about the origin of tuned settings, by controller.
         time_unit: unit of time of the problem.
         pictures: those of the problem file; they are drawn where they keep something of every run.
+        apart: why runs of some controllers were one after the other, and not side by side.
     """
 
     count: int
@@ -67,6 +68,7 @@ class ScenarioComparison(Study, FoundByName):
     figure: Objective = field(default_factory=Objective)
     groups: Mapping[str, tuple[Summary, ...]] = field(default_factory=dict)
     pictures: tuple[Picture, ...] = ()
+    apart: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"
@@ -111,7 +113,12 @@ def _view(comparison: ScenarioComparison) -> View:
         sentences=tuple(zip_longest(comparison.verdict, outcomes)),
         conditions=f"{conditions} {'' if comparison.figure.metric else _ERRORS}{_MEANING} {'' if comparison.tuning else _UNTUNED}",
         tables=(_controllers(comparison, conditions), _groups(comparison)),
-        lists={"Tuning": [f"{name}: {note}" for name, note in comparison.tuning.items()]},
+        lists={
+            "Tuning": [f"{name}: {note}" for name, note in comparison.tuning.items()],
+            "How it was run": [
+                f"{name}: one run after the other, because {why}" for name, why in comparison.apart.items()
+            ],
+        },
         skipped=comparison.skipped,
         facts=_facts(comparison),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
@@ -19,7 +20,7 @@ from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
 from fpirhc.simulation.metrics.measuring import Column
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint, scenario_numbers
+from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Bench, Conditions, RecordFields, fingerprint, scenario_numbers
 from fpirhc.studies.scenarios.cluster import Cluster, Workers
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger, header_of
@@ -92,8 +93,14 @@ def compare_scenarios(
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
     conditions = Conditions(seed, COMPARING, float(percent), compiled, named=cases is not None)
-    bench, header = Bench(task, conditions), fingerprint(task, conditions)
-    opening = {"path": str(task.path.resolve()), "tuned": tuned or {}, "conditions": asdict(conditions)}
+    side_by_side = compiled and len(numbers) * shard[1] >= SIDE_BY_SIDE
+    bench, header = Bench(task, conditions, side_by_side=side_by_side), fingerprint(task, conditions)
+    opening = {
+        "path": str(task.path.resolve()),
+        "tuned": tuned or {},
+        "conditions": asdict(conditions),
+        "side by side": side_by_side,
+    }
     workers: Workers | Cluster | None = None
     if cluster is not None:
         workers = Cluster(cluster, opening, header, processes)
@@ -119,6 +126,7 @@ def compare_scenarios(
         tuning={n: note for n, note in (tuning or {}).items() if n in names},
         **circumstances(task, select(task, names), command, begin),
         pictures=task.pictures,
+        apart={n: why for n, why in bench.apart.items() if n in records},
     )
 
 
@@ -151,7 +159,10 @@ def _completed(
     for place, record in enumerate(records):
         if record["controller"] in places and record["scenario"] <= max(numbers):
             places[record["controller"]][record["scenario"]] = place
-    jobs = [(k, name) for k in numbers for name in names if places[name][k] < 0]
+    jobs: list[tuple[Sequence[int], str]] = []
+    for name in names:
+        jobs += [(block, name) for block in bench.blocks(name, [k for k in numbers if places[name][k] < 0])]
+    jobs.sort(key=lambda job: job[0][0])  # controllers take turns
     done = {name: int((places[name][list(numbers)] >= 0).sum()) for name in names}
     skipped: dict[str, str] = {}
     # Closed whatever happens: the workers end with it.
@@ -170,15 +181,15 @@ def _completed(
 
 
 def _answers(
-    bench: Bench, workers: Workers | Cluster | None, jobs: Sequence[tuple[int, str]]
+    bench: Bench, workers: Workers | Cluster | None, jobs: Sequence[tuple[Sequence[int], str]]
 ) -> Generator[dict[str, Any]]:
     """Records of the jobs in the order in which they come; without workers this process runs the jobs."""
     if workers is None:
-        for number, name in jobs:
-            yield bench.record(number, name)
+        for numbers, name in jobs:
+            yield from bench.records(numbers, name)
         return
     with workers:
-        for record in workers.answers(jobs, lambda job: bench.record(*job)):
+        for record in itertools.chain.from_iterable(workers.answers(jobs, lambda job: list(bench.records(*job)))):
             if "error" in record and "scenario" not in record:
                 raise FpirhcError(record["error"])
             yield record

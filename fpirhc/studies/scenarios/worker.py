@@ -1,7 +1,7 @@
 """A process that runs scenarios for another one: `python -m fpirhc.studies.scenarios.worker`, see `processes`.
 
 Its first line of input has the problem file and the conditions, and it answers with the fingerprint. Every other line is a job
-[scenario, controller], and it answers with a record.
+[scenarios, controller], and it answers with their records.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TextIO
 
@@ -41,15 +41,16 @@ def study(opening: Mapping[str, Any]) -> Study:
     """
     task = with_tuned(load_problem(opening["path"]), opening["tuned"])
     conditions = Conditions(**opening["conditions"])
-    return Study(Bench(task, conditions), fingerprint(task, conditions))
+    bench = Bench(task, conditions, side_by_side=opening["side by side"])
+    return Study(bench, fingerprint(task, conditions))
 
 
-def answered(bench: Bench, number: int, name: str) -> dict[str, Any]:
-    """Return the record of a job, or {"error": why} where nobody expected an error."""
+def answered(bench: Bench, numbers: Sequence[int], name: str) -> list[dict[str, Any]]:
+    """Return the records of a job, or {"error": why} where nobody expected an error."""
     try:
-        return bench.record(number, name)
+        return list(bench.records(numbers, name))
     except Exception as error:  # noqa: BLE001 -- a process that dies of it would be started again and again
-        return {"error": f"scenario {number}, controller '{name}': {error}"}
+        return [{"error": f"scenario {numbers[0]}, controller '{name}': {error}"}]
 
 
 def main() -> None:
@@ -64,8 +65,8 @@ def main() -> None:
         _answer(answers, {"error": str(error)})
         return
     for line in sys.stdin:
-        number, name = json.loads(line)
-        _answer(answers, answered(ready.bench, number, name))
+        numbers, name = json.loads(line)
+        _answer(answers, answered(ready.bench, numbers, name))
 
 
 def _private_output() -> TextIO:

@@ -275,7 +275,7 @@ def _judged(
     """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all of them."""
     try:
         live = trials.live(scenarios)
-        records = [trials.record(k, settings, live=live) for k in scenarios]
+        records = list(trials.records([(k, settings) for k in scenarios], live=live))
     except (InvalidValue, InvalidProblem):
         return {"cost": aim.refused, "failures": len(scenarios)}
     failures = sum(r.get("outcome") != "finished" for r in records)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.plant.motion import derivative_unit
 from fpirhc.simulation.metrics.base import Metric, by_name, input_unit, measured_cycles
+from fpirhc.simulation.metrics.streamed import Cycle, Measured, Streamed, summed
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
 from fpirhc.symbolic.live import nominal
@@ -33,11 +35,17 @@ def at_limit(problem: Problem, run: Run) -> float:
     commands = _measured(problem, run)
     if not commands.shape[0]:
         return float("nan")
-    lower, upper = nominal(problem).limits.input_bounds(problem.plant)
+    lower, upper = _ends(problem)
+    return float(np.mean(((commands <= lower) | (commands >= upper)).any(axis=1)))
+
+
+def _ends(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Commands from which on an input is at a limit, shape (inputs,) each."""
+    lower, upper = nominal(problem.limits).input_bounds(problem.plant)
     span = upper - lower
     near = _AT * np.where(np.isfinite(span), span, np.fmax(1.0, np.fmin(np.abs(lower), np.abs(upper))))
     near = np.where(np.isfinite(near), near, 0.0)
-    return float(np.mean(((commands <= lower + near) | (commands >= upper - near)).any(axis=1)))
+    return lower + near, upper - near
 
 
 def _measured(problem: Problem, run: Run) -> np.ndarray:
@@ -45,8 +53,39 @@ def _measured(problem: Problem, run: Run) -> np.ndarray:
     return np.asarray(run["command"][measured_cycles(problem, run)])
 
 
+def _moving(memory: ca.SX, cycle: Cycle) -> ca.SX:
+    """Sums, the last commands, and whether these were measured."""
+    command = cycle["command"]
+    sums, last, begun = ca.vertsplit(memory, [0, command.numel(), 2 * command.numel(), memory.numel()])
+    return ca.vertcat(sums + begun * ca.fabs(command - last), command, cycle.measured)
+
+
+def _moved(memories: np.ndarray, run: Measured) -> dict[str, np.ndarray]:
+    names, time = run.layout["command"].elements, max((run.count - 1) * run.problem.period, run.problem.period)
+    return dict(zip(names, memories.T[: len(names)] / time, strict=True))
+
+
+def _standing(memory: ca.SX, cycle: Cycle) -> ca.SX:
+    """The ends, and the number of cycles at them."""
+    command, count = cycle["command"], memory[-1]
+    lower, upper = ca.vertsplit(memory[:-1], command.numel())
+    standing = ca.logic_or(command <= lower, command >= upper)
+    some = ca.sum1(standing) > 0
+    return ca.vertcat(lower, upper, count + cycle.measured * some)
+
+
 METRICS = (
-    Metric("effort", effort, by="input", unit=input_unit, better="neither", title="rms", finite=True, order=50),
+    Metric(
+        "effort",
+        effort,
+        by="input",
+        unit=input_unit,
+        better="neither",
+        title="rms",
+        finite=True,
+        order=50,
+        streamed=summed("command", "command", lambda u: u * u, lambda sums, run: np.sqrt(sums / run.count)),
+    ),
     Metric(
         "total_variation",
         total_variation,
@@ -57,6 +96,7 @@ METRICS = (
         headline=True,
         finite=True,
         order=55,
+        streamed=Streamed(lambda run: np.zeros(2 * run.layout["command"].size + 1), _moving, _moved),
     ),
     Metric(
         "at_limit",
@@ -68,5 +108,10 @@ METRICS = (
         finite=True,
         step=lambda _, cycles: 1.0 / cycles,
         order=60,
+        streamed=Streamed(
+            lambda run: np.concatenate([*_ends(run.problem), [0.0]]),
+            _standing,
+            lambda memories, run: {"": memories[:, -1] / run.count},
+        ),
     ),
 )

@@ -85,9 +85,20 @@ def _adapts(run: Run) -> bool:
     return "contraction" in run.layout and "effective_gain" in run.settings and run.cycles >= _SHORTEST
 
 
+# They read more signals of a run with a contraction, which only one that is judged has.
 # A difference of 1e-4 has no meaning: the factor is a fit, or a difference of eigenvalues from one.
 METRICS = (
-    Metric("contraction.predicted", predicted, short="factor", headline=True, floor=1e-4, order=85),
-    Metric("contraction.growing", growing, title="contraction above 1", text=in_percent, compared="not", order=85.5),
-    Metric("contraction.measured", measured, floor=1e-4, order=86),
+    Metric(
+        "contraction.predicted", predicted, short="factor", headline=True, floor=1e-4, order=85, reads=("contraction",)
+    ),
+    Metric(
+        "contraction.growing",
+        growing,
+        title="contraction above 1",
+        text=in_percent,
+        compared="not",
+        order=85.5,
+        reads=("contraction",),
+    ),
+    Metric("contraction.measured", measured, floor=1e-4, order=86, reads=("contraction",)),
 )

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.simulation.metrics.base import Function, Metric
+from fpirhc.simulation.metrics.streamed import Measured, Streamed
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.summary import written_out
@@ -31,9 +33,28 @@ def cycles(problem: Problem, run: Run) -> int:  # noqa: ARG001 -- every metric i
     return run.cycles
 
 
+def _counts(memories: np.ndarray, run: Measured) -> dict[str, np.ndarray]:  # noqa: ARG001 -- as every metric's
+    counts = memories.astype(int)
+    return {s.name: np.ma.masked_equal(counts[:, s], 0 if s not in _ALWAYS else -1) for s in Status}
+
+
 _CYCLES = (
-    Metric("cycles", cycles, better="neither", report=False, compared="exact", finite=True, order=5),
-    Metric("status", status, by="status", better="neither", report=False, compared="exact", finite=True, order=80),
+    Metric("cycles", cycles, better="neither", report=False, compared="exact", finite=True, order=5, reads=()),
+    Metric(
+        "status",
+        status,
+        by="status",
+        better="neither",
+        report=False,
+        compared="exact",
+        finite=True,
+        order=80,
+        streamed=Streamed(
+            lambda _: np.zeros(len(Status)),
+            lambda memory, cycle: memory + (cycle["status"] == ca.DM(list(Status))),
+            _counts,
+        ),
+    ),
 )
 
 
@@ -77,6 +98,7 @@ def residual(value: float) -> str:
     return written_out(value, 1)
 
 
+_SOLVE = ("solve",)
 METRICS = (
     *_CYCLES,
     Metric(
@@ -87,8 +109,17 @@ METRICS = (
         text=iterations,
         finite=True,
         order=90,
+        reads=_SOLVE,
     ),
-    Metric("solve.worst_iterations", _over("iterations", np.max), text=iterations, report=False, finite=True, order=91),
+    Metric(
+        "solve.worst_iterations",
+        _over("iterations", np.max),
+        text=iterations,
+        report=False,
+        finite=True,
+        order=91,
+        reads=_SOLVE,
+    ),
     Metric(
         "solve.median_stationarity",
         _over("stationarity", np.median),
@@ -98,9 +129,27 @@ METRICS = (
         report=False,
         compared="not",
         order=92,
+        reads=_SOLVE,
     ),
-    Metric("solve.worst_stationarity", _over("stationarity", np.max), title="worst residual", compared="not", order=93),
-    Metric("solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=94),
-    Metric("solve.second_plans", second_plans, report=False, compared="exact", finite=True, order=94.5),
-    Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=95),
+    Metric(
+        "solve.worst_stationarity",
+        _over("stationarity", np.max),
+        title="worst residual",
+        compared="not",
+        order=93,
+        reads=_SOLVE,
+    ),
+    Metric(
+        "solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=94, reads=_SOLVE
+    ),
+    Metric(
+        "solve.second_plans",
+        second_plans,
+        report=False,
+        compared="exact",
+        finite=True,
+        order=94.5,
+        reads=("second_plans",),
+    ),
+    Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=95, reads=_SOLVE),
 )

@@ -1,0 +1,164 @@
+"""What is summed up of a run cycle by cycle: its metrics, and whether a number left its range. No log is kept for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import NoCode
+from fpirhc.simulation.log import with_common_columns
+from fpirhc.simulation.metrics import measure
+from fpirhc.simulation.metrics.base import Metric, first_measured
+from fpirhc.simulation.metrics.streamed import Cycle, Measured, Streamed
+from fpirhc.simulation.ranges import ranges_of
+from fpirhc.simulation.run import Run
+from fpirhc.symbolic.layout import Layout
+from fpirhc.task.problem import Problem
+
+Values = dict[str, dict[str, float]]  # by metric and element
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """The sums of one loop.
+
+    Args:
+        trace: of the loop.
+        metrics: in the order of their numbers.
+        built: the problem of the loop.
+
+    Raises:
+        NoCode: a metric that reads whole runs.
+    """
+
+    trace: Layout
+    metrics: tuple[Metric, ...]
+    built: Problem
+
+    def __post_init__(self) -> None:
+        for metric in self.metrics:
+            if metric.streamed is None and metric.reads is None:
+                raise NoCode(f"the metric '{metric.name}' reads whole runs")
+        self.start(self.built)
+
+    @property
+    def size(self) -> int:
+        """Numbers of the memory."""
+        return self._places[-1]
+
+    @property
+    def kept(self) -> Layout:
+        """The signals of which every cycle is kept, for metrics that are functions of them."""
+        names = {name for metric in self._of_logs for name in metric.reads or ()}
+        return Layout(tuple(s for s in self._common[0].signals if s.name in names))
+
+    def start(self, problem: Problem) -> np.ndarray:
+        """Return the memory before a run, shape (size,).
+
+        Raises:
+            NoCode: a metric needs what nobody knows before the run.
+        """
+        return np.concatenate(self._starts(problem))
+
+    def function(self) -> ca.Function:
+        """Function (memory, trace, [number of the cycle, whether it is measured]) -> (memory, kept)."""
+        memory, trace, when = ca.SX.sym("m", self.size), ca.SX.sym("s", self.trace.size), ca.SX.sym("k", 2)
+        layout, columns = self._common
+        whole = ca.mtimes(ca.DM(ca.sparsify(ca.DM(columns.T))), trace)
+        signals = {s.name: whole[layout.slice(s.name)] for s in layout.signals}
+        cycle = Cycle(signals, when[0], when[1])
+        parts = zip(self._all, ca.vertsplit(memory, self._places), strict=True)
+        kept = [signals[s.name] for s in self.kept.signals]
+        after = ca.vertcat(*(ca.densify(one.step(part, cycle)) for one, part in parts))
+        return ca.Function("fpirhc_sums", [memory, trace, when], [after, ca.densify(ca.vertcat(*kept, ca.SX(0, 1)))])
+
+    def values(self, problem: Problem, sums: np.ndarray, log: np.ndarray, seed: int) -> list[Values | None]:
+        """Return the metrics of some runs of one duration; None for one that left a range.
+
+        Args:
+            problem: one of theirs.
+            sums: last memories, shape (runs, size).
+            log: what was kept, shape (runs, cycles, kept.size).
+            seed: for the runs' names alone.
+        """
+        columns, outside = self.columns(problem, sums)
+        return [None if outside[k] else self._row(k, problem, columns, log[k], seed) for k in range(len(sums))]
+
+    def columns(self, problem: Problem, sums: np.ndarray) -> tuple[dict[str, Mapping[str, np.ndarray]], np.ndarray]:
+        """Return the metrics that are summed up, by name and element, shape (runs,) each; and which runs left a range."""
+        run = self._measured(problem)
+        outside, *rest = np.split(sums, self._places[1:-1], axis=1)
+        pairs = zip(self._streamed, rest, strict=True)
+        return {m.name: one.result(part, run) for (m, one), part in pairs}, outside[:, -1] != 0
+
+    def _row(
+        self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, Any]], log: np.ndarray, seed: int
+    ) -> Values:
+        run = Run(problem.name, "", seed, problem.period, self.kept, log, None, True, {})
+        of_logs = measure(problem, run, self._of_logs).values
+        row: Values = {}
+        for metric in self.metrics:
+            if metric.name in columns:
+                numbers = {e: v[k] for e, v in columns[metric.name].items()}
+                row[metric.name] = {e: v.item() for e, v in numbers.items() if v is not np.ma.masked}
+            elif metric.name in of_logs:
+                row[metric.name] = dict(of_logs[metric.name])
+        return row
+
+    def _starts(self, problem: Problem) -> list[np.ndarray]:
+        run, starts = self._measured(problem), []
+        for one, name in zip(self._all, ("ranges", *(metric.name for metric, _ in self._streamed)), strict=True):
+            start = one.start(run)
+            if start is None:
+                raise NoCode(f"'{name}' cannot be summed up: this problem does not say before a run what it needs")
+            starts.append(start)
+        return starts
+
+    def _measured(self, problem: Problem) -> Measured:
+        return Measured(problem, self._common[0], problem.cycles, first_measured(problem))
+
+    @cached_property
+    def _common(self) -> tuple[Layout, np.ndarray]:
+        """What a run logs, and how it follows from the trace: shape (trace, log)."""
+        return with_common_columns(self.trace, np.eye(self.trace.size))
+
+    @cached_property
+    def _streamed(self) -> list[tuple[Metric, Streamed]]:
+        return [(m, m.streamed) for m in self.metrics if m.streamed is not None]
+
+    @cached_property
+    def _of_logs(self) -> list[Metric]:
+        return [m for m in self.metrics if m.streamed is None]
+
+    @cached_property
+    def _all(self) -> list[Streamed]:
+        return [self._outside, *(one for _, one in self._streamed)]
+
+    @cached_property
+    def _places(self) -> list[int]:
+        return [0, *np.cumsum([len(start) for start in self._starts(self.built)]).tolist()]
+
+    @cached_property
+    def _outside(self) -> Streamed:
+        """The ends of all ranges, and whether some number lay outside."""
+        columns = ranges_of(self.built, self.trace).columns.tolist()
+
+        def start(run: Measured) -> np.ndarray | None:
+            found = ranges_of(run.problem, self.trace)
+            ends = dict(zip(found.columns.tolist(), zip(found.lower, found.upper, strict=True), strict=True))
+            if not ends.keys() <= set(columns):
+                return None
+            return np.append(np.array([ends.get(c, (-np.inf, np.inf)) for c in columns]).reshape(-1, 2).T.ravel(), 0.0)
+
+        def step(memory: ca.SX, cycle: Cycle) -> ca.SX:
+            values, count = ca.vertcat(*(cycle[s.name] for s in self.trace.signals))[columns], len(columns)
+            lower, upper = memory[:count], memory[count:-1]
+            left = ca.sum1(ca.logic_or(values < lower, values > upper)) if columns else ca.SX(0)
+            return ca.vertcat(lower, upper, ca.fmax(memory[-1], left))
+
+        return Streamed(start, step, lambda memories, _: {"": memories[:, -1]})
