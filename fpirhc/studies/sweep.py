@@ -393,9 +393,9 @@ class _Runner:
         todo, done = [p for p in places if self._number(p) not in known], 0
         while todo:
             some, todo = todo[:_BLOCK], todo[_BLOCK:]
-            for record in self._records(some):
-                known[record["cell"]] = record
-                self._ledger.append(record)
+            for new in self._records(some):
+                known[new["cell"]] = new
+                self._ledger.append(new)
                 done = len(known)
                 if progress:
                     progress(self._name, done, len(places))

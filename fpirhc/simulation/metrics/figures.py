@@ -88,7 +88,8 @@ def Overshoot(judged: str, *, name: str = "overshoot", headline: bool = True) ->
         return float(max(beyond[measured_cycles(problem, run)].max(), 0.0))
 
     unit = lambda problem, _: followed_units(problem.plant).get(judged, "")  # noqa: E731 -- one line says it
-    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline, finite=True)
+    reads = ("true_error", "reference", "time")
+    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline, finite=True, reads=reads)
 
 
 @checked_call
@@ -126,7 +127,8 @@ def Norm(whats: Sequence[str], *, power: float = 2.0, name: str = "norm", headli
         return float(largest * (np.sum((values / largest) ** power) * problem.period) ** (1 / power))
 
     unit = (lambda problem, _: _unit(problem, whats[0])) if np.isinf(power) else ""
-    return Metric(name, partial(_of_whole_runs, norm), unit=unit, headline=headline, finite=True)
+    reads = (*(what.partition(".")[0] for what in whats), "time")
+    return Metric(name, partial(_of_whole_runs, norm), unit=unit, headline=headline, finite=True, reads=reads)
 
 
 def _figure(
@@ -144,7 +146,13 @@ def _figure(
 
     whole = partial(_of_whole_runs, function)
     return Metric(
-        name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, finite=True, better=better
+        name,
+        whole,
+        unit=lambda p, _: unit(_unit(p, what), p.time_unit),
+        headline=headline,
+        finite=True,
+        better=better,
+        reads=(what.partition(".")[0], "time") if isinstance(what, str) else None,
     )
 
 

@@ -22,7 +22,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.pairwise import harm_of_adaptation
-from fpirhc.studies.scenarios.bench import Conditions, Trials, fingerprint, scenario_numbers
+from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, fingerprint, scenario_numbers
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
@@ -31,6 +31,7 @@ from fpirhc.studies.view import Progress
 from fpirhc.symbolic.paths import content_at, paths_to
 
 LEDGER = "trials.jsonl"
+_REGISTER = 8  # scenarios of a trial from which they run side by side
 _PRESENT = -1  # number of the trial of the settings as they are, which no budget counts
 
 
@@ -228,7 +229,9 @@ def _tuned(
     before = {path: current_setting(task.controllers[name], path) for path in spans}
     # A trial keeps its cost alone, so no other metric is measured.
     needed = [metric for metric in task.metrics if metric.name in ("rms_error", aim.metric.name if aim.metric else "")]
-    runs = Trials(replace(task, metrics=needed), name, tuple(spans), conditions)
+    # A trial is a call of its own, so its scenarios alone fill a register.
+    side_by_side = len(numbers) >= _REGISTER and trials * len(numbers) >= SIDE_BY_SIDE
+    runs = Trials(replace(task, metrics=needed), name, tuple(spans), conditions, side_by_side=side_by_side)
     study = optuna.create_study()
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
     for number in range(_PRESENT, trials):

@@ -1,0 +1,168 @@
+"""Studies whose runs are side by side say what the ordinary runs say, one after the other."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
+from fpirhc.studies.sweep import Axis, sweep
+from fpirhc.studies.tuning.tune import tune
+
+TWO_MASS = fp.load_problem("two_mass")
+SMOOTH, ROUNDED = 1e-12, 1e-9  # relative; behind a quantum a last place is now and then a whole one
+_RESIDUALS = ("stationarity", "feasibility")  # differences of large numbers: rounding is all that is in them
+_SHORT: dict[str, Any] = {"duration": 2.0, "measure_from": 0.5}
+
+
+def short(task: Task, **changes: Any) -> Task:
+    return replace(task, problem=replace(task.problem, **{**_SHORT, **changes}))
+
+
+NOISY = short(
+    TWO_MASS,
+    disturbances={"q1": fp.Noise(0.3)},
+    sensing=fp.Sensing({"q1": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.05)}, fp.SavitzkyGolay(window=7, degree=4)),
+)
+STUDIES = {
+    "computed torque": (short(TWO_MASS), "CTC+FPI (eq 6)", SMOOTH),
+    "plans": (short(TWO_MASS), "RHC+FPI", SMOOTH),
+    "noise and lost samples": (NOISY, "CTC", ROUNDED),
+    "map": (fp.load_problem("fishery"), "CTC+FPI", SMOOTH),
+}
+
+
+def numbers(record: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for name, value in record.items():
+        if isinstance(value, Mapping):
+            yield from numbers(value, (*path, name))
+        else:
+            yield (*path, name), value
+
+
+def assert_equal(found: Mapping[str, Any], expected: Mapping[str, Any], close: float) -> None:
+    """The same entries of the same types; whole numbers and texts alike, others to rounding."""
+    one, other = dict(numbers(found)), dict(numbers(expected))
+    assert one.keys() == other.keys()
+    for path, value in other.items():
+        assert type(one[path]) is type(value), path
+        if not isinstance(value, float):
+            assert one[path] == value, path
+        elif not any(word in "".join(path) for word in _RESIDUALS):
+            assert one[path] == pytest.approx(value, rel=close, abs=1e-14), path
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_records_are_those_of_ordinary_runs(name: str) -> None:
+    """Every metric, in every scenario with its own parameters and its own noise."""
+    task, controller, close = STUDIES[name]
+    conditions = Conditions(seed=5, use=COMPARING, percent=10.0, compiled=True)
+    bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
+    records = list(bench.records(range(11), controller))
+    assert not bench.apart
+    for number in (0, 4, 7, 8, 10):
+        assert_equal(records[number], ordinary.record(number, controller), close)
+
+
+def test_a_record_does_not_depend_on_its_neighbours() -> None:
+    """Bit by bit: so it is the same whoever computes it, and with whatever others."""
+    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True), side_by_side=True)
+    together = list(bench.records(range(12), "RHC+FPI"))
+    assert next(bench.records([9], "RHC+FPI")) == together[9]
+    assert list(bench.records([11, 3], "RHC+FPI")) == [together[11], together[3]]
+    assert not bench.apart
+
+
+def test_a_run_that_ends_early_is_the_ordinary_one_and_its_neighbours_stay() -> None:
+    """A gain far beyond its limit makes the iteration run away; the lane of the stable gain does not notice."""
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.BeyondLimit(fp.Affine(gain=-0.5)))
+    task = short(TWO_MASS, limits=fp.Limits())
+    task = replace(task, controllers={"wild": controller})
+    path, conditions = "deformation.map.gain", Conditions(0, COMPARING, 5.0, True)
+    live = {"wild": (path,)}
+    bench, ordinary = Bench(task, conditions, live, side_by_side=True), Bench(task, conditions, live)
+    gains = [-0.5, -9.0, -0.7]
+    records = list(bench.records([0, 0, 0], "wild", [{path: gain} for gain in gains]))
+    assert [one["outcome"] for one in records] == ["finished", "ended early", "finished"]
+    assert records[1] == ordinary.record(0, "wild", {path: gains[1]})
+    for k in (0, 2):
+        assert_equal(records[k], ordinary.record(0, "wild", {path: gains[k]}), SMOOTH)
+
+
+def test_a_metric_of_whole_runs_and_a_solver_are_told() -> None:
+    """They run one after the other, with the same records."""
+    middle = fp.Metric("middle", lambda _, run: float(np.median(run["error.q1"])))
+    own = replace(short(TWO_MASS), metrics=(*TWO_MASS.metrics, middle))
+    limited = short(TWO_MASS, limits=fp.Limits(states={"q1": (-9.0, 9.0)}))
+    conditions = Conditions(0, COMPARING, 5.0, True)
+    for task, name, why in ((own, "CTC", "the metric 'middle' reads whole runs"), (limited, "RHC", "not written")):
+        bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
+        assert list(bench.records([0, 1], name)) == [ordinary.record(k, name) for k in (0, 1)]
+        assert why in bench.apart[name]
+
+
+def test_what_a_figure_reads_is_kept() -> None:
+    """Figures of a problem file are functions of one signal, of which every cycle is kept."""
+    task = replace(short(TWO_MASS), metrics=(*TWO_MASS.metrics, fp.figures.InBand("state.q1", -1.0, 1.0)))
+    conditions = Conditions(0, COMPARING, 5.0, True)
+    bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
+    [record] = bench.records([3], "CTC")
+    assert not bench.apart
+    assert_equal(record, ordinary.record(3, "CTC"), SMOOTH)
+
+
+def test_scenarios_side_by_side_are_those_one_after_the_other(tmp_path: Path) -> None:
+    """Statistics, and the records of two processes bit by bit."""
+    settings: dict[str, Any] = {"count": 70, "percent": 10.0, "seed": 2, "controllers": ["CTC", "CTC+FPI (eq 6)"]}
+    task = TWO_MASS
+    lanes = compare_scenarios(task, folder=tmp_path / "lanes", **settings)
+    plain = compare_scenarios(task, folder=tmp_path / "plain", **{**settings, "count": 12})
+    assert not lanes.apart
+    for name, some in plain.records.items():
+        for record, expected in zip(lanes.records[name], some, strict=False):
+            assert_equal(record, expected, SMOOTH)
+    compare_scenarios(task, folder=tmp_path / "two", processes=2, **settings)
+    one, two = (sorted((tmp_path / f / LEDGER).read_text().splitlines()) for f in ("lanes", "two"))
+    assert one == two
+
+
+def test_a_sweep_side_by_side_is_the_sweep_of_single_runs(tmp_path: Path) -> None:
+    """Parameters and a live gain, of which some values are refused."""
+    axes = [Axis.parsed("deformation.gain=-3:-0.2:8"), Axis.parsed("exact.m1=0.5:2:8")]
+    task = short(TWO_MASS)
+    lanes = sweep(task, axes, folder=tmp_path / "lanes", controllers=["CTC+FPI (eq 6)"]).maps[0]
+    plain = sweep(task, axes, folder=tmp_path / "plain", controllers=["CTC+FPI (eq 6)"], compiled=False).maps[0]
+    assert not lanes.apart
+    assert (lanes.outcomes == plain.outcomes).all()
+    assert {"finished", "refused"} <= set(lanes.outcomes.ravel())
+    np.testing.assert_allclose(lanes.values, plain.values, rtol=SMOOTH)
+
+
+def test_costs_of_a_search_are_those_of_single_runs(tmp_path: Path) -> None:
+    spans = {"CTC+FPI (eq 6)": {"deformation.gain": fp.LogSpan(-1.2, -0.2)}}
+    task = replace(short(TWO_MASS), tuning=spans)
+    settings: dict[str, Any] = {"trials": 3, "seed": 1, "count": 32, "percent": 10.0, "controllers": list(spans)}
+    lanes = tune(task, folder=tmp_path / "lanes", **settings).entries[0]
+    plain = tune(task, folder=tmp_path / "plain", **settings, compiled=False).entries[0]
+    assert lanes.cost == pytest.approx(plain.cost, rel=SMOOTH)
+    assert lanes.settings == pytest.approx(plain.settings, rel=SMOOTH)
+    first = json.loads((tmp_path / "lanes" / "trials.jsonl").read_text().splitlines()[1])
+    assert first["failures"] == 0
+
+
+def test_lanes_keep_to_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs take turns where their noise needs more room, and are the same."""
+    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True), side_by_side=True)
+    together = list(bench.records(range(20), "CTC"))
+    monkeypatch.setattr("fpirhc.simulation.lanes._ROOM", 1)
+    assert list(bench.records(range(20), "CTC")) == together
