@@ -8,6 +8,7 @@ remember with multiples of it, so that one absurd but finite sample does not sta
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -108,10 +109,12 @@ class Scale:
 def largest_response(problem: Problem) -> tuple[float, ...]:
     """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
 
-    It is infinite too where the states that belong to the reference are not known before a run.
+    It is rounded up to a power of two, so that most starts have one loop. It is infinite too where the states that belong to the
+    reference are not known before a run.
     """
     free = (float("inf"),) * len(problem.plant.controlled_names)
-    return response_scale(problem).largest if known_on_reference(problem.plant) else free
+    largest = response_scale(problem).largest if known_on_reference(problem.plant) else free
+    return tuple(2.0 ** math.ceil(math.log2(value)) if math.isfinite(value) else value for value in largest)
 
 
 @lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison

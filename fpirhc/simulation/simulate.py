@@ -44,6 +44,7 @@ from fpirhc.task.problem import Problem
 
 _CHAIN = 5  # cycles of the inner chain of the virtual machine
 Progress = Callable[[int, int], None]
+Compiled: TypeAlias = tuple[Evaluator, bool, str]  # whether it is compiled, and why not
 Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the memory, their values
 SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
 _TOO_SHORT = "compiled=None was given, and the run is short"
@@ -178,16 +179,37 @@ def simulator(
         NotSupported: a setting that decides what the loop is made of, or that this loop needs as a number.
         CompileError: the compiler fails on a loop with live settings.
     """
+    return built(problem, controller, compiled, flags, live, {})
+
+
+def built(
+    problem: Problem,
+    controller: Controller,
+    compiled: bool | None,
+    flags: Sequence[str],
+    live: Sequence[str],
+    known: dict[object, Compiled],
+) -> Simulator:
+    """Return what `simulator` does; a loop whose code is `known` is not compiled again, and `known` gets that of every other one.
+
+    Loops of one code differ in their first memory alone, as those of most starts do.
+    """
     settings = live_settings(problem, controller, live)
     ready = settings.controller
     loop = close_loop(problem, ready, settings if live else None)
     long = problem.cycles * (problem.horizon.stages if problem.horizon is not None else 1) > _SHORT_RUN
-    backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
-    if compiled or (compiled is None and long):
-        backend = native(loop.function, flags, required=bool(live), calls=moving(problem).cycles_of_call)
-    interpreted = moving(problem).cycles_interpreted
-    function = backend.function if backend.compiled else chained(loop.function, interpreted, _CHAIN)
-    return Simulator(problem, ready, loop, Evaluator(function), backend.compiled, backend.reason, settings)
+    key = compiled or (compiled is None and long), loop.function.serialize()
+    if key not in known:
+        backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
+        if key[0]:
+            backend = native(loop.function, flags, required=bool(live), calls=moving(problem).cycles_of_call)
+        interpreted = moving(problem).cycles_interpreted
+        function = backend.function if backend.compiled else chained(loop.function, interpreted, _CHAIN)
+        known[key] = Evaluator(function), backend.compiled, backend.reason
+    result = Simulator(problem, ready, loop, *known[key], settings)
+    if result.remembers:  # it is built anew for every run
+        del known[key]
+    return result
 
 
 @checked_call

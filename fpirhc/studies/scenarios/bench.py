@@ -28,7 +28,7 @@ from fpirhc.simulation.lanes import Lanes, OneRun
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.simulation.simulate import Compiled, Simulator, built
 from fpirhc.studies.comparison.causes import error_left_alone
 from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
 from fpirhc.task.problem import Problem
@@ -130,6 +130,7 @@ class Bench:
         self._ranges, self._held = ranges(task.problem), held(task.problem)
         self._simulators: dict[tuple[str, object], Simulator | FpirhcError] = {}
         self._shared: dict[tuple[str, object], Simulator | None] = {}
+        self._known: dict[object, Compiled] = {}
         self._lanes: dict[int, Lanes] = {}
         self._last: tuple[int, Scenario] | None = None
 
@@ -179,13 +180,14 @@ class Bench:
 
     def _lanes_of(self, name: str, scenario: Scenario) -> tuple[Lanes, Simulator]:
         ready = self._simulator(name, scenario)
-        if id(ready) not in self._lanes:
+        code = id(ready.evaluator)
+        if code not in self._lanes:
             shown = [one.title for one in self._pictures(name) if one.keeps]
             why = f"the picture '{shown[0]}' keeps something of every run" if shown else ""
-            self._lanes[id(ready)] = lanes = Lanes(ready, self._task.metrics, why=why)
+            self._lanes[code] = lanes = Lanes(ready, self._task.metrics, why=why)
             if lanes.why:
                 self.apart[name] = lanes.why
-        return self._lanes[id(ready)], ready
+        return self._lanes[code], ready
 
     def record(self, number: int, name: str, settings: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Return the result of one controller in one scenario, as plain data; a number that is not finite becomes None.
@@ -269,7 +271,7 @@ class Bench:
             if shared is not None:
                 checked(scenario.built, controller)
                 return shared
-            return simulator(scenario.built, controller, compiled=compile_it, live=live)
+            return built(scenario.built, controller, compile_it, (), live, self._known)
         except FpirhcError as error:
             return error
 
@@ -279,7 +281,7 @@ class Bench:
         if key not in self._shared:
             live = (*self._live.get(name, ()), *shared.live)
             try:
-                ready = simulator(shared.built, controller, compiled=compile_it, live=live)
+                ready = built(shared.built, controller, compile_it, (), live, self._known)
                 self._shared[key] = None if ready.remembers else ready
             except FpirhcError:  # what is wrong in every scenario is said by the loops of their own
                 self._shared[key] = None

@@ -19,7 +19,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
 from fpirhc.review.grid import is_late, live_paths, roomy, scaled
-from fpirhc.task.cases import Cases
+from fpirhc.task.cases import START, Cases
 from fpirhc.task.problem import Problem
 
 _REGISTER = 8  # numbers in one, at most
@@ -218,13 +218,19 @@ class NamedCases(Scenarios):
         return Scenario(name, group, seed, mismatch, key, built, problem, self._shared(name, built))
 
     def has_many_alike(self, number: int) -> bool:
-        alike = self._alike[self.cases.key(self.cases.names[number], self._live)]
+        alike = self._alike[self.cases.key(self.cases.names[number], self._data)]
         return alike == len(self.cases.names) or alike >= _REGISTER
 
     @cached_property
     def _alike(self) -> Counter[object]:
         """Number of cases of every loop."""
-        return Counter(self.cases.key(name, self._live) for name in self.cases.names)
+        return Counter(self.cases.key(name, self._data) for name in self.cases.names)
+
+    @cached_property
+    def _data(self) -> tuple[str, ...]:
+        """Paths of what is data of most loops: live numbers, and starts."""
+        paths = {path for changes in self.cases.changes.values() for path in changes}
+        return (*self._live, *(path for path in paths if path.startswith(f"{START}.")))
 
     def _shared(self, name: str, built: Problem) -> Shared | None:
         """The loop in which the numbers that cases change are live."""
