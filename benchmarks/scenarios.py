@@ -3,8 +3,8 @@
     python benchmarks/scenarios.py [--write] [--records]     --write puts the tables into docs/performance.md
                                                              --records measures records alone, in seconds
 
-A record is one run of one controller in one scenario, with its metrics: processor time, the smallest of many, bytes
-of memory are those of a thousand more records that are read from a file.
+A record is one run of one controller in one scenario, with its metrics: processor time, the smallest of many, of single runs and of
+runs side by side; bytes of memory are those of a thousand more records that are read from a file.
 
 Libraries are compiled before anything is timed. In every round the four ways take turns, so that whatever else the machine does
 falls on all: one process, two processes, two workers of a local Dask cluster, and, for what the machine can give, the same work
@@ -40,6 +40,7 @@ RECORDS, SOME, MORE = (
     40,
     80,
 )  # records that are timed; and how often they are read in the smaller and the larger file
+TURNS, BLOCK = 4, 64  # of scenarios side by side; the first one compiles
 STUDIES = (("two_mass", ("CTC", "CTC+FPI (eq 6)"), 2000), ("van_der_pol", ("RHC", "RHC+FPI", "RHC exact model"), 600))
 
 
@@ -112,11 +113,18 @@ def record(name: str, controller: str) -> tuple[str, ...]:
         begin = time.process_time()
         made.append(bench.record(number, controller))
         taken.append(time.process_time() - begin)
+    lanes, together = Bench(task, Conditions(seed=0, use=COMPARING, percent=10.0, compiled=True), side_by_side=True), []
+    for turn in range(TURNS):
+        begin = time.process_time()
+        some = list(lanes.records(range(turn * BLOCK, (turn + 1) * BLOCK), controller))
+        together.append((time.process_time() - begin) / len(some))
     memory = [held([{**one, "scenario": k} for k, one in enumerate(made * times)]) for times in (SOME, MORE)]
     lines = [len(json.dumps(one, separators=(",", ":"))) for one in made]
     return (
         f"{name}: {controller}, {task.problem.cycles} cycles",
         f"{1e3 * min(taken):.1f}",
+        f"{1e3 * min(together):.2f}",
+        f"{min(taken) / min(together):.1f}",
         f"{(memory[1] - memory[0]) / (RECORDS * (MORE - SOME)):.0f}",
         f"{np.mean(lines):.0f}",
     )
@@ -139,7 +147,7 @@ def held(records: list[dict[str, Any]]) -> int:
 
 def main() -> None:
     """Measure and print."""
-    heads = ("a record", "ms", "bytes of memory", "bytes in the file")
+    heads = ("a record", "ms", "ms side by side", "times faster", "bytes of memory", "bytes in the file")
     write_table("records", heads, [record(name, one) for name, names, _ in STUDIES for one in names[:2]])
     if "--records" in sys.argv:
         return

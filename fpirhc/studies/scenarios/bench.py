@@ -132,7 +132,7 @@ class Bench:
         self._shared: dict[tuple[str, object], Simulator | None] = {}
         self._known: dict[object, Compiled] = {}
         self._lanes: dict[int, Lanes] = {}
-        self._last: tuple[int, Scenario] | None = None
+        self._last: dict[int, Scenario] = {}
 
     def records(
         self, numbers: Sequence[int], name: str, settings: Sequence[Mapping[str, float] | None] | None = None
@@ -241,10 +241,12 @@ class Bench:
         return [one for one in self._task.pictures if not one.controllers or name in one.controllers]
 
     def _scenario(self, number: int) -> Scenario:
-        """The scenario; the last one is kept, because controllers take turns on it."""
-        if self._last is None or self._last[0] != number:
-            self._last = number, self._scenarios[number]
-        return self._last[1]
+        """The scenario; those of a block are kept, because controllers take turns on it."""
+        if number not in self._last:
+            if len(self._last) >= _BLOCK:
+                self._last.pop(next(iter(self._last)))
+            self._last[number] = self._scenarios[number]
+        return self._last[number]
 
     def _simulator(self, name: str, scenario: Scenario) -> Simulator:
         key = name, scenario.build
