@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -97,7 +96,7 @@ class Sums:
         return {m.name: one.result(part, run) for (m, one), part in pairs}, outside[:, -1] != 0
 
     def _row(
-        self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, Any]], log: np.ndarray, seed: int
+        self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, np.ndarray]], log: np.ndarray, seed: int
     ) -> Values:
         run = Run(problem.name, "", seed, problem.period, self.kept, log, None, True, {})
         of_logs = measure(problem, run, self._of_logs).values

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import random
+import shlex
 import signal
 import subprocess
 import sys
@@ -29,6 +30,7 @@ from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import is_late, scaled
+from fpirhc.studies.scenarios import paired
 from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error
 from fpirhc.studies.scenarios.cluster import DEATHS, Workers
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
@@ -602,3 +604,43 @@ def _children(parent: int) -> list[int]:
         if int(fields[1]) == parent:
             collected.append(int(stat.parent.name))
     return collected
+
+
+@pytest.mark.parametrize("percent", [0.0, 20.0])
+def test_the_ends_of_all_resamples_are_those_of_many(percent, monkeypatch):
+    """The binomial distribution of a resample's median beside 4000 resamples: within two places of the sorted values."""
+    values = np.sort(np.random.default_rng(int(percent)).normal(size=2001))
+    exact = paired.median_interval(values, seed=0)
+    monkeypatch.setattr(paired, "_MANY", 10**9)
+    drawn = paired.median_interval(values, seed=0)
+    for one, other in ((exact.low, drawn.low), (exact.high, drawn.high)):
+        assert abs(int(np.searchsorted(values, one)) - int(np.searchsorted(values, other))) <= 2
+    assert exact.median == drawn.median
+
+
+def test_a_scenario_is_run_once_more_by_the_command_of_the_report(tmp_path, capsys):
+    """With its parameters, dead times and noise: the saved run has the error of the record."""
+    task = fp.load_problem("two_mass")
+    command = "fpirhc compare two_mass --scenarios 5 --mismatch 20 --controllers CTC"
+    study = fp.compare_scenarios(
+        task,
+        count=5,
+        percent=20.0,
+        seed=4,
+        folder=tmp_path / "study",
+        controllers=["CTC"],
+        compiled=False,
+        command=command,
+    )
+    [worst, median] = study.view.lists["Scenarios to look at"]
+    number = study["CTC"].worst_scenario
+    assert worst == f"CTC, worst ({number}): fpirhc run two_mass CTC --scenario {number} --mismatch 20 --seed 4"
+    assert median.startswith("CTC, median (")
+    words = shlex.split(worst.partition(": fpirhc ")[2])
+    assert main([*words, "--no-compile", "--out", str(tmp_path)]) == 0
+    run = fp.load_run(tmp_path / f"CTC_scenario_{number}.npz")
+    late = run.time >= task.problem.measure_from
+    assert float(np.sqrt(np.mean(run["true_error.q1"][late] ** 2))) == pytest.approx(
+        study.records["CTC"][number]["metrics"]["rms_error"]["q1"], rel=1e-12
+    )
+    capsys.readouterr()

@@ -13,11 +13,12 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.bench import Bench, Conditions, ranges, relative_error
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
 from fpirhc.studies.sweep import Axis, sweep
 from fpirhc.studies.tuning.tune import tune
+from fpirhc.symbolic.native import Native, native
 
 TWO_MASS = fp.load_problem("two_mass")
 SMOOTH, ROUNDED = 1e-12, 1e-9  # relative; behind a quantum a last place is now and then a whole one
@@ -166,3 +167,25 @@ def test_lanes_keep_to_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     together = list(bench.records(range(20), "CTC"))
     monkeypatch.setattr("fpirhc.simulation.lanes._ROOM", 1)
     assert list(bench.records(range(20), "CTC")) == together
+
+
+def test_a_map_over_starts_has_one_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The basin of a law: code is compiled once, cells are runs from their starts, which are side by side."""
+    compiled: list[object] = []
+
+    def counted(*given: Any, **named: Any) -> Native:
+        compiled.append(given)
+        return native(*given, **named)
+
+    monkeypatch.setattr("fpirhc.simulation.simulate.native", counted)
+    axes = [Axis.parsed("start.q1=1:3.4:8"), Axis.parsed("start.q1'=-4:4:8")]
+    task = short(TWO_MASS)
+    found = sweep(task, axes, folder=tmp_path, controllers=["RHC"]).maps[0]
+    assert len(compiled) == 1
+    assert not found.apart
+    for place in ((0, 0), (3, 7), (7, 2)):
+        start = {"q1": axes[0].values[place[0]], "q1'": axes[1].values[place[1]]}
+        problem = replace(task.problem, start={**task.problem.start, **start})
+        run = fp.simulate(problem, task.controllers["RHC"], seed=0)
+        error = relative_error(fp.measure(problem, run), ranges(task.problem))
+        assert found.values[place] == pytest.approx(error, rel=SMOOTH)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from fpirhc.cli.options import add_no_compile, add_out, add_problem, add_seed, add_set, numbers
+from fpirhc.cli.options import add_mismatch, add_no_compile, add_out, add_problem, add_seed, add_set, numbers, whole
 from fpirhc.cli.output import results_folder
 from fpirhc.cli.verb import ExitCode, Verb
 
@@ -26,7 +27,11 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(parser)
     add_seed(parser, "the noise")
     add_no_compile(parser)
-    parser.add_argument("--case", metavar="NAME", help="run the problem in this case of the problem file")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--case", metavar="NAME", help="run the problem in this case of the problem file")
+    text = "run scenario K of 'fpirhc compare --scenarios' with this seed and mismatch"
+    which.add_argument("--scenario", type=whole(0), metavar="K", help=text)
+    add_mismatch(parser, None)
     add_set(parser, "; or a set-point, setpoints.q1=2")
 
 
@@ -34,33 +39,42 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import in_case, load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
+    from fpirhc.errors import InvalidValue
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.studies.comparison.compare import check_gains, select
     from fpirhc.studies.comparison.pairwise import harm_of_adaptation
+    from fpirhc.studies.scenarios.draws import COMPARING, RandomScenarios
 
     task = in_case(task, options.case) if options.case else task
-    name = options.controller
+    name, seed = options.controller, options.seed
     controller = select(task, [name])[name]
     if not options.settings:
         check_gains(task, {name: controller})
+    if options.scenario is not None:
+        scenarios = RandomScenarios(task.problem, seed, COMPARING, options.mismatch or 0.0)
+        one = scenarios[options.scenario]
+        task, controller, seed = replace(task, problem=one.problem), scenarios.automatic(controller), one.seed
+    elif options.mismatch is not None:
+        raise InvalidValue("--mismatch belongs to --scenario K, the number of a scenario")
     folder = results_folder(options.out, task.name)
     with progress_bars() as progress:
         problem, changed, run = _simulated(
             task.problem,
             controller,
             *by_kind(numbers(options.settings)),
-            seed=options.seed,
+            seed=seed,
             name=name,
             compiled=not options.no_compile,
             progress=_named(progress, name),
         )
-    stem = "".join(c if c.isalnum() else "_" for c in f"{name} {options.case or ''}".strip())
+    which = options.case or ("" if options.scenario is None else f"scenario {options.scenario}")
+    stem = "".join(c if c.isalnum() else "_" for c in f"{name} {which}".strip())
     run.save(folder / f"{stem}.npz")
     save_figure(run.plot(), folder / f"{stem}.png")
     announce_backend([run])
-    facts = {"seed": options.seed, "compiled": not options.no_compile, "metrics": task.metrics}
+    facts = {"seed": seed, "compiled": not options.no_compile, "metrics": task.metrics}
     harm = harm_of_adaptation(problem, name, changed, **facts)
     show_run(run, measure(problem, run, task.metrics), harm, folder / f"{stem}.npz")
     return ExitCode.FINISHED if run.stop is None else ExitCode.ENDED_EARLY
@@ -157,6 +171,10 @@ VERB = Verb(
         ),
         ('fpirhc run two_mass "RHC+FPI" --set exact.m1=1.4 --set start.q1=2', "another plant and another start"),
         ('fpirhc run my_arm.py "RHC+FPI" --case heavy', "the problem in a case of its file"),
+        (
+            'fpirhc run two_mass "RHC+FPI" --scenario 14 --mismatch 20',
+            "a scenario of compare --scenarios, with every signal",
+        ),
         ('fpirhc run my_arm.py "RHC+FPI" --out results --seed 3', "another folder, other noise"),
     ),
 )

@@ -126,6 +126,10 @@ class Scenarios(ABC):
     def __getitem__(self, number: int) -> Scenario:
         """Return a scenario, always the same one."""
 
+    @abstractmethod
+    def options(self, number: int) -> tuple[str, ...]:
+        """Return the options of `fpirhc run` that run a scenario once more."""
+
     def automatic(self, controller: Controller) -> Controller:
         """Return the controller with those settings that it has whatever the scenario is."""
         return controller
@@ -164,6 +168,9 @@ class RandomScenarios(Scenarios):
         built = self._late[lateness]
         problem = built.with_exact(one.exact)
         return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, problem, self._shared)
+
+    def options(self, number: int) -> tuple[str, ...]:
+        return ("--scenario", str(number), "--mismatch", f"{self.percent:g}", "--seed", str(self.seed))
 
     def automatic(self, controller: Controller) -> Controller:
         return resolved(self.of, controller) if self._draws_dead_times else controller
@@ -216,6 +223,9 @@ class NamedCases(Scenarios):
         mismatch = _mismatch(problem.plant, moved, exact)
         group, seed = self.cases.group(name), seed if own is None else own
         return Scenario(name, group, seed, mismatch, key, built, problem, self._shared(name, built))
+
+    def options(self, number: int) -> tuple[str, ...]:
+        return ("--case", self.cases.names[number], "--seed", str(self[number].seed))
 
     def has_many_alike(self, number: int) -> bool:
         alike = self._alike[self.cases.key(self.cases.names[number], self._data)]

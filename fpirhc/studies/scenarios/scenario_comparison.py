@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
@@ -51,6 +52,7 @@ class ScenarioComparison(Study, FoundByName):
         time_unit: unit of time of the problem.
         pictures: those of the problem file; they are drawn where they keep something of every run.
         apart: why runs of some controllers were one after the other, and not side by side.
+        to_look_at: options of `fpirhc run` for some scenarios, by controller and what they are.
     """
 
     count: int
@@ -69,6 +71,7 @@ class ScenarioComparison(Study, FoundByName):
     groups: Mapping[str, tuple[Summary, ...]] = field(default_factory=dict)
     pictures: tuple[Picture, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
+    to_look_at: Mapping[str, Mapping[str, Sequence[str]]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"
@@ -118,10 +121,19 @@ def _view(comparison: ScenarioComparison) -> View:
             "How it was run": [
                 f"{name}: one run after the other, because {why}" for name, why in comparison.apart.items()
             ],
+            f"{noun(comparison.named).capitalize()} to look at": list(_to_look_at(comparison)),
         },
         skipped=comparison.skipped,
         facts=_facts(comparison),
     )
+
+
+def _to_look_at(comparison: ScenarioComparison) -> Iterator[str]:
+    """The commands that run them once more, with every signal."""
+    task = shlex.split(comparison.command)[2] if comparison.command else comparison.problem
+    for name, some in comparison.to_look_at.items():
+        for what, options in some.items():
+            yield f"{name}, {what}: {shlex.join(['fpirhc', 'run', task, name, *options])}"
 
 
 def _flat(metrics: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:

@@ -20,7 +20,15 @@ from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
 from fpirhc.simulation.metrics.measuring import Column
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Bench, Conditions, RecordFields, fingerprint, scenario_numbers
+from fpirhc.studies.scenarios.bench import (
+    SIDE_BY_SIDE,
+    Bench,
+    Conditions,
+    RecordFields,
+    fingerprint,
+    scenario_numbers,
+    scenarios,
+)
 from fpirhc.studies.scenarios.cluster import Cluster, Workers
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger, header_of
@@ -127,7 +135,23 @@ def compare_scenarios(
         **circumstances(task, select(task, names), command, begin),
         pictures=task.pictures,
         apart={n: why for n, why in bench.apart.items() if n in records},
+        to_look_at={} if tuned else _to_look_at(task, conditions, summaries, records),
     )
+
+
+def _to_look_at(
+    task: Task, conditions: Conditions, summaries: Sequence[Summary], records: Mapping[str, Sequence[Record]]
+) -> dict[str, dict[str, tuple[str, ...]]]:
+    """Options of the runs of the worst, the median and the first failing scenario of every controller."""
+    every = scenarios(task, conditions)
+    found: dict[str, dict[str, tuple[str, ...]]] = {}
+    for one in summaries:
+        order, failed = np.argsort(one.values, kind="stable"), np.flatnonzero(~np.isfinite(one.values))
+        places = {"worst": order[-1], "median": order[(len(order) - 1) // 2]}
+        places |= {"first that ended early": failed[0]} if failed.size else {}
+        numbers = {what: int(records[one.name][int(place)]["scenario"]) for what, place in places.items()}
+        found[one.name] = {f"{what} ({every[k].name})": every.options(k) for what, k in numbers.items()}
+    return found
 
 
 def _of_shard(numbers: Sequence[int], part: int, parts: int) -> Sequence[int]:
