@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotInstalled
+from fpirhc.errors import DeviceFailed, InvalidName, InvalidShape, InvalidValue, NotInstalled
 from fpirhc.simulation.lanes import run_many
 from fpirhc.simulation.metrics.base import measured_errors
 from fpirhc.simulation.simulate import Simulator
@@ -172,6 +172,21 @@ def test_what_a_device_cannot_run_is_told():
     assert many.why.startswith("the loop has a part that is not written for devices: fpirhc_fixed_point_")
     with pytest.raises(InvalidName, match="no OpenCL device is called 'abacus'"):
         run_many(fp.simulator(*CASES["map"]), plants(fp.simulator(*CASES["map"]), 2), device="abacus")
+
+
+def test_a_device_that_fails_is_named(monkeypatch):
+    """What a driver says while it runs is one sentence, with what to do."""
+    device = some_device()
+    cl = pytest.importorskip("pyopencl")
+
+    def exhausted(*_args):
+        raise cl.MemoryError("clEnqueueReadBuffer failed: OUT_OF_RESOURCES\nand more")
+
+    monkeypatch.setattr(cl, "enqueue_copy", exhausted)
+    ready = fp.simulator(replace(TWO_MASS.problem, duration=0.5, measure_from=0.1), ADAPTIVE)
+    told = r"failed with 2 plants \(.*OUT_OF_RESOURCES\): run fewer plants at once, or leave the device out"
+    with pytest.raises(DeviceFailed, match=told):
+        run_many(ready, plants(ready, 2), device=device)
 
 
 def test_a_device_needs_its_package(monkeypatch):
