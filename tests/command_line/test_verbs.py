@@ -367,7 +367,7 @@ JOURNEYS: dict[str, Any] = {
         (None, "line.py CTC --out other --name 2nd", 2),
     ],
     "lab": [
-        (None, "line.py --out lab.html", 0),
+        (None, "line.py --controllers CTC+FPI --out lab.html", 0),
         (None, "line.py --out line.py/lab.html", 3),
         (None, "line.py --controllers nobody", 2),
     ],

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -37,10 +38,10 @@ globalThis.postMessage = (said) => { if (said.ready) return onmessage({ data: { 
 """
 
 
-def made(name: str, duration: float | None = None) -> Lab:
+def made(name: str, duration: float | None = None, controllers: Sequence[str] = ()) -> Lab:
     task = fp.load_problem(name)
     problem = task.problem if duration is None else replace(task.problem, duration=duration, measure_from=0.0)
-    chosen = {n: task.controllers[n] for n in CASES[name]}
+    chosen = {n: task.controllers[n] for n in controllers or CASES[name]}
     return make_lab(name, task.title, name, problem, chosen, pictures=task.pictures)
 
 
@@ -163,7 +164,7 @@ def test_reference_dead_time_and_set_points_have_the_numbers_of_a_task_that_stat
 def test_a_slider_that_needs_python_is_left_out_and_says_why(monkeypatch):
     """The first plan follows from the upper limit of the motor's voltage; a zero has no scale."""
     monkeypatch.setattr(module, "package", lambda *_: None)
-    lab = made("noisy_motor", duration=0.5)
+    lab = made("noisy_motor", duration=0.5, controllers=["RHC"])
     paths = {s.path for s in lab.sliders}
     assert {"exact.k", "approximate.k"} & paths or len(paths) > 5
     assert "only Python computes that" in lab.without["limits.inputs.voltage.1"]
@@ -176,7 +177,7 @@ def short() -> Lab:
     """Half a second of two masses, without WebAssembly."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "package", lambda *_: None)
-        return made("two_mass", duration=0.5)
+        return made("two_mass", duration=0.5, controllers=["CTC+FPI (eq 6)"])
 
 
 def test_a_slider_stays_inside_the_bounds_of_its_setting(short):

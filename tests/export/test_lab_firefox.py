@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -53,8 +52,9 @@ class Firefox:
         """Move the slider of the first mass, and wait until the page shows the run with it."""
         began = self.evaluate("window.shownNumber || 0")
         self.evaluate(f"set({PLACE}, {mass!r})")
-        while self.evaluate("busy || (window.shownNumber || 0)") in (True, began):
-            time.sleep(0.02)
+        done = f"!busy && (window.shownNumber || 0) !== {began}"
+        look = f"const look = () => {done} ? resolve() : requestAnimationFrame(look); look();"
+        self.evaluate(f"new Promise((resolve) => {{ {look} }})")
 
     def memory(self) -> int:
         """Bytes in memory of the browser's processes."""

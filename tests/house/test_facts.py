@@ -6,6 +6,7 @@ import ast
 import importlib
 import inspect
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -425,6 +426,13 @@ BUILDS = {
 }
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """The tree of a file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def contracts() -> tuple[type, ...]:
     """The families' contracts."""
     collected = []
@@ -437,7 +445,7 @@ def contracts() -> tuple[type, ...]:
 def names_in(path: Path) -> dict[str, Any]:
     """What a file imports or defines by name, imports inside of functions included."""
     module = importlib.import_module(".".join(["fpirhc", *path.relative_to(PACKAGE).with_suffix("").parts]))
-    nodes = [n for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.ImportFrom)]
+    nodes = [n for n in ast.walk(parsed(path)) if isinstance(n, ast.ImportFrom)]
     inside = [(n.module, a) for n in nodes if n.col_offset and str(n.module).startswith("fpirhc.") for a in n.names]
     late = {a.asname or a.name: getattr(importlib.import_module(str(source)), a.name) for source, a in inside}
     return late | vars(module)
@@ -445,6 +453,8 @@ def names_in(path: Path) -> dict[str, Any]:
 
 def named_members(path: Path, used: set[str]) -> set[str]:
     """Names in `used` that a file imports or defines and that are members of a family."""
+    if not used:
+        return set()
     families, known = contracts(), names_in(path)
     values = {name: known.get(name) for name in used}
     return {n for n, v in values.items() if inspect.isclass(v) and issubclass(v, families) and v not in families}
@@ -476,7 +486,7 @@ def test_nobody_is_asked_for_his_class():
     """No isinstance, issubclass, type comparison or pattern on a member of a family, in any file."""
     ladders = {}
     for path in files():
-        members = named_members(path, asked_classes(ast.parse(path.read_text(encoding="utf-8"))))
+        members = named_members(path, asked_classes(parsed(path)))
         if members:
             ladders[str(path.relative_to(PACKAGE))] = members
     assert not ladders
@@ -489,8 +499,9 @@ def test_generic_code_names_no_members():
         name = path.relative_to(PACKAGE).as_posix()
         if name.split("/")[0] not in GENERIC and name not in GENERIC_FILES:
             continue
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        imported = {a.asname or a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+        imported = {
+            a.asname or a.name for n in ast.walk(parsed(path)) if isinstance(n, ast.ImportFrom) for a in n.names
+        }
         members = {m for m in named_members(path, imported) if _is_foreign(path, m)}
         if members:
             collected[name] = members

@@ -2,9 +2,10 @@
 
 A form is a way to say a plant (coordinates of any order, outputs of states, a static map, a map of steps) or what lies between
 plant and controller (dead time, estimators, beliefs, another plant, a body outside). The law of a pair: the run with a wrong
-model stays near its reference, and a Stepper that is given the run's measurements has the run's commands. A pair that is not
-served stands below with the sentence that its user reads; every other refusal is a defect. Members are found by search, so a
-new one is tried on all forms, and a new form with all members.
+model stays near its reference, and a Stepper that is given the run's measurements has the run's commands. A controller decides
+what a Stepper is composed of, so each is replayed on all forms; its parts are blocks in it, and are replayed on two forms each,
+in turn. A pair that is not served stands below with the sentence that its user reads; every other refusal is a defect. Members
+are found by search, so a new one is tried on all forms, and a new form with all members.
 """
 
 from __future__ import annotations
@@ -184,4 +185,6 @@ def test_a_member_serves_a_form_or_says_why_not(member: str, form: str) -> None:
     assert run.stop is None
     error = float(np.sqrt(np.mean(run["true_error"][-run.cycles // 4 :] ** 2)))
     assert (error < NEAR) == ((member, form) not in FARTHER)
-    np.testing.assert_allclose(replayed(problem, controller, run), run["command"][:REPLAYED], rtol=1e-9, atol=1e-9)
+    turn = list(MEMBERS).index(member) - list(FORMS).index(form)
+    if member in CONTROLLERS or turn % (len(FORMS) // 2) == 0:
+        np.testing.assert_allclose(replayed(problem, controller, run), run["command"][:REPLAYED], rtol=1e-9, atol=1e-9)

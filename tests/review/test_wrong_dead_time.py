@@ -275,7 +275,7 @@ def test_a_loop_that_grows_too_slowly_for_a_short_run_is_no_yes():
     """Plans that are stiffer than the shipped ones swing at 66 cycles: a run of 2 s shows .043 m, and one of 12 s .072."""
     task = fp.load_problem("delayed_mass")
     problem = replace(task.problem, cost=fp.Quadratic(states={"q": 1e3, "q'": 1.0}, deviation={"Q": 9e-4}))
-    one = about(answers(problem, task.controllers["RHC+FPI"]), "wrong by a tenth")
+    one = answer(problem, task.controllers["RHC+FPI"], "wrong by a tenth")
     assert one.verdict == "unknown"
     assert one.evidence.startswith("longer: the rms error of q is 0.0402 m without adaptation, 0.043 m with it; ")
     assert "; but 6 cycles off, the slowest mode is multiplied by 1.000" in one.evidence
@@ -287,5 +287,5 @@ def test_a_loop_that_grows_too_slowly_for_a_short_run_is_no_yes():
     late = replace(problem, dead_time=fp.DeadTime(inputs={"Q": 0.066}))
     run = fp.simulate(late, task.controllers["RHC+FPI"], seed=0)
     assert fp.measure(late, run).rms_error["q"] == pytest.approx(0.072, rel=0.02)
-    shipped = about(answers(task.problem, task.controllers["RHC+FPI"]), "wrong by a tenth")
+    shipped = answer(task.problem, task.controllers["RHC+FPI"], "wrong by a tenth")
     assert shipped.verdict == "yes"

@@ -160,5 +160,5 @@ def test_the_command_prints_and_saves_what_was_found(tmp_path, capsys):
     assert "at most 30 % of all plants of the box do, with 90 % confidence" in (tmp_path / "report.html").read_text(
         encoding="utf-8"
     )
-    assert main(["robust", "two_mass", "--controllers", "CTCC"]) == 2
+    assert main(["robust", "two_mass", "--controllers", "CTCC", "--out", str(tmp_path)]) == 2
     assert "CTCC" in capsys.readouterr().err
