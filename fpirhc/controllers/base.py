@@ -24,7 +24,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import GAP, SETTLING, Block, Delay, Step, is_long
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
 from fpirhc.symbolic.functions import numbers
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar, vector
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -140,7 +140,7 @@ def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[
     The controller also writes 'desired', and '_deformed_unclipped': the response that its model expects of this command.
     `judged` are solver statuses.
     """
-    delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(command_before(problem), "command")]
+    delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(command_before(problem), "command")]
     return [_limit_block(problem), _judge_block(judged), _warm_up_block(problem.longest_warm_up)], delays
 
 

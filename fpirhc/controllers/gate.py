@@ -258,7 +258,7 @@ class Gate:
         memory = self.inner.memory
         if not self.inner.opaque:
             return memory
-        return Layout((Signal(INNER, memory.columns, memory.units, tuple(map(float, memory.start()))),))
+        return Layout((Signal(INNER, memory.columns, memory.units, tuple(map(float, memory.start())), memory.kinds),))
 
     def named(self, memory: Layout) -> Layout:
         """Return a layout with the controller's memory under the names of its signals, where it is one signal there."""

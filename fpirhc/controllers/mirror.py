@@ -168,7 +168,7 @@ def _twin(path: CommandPath, motion: _States | _Outputs) -> Block:
     problem, plant = path.problem, path.problem.plant
     estimator = problem.sensing.estimator
     estimate = estimator.block(plant, problem.period, motion.start, Signal("_seen", estimator.measures(plant)))
-    own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
+    own = tuple(replace(m, name=f"mirror_{m.name}") for m in estimate.memory.signals)
     moves = memory_moves(problem, estimator.measures(plant))
 
     def step(s: Signals) -> dict[str, Expression]:

@@ -42,7 +42,7 @@ from fpirhc.status import STOPPED, Status
 from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.functions import nan_where, numbers
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, copied, live_numbers, nominal, settled
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
@@ -218,7 +218,7 @@ def _read_from_data(optimiser: Optimiser) -> dict[str, LiveNumber]:
 
 def _due_block(cycles: int) -> Block:
     """Block -> whether a new plan is due in this cycle."""
-    count = scalar("plan_count")
+    count = discrete("plan_count")
 
     def step(s: Signals) -> dict[str, Expression]:
         count_next = s.plan_count + 1
@@ -272,8 +272,8 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     stopped = (scalar(STOPPED),) if on_failure.stops else ()
     writes = (
         like(plant.input, "planned"),
-        Signal("solve", _SOLVE),
-        scalar("_solve_status"),
+        Signal("solve", _SOLVE, kinds=(Kind.DISCRETE,)),
+        discrete("_solve_status"),
         *stopped,
         *map(scalar, optimiser.logged),
     )
@@ -324,7 +324,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         first = lambda: optimiser.memory(ocp).unpack(first_memory(start, optimiser, ahead, table_of))  # noqa: E731
         return Derived(signals, first, {name: _STALE[name] for name in signals})
 
-    own = memory + Layout((scalar("plan_begun"),))
+    own = memory + Layout((discrete("plan_begun"),))
     live = derived if ocp.settings or ocp.live_bounds else None
     return Block("plan", _plan_reads(problem, ocp, room), Layout(writes), step, own, opaque=True, derived=live)
 

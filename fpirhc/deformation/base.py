@@ -350,7 +350,7 @@ class Wrapper(Deformation, ABC):
         return replace(self, map=self.map.with_effective_gain(gain))
 
 
-def discrete(wrapper: Wrapper, memory: Mapping[str, Expression], size: int) -> dict[str, Expression]:
+def memory_of_map(wrapper: Wrapper, memory: Mapping[str, Expression], size: int) -> dict[str, Expression]:
     """Return the part of a wrapper's memory that belongs to the map; `size` is the number of coordinates."""
     own = wrapper.map.memory(tuple(f"q{k}" for k in range(size)))
     return {name: memory[name] for name in own.names}

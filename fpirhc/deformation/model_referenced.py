@@ -11,7 +11,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, memory_of_map
 from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne, finite_number
@@ -99,7 +99,7 @@ class ModelReferenced(Wrapper):
         size, queue, past = request.numel(), self._queue, memory["own_deformation"]
         before, pole = past[:size], self._leak
         undeformed = request - queue.delayed(past, size)
-        next_request, next_memory = self.map.step(request, response, undeformed, discrete(self, memory, size))
+        next_request, next_memory = self.map.step(request, response, undeformed, memory_of_map(self, memory, size))
         deformation = next_request - undeformed
         if not stays(pole, 0.0):
             deformation = pole * before + (1 - pole) * deformation

@@ -9,7 +9,7 @@ its metrics show it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -18,7 +18,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import FINITE
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, discrete
 
 _PLAN, _COUNT = "plan_inputs", "plan_second_plans"
 
@@ -54,9 +54,9 @@ class Ladder(Optimiser):
 
     def memory(self, ocp: OptimalControl) -> Layout:
         first, second = self.first.memory(ocp), self.second.memory(ocp)
-        own = [Signal(f"first_{s.name}", s.elements, s.units, s.start) for s in first.signals if s.name != _PLAN]
-        other = [Signal(f"second_{s.name}", s.elements, s.units, s.start) for s in second.signals if s.name != _PLAN]
-        return Layout((first[_PLAN], *own, *other, scalar(_COUNT)))
+        own = [replace(s, name=f"first_{s.name}") for s in first.signals if s.name != _PLAN]
+        other = [replace(s, name=f"second_{s.name}") for s in second.signals if s.name != _PLAN]
+        return Layout((first[_PLAN], *own, *other, discrete(_COUNT)))
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         parts = self.memory(ocp).split(memory)

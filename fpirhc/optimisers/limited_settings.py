@@ -8,7 +8,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.bounds import Scales, scales
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, discrete
 
 PATIENCE = 3  # pure steps in a row that may fail to halve the error: the active limits are changing
 HOPELESS = 1e2  # scaled error from which on there is no patience: multipliers are at their largest value
@@ -78,7 +78,7 @@ def limited_memory(ocp: OptimalControl) -> Layout:
             Signal("plan_costates", later),
             Signal("plan_gains", tuple(f"{e}/{x}@{k}" for k in n for x in states for e in inputs)),
             Signal("plan_multipliers", multipliers),
-            scalar("plan_barrier"),
-            scalar("plan_damping"),
+            discrete("plan_barrier"),
+            discrete("plan_damping"),
         )
     )

@@ -21,7 +21,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
 from fpirhc.symbolic.expression import FINITE, is_finite
 from fpirhc.symbolic.latest import Latest
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, discrete
 from fpirhc.symbolic.live import LiveNumber, Number
 from fpirhc.symbolic.native import Native
 
@@ -69,8 +69,8 @@ def plain_memory(ocp: OptimalControl) -> Layout:
             Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(n) for i in inputs)),
             Signal("plan_states", tuple(f"{s}@{k}" for k in range(n) for s in state)),
             Signal("plan_gains", tuple(f"{i}/{s}@{k}" for k in range(n) for s in state for i in inputs)),
-            scalar("plan_gamma", start=0.0),
-            scalar("plan_step", start=0.0),
+            discrete("plan_gamma"),
+            discrete("plan_step"),
         )
     )
 

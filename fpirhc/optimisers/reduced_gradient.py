@@ -15,7 +15,7 @@ from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, sane, shift, status_of
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import TINY, is_finite
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, discrete
 
 _HISTORY = 5  # values that the non-monotone line search compares with
 _DECREASE = 1e-4
@@ -40,7 +40,7 @@ class ReducedGradient(Optimiser):
 
     def memory(self, ocp: OptimalControl) -> Layout:
         plan = Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements))
-        return Layout((plan, scalar("plan_step_length", start=0.0)))
+        return Layout((plan, discrete("plan_step_length")))
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         plan = ca.reshape(memory[:-1], ocp.input.size, ocp.stages)

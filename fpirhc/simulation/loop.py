@@ -22,7 +22,7 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.simulation.path import acting_blocks, disturbance_signals, moving, outside_blocks, sensing_blocks
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
 from fpirhc.symbolic.live import PREFIX, nominal
 from fpirhc.task.problem import Problem
 
@@ -118,4 +118,4 @@ def _clock_block(time: Signal, period: float) -> Block:
     def step(s: Signals) -> dict[str, Expression]:
         return {"time": s.cycle * period, "cycle_next": s.cycle + 1}
 
-    return Block("clock", Layout(), Layout((time,)), step, Layout((scalar("cycle"),)))
+    return Block("clock", Layout(), Layout((time,)), step, Layout((discrete("cycle"),)))

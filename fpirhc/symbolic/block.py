@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.symbolic.expression import FINITE, Expression, Matrix, Signals, Value, expression, kind, total
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Kind, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX as SETTING
 from fpirhc.symbolic.live import Derived, Values
 
@@ -354,10 +354,8 @@ def every(block: Block, cycles: int) -> Block:
         raise InvalidValue(f"block '{block.name}' is to run every {cycles} cycles; expected 1 or more")
     if cycles == 1:
         return block
-    phase = scalar(f"{block.name}_phase")
-    held = Layout(
-        tuple(Signal(f"{block.name}_held_{s.name}", s.elements, s.units, s.start) for s in block.writes.signals)
-    )
+    phase = Signal(f"{block.name}_phase", kinds=(Kind.PHASE,))
+    held = Layout(tuple(replace(s, name=f"{block.name}_held_{s.name}") for s in block.writes.signals))
     own = Layout((phase, *held.signals)) + block.memory
     run, hold = _branches(block, held)
 

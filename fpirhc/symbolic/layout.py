@@ -10,7 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from functools import cached_property
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
@@ -19,7 +21,19 @@ import numpy.typing as npt
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, column
 
-__all__ = ["Expression", "Layout", "Named", "Signal", "scalar", "vector"]
+__all__ = ["Expression", "Kind", "Layout", "Named", "Signal", "discrete", "scalar", "vector"]
+
+
+T = TypeVar("T")
+
+
+class Kind(Enum):
+    """What an entry of a memory is, for whoever linearises a step: a state deviates, all others stay what they are at the point."""
+
+    STATE = "deviates"
+    DISCRETE = "jumps, or is only recorded: a count, a status, what a line search remembers"
+    PHASE = "discrete, and back at its value when the step repeats itself"
+    ADAPTED = "part of a model or a gain that changes on line"
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +45,14 @@ class Signal:
         elements: names of its entries; empty: a scalar.
         units: one per entry, or one for all; empty: '1'.
         start: first value; empty: zeros.
+        kinds: of a memory: one per entry, or one for all; empty: `Kind.STATE`.
     """
 
     name: str
     elements: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     start: tuple[float, ...] = ()
+    kinds: tuple[Kind, ...] = ()
 
     @cached_property
     def size(self) -> int:
@@ -51,18 +67,31 @@ class Signal:
     @property
     def entry_units(self) -> tuple[str, ...]:
         """One unit per entry; '1' where the signal has none."""
-        if not self.units:
-            return ("1",) * self.size
-        return self.units if len(self.units) == self.size else self.units * self.size
+        return _each(self.units or ("1",), self.size)
+
+    @property
+    def entry_kinds(self) -> tuple[Kind, ...]:
+        """One kind per entry."""
+        return _each(self.kinds or (Kind.STATE,), self.size)
 
     def start_vector(self) -> np.ndarray:
         """Start value, shape (size,); zeros where the signal has none."""
         return np.array(self.start if self.start else (0.0,) * self.size, dtype=float)
 
 
+def _each(values: tuple[T, ...], size: int) -> tuple[T, ...]:
+    """One value per entry, of one per entry or one for all."""
+    return values if len(values) == size else values * size
+
+
 def scalar(name: str, unit: str = "1", start: float = 0.0) -> Signal:
     """Return a scalar signal."""
     return Signal(name, (), (unit,), (start,))
+
+
+def discrete(name: str, start: float = 0.0) -> Signal:
+    """Return a scalar of a memory that jumps, or is only recorded: a count, a status, what a line search remembers."""
+    return Signal(name, start=(start,), kinds=(Kind.DISCRETE,))
 
 
 def vector(name: str, elements: Sequence[str], units: Sequence[str] | str = "1", start: Sequence[float] = ()) -> Signal:
@@ -129,6 +158,15 @@ class Layout:
     def units(self) -> tuple[str, ...]:
         """Units of all entries of the flat vector."""
         return tuple([u for s in self.signals for u in s.entry_units])
+
+    @cached_property
+    def kinds(self) -> tuple[Kind, ...]:
+        """Kinds of all entries of the flat vector."""
+        return tuple([k for s in self.signals for k in s.entry_kinds])
+
+    def adapted(self) -> Layout:
+        """The same signals as part of a model or a gain that changes on line."""
+        return Layout(tuple(replace(s, kinds=(Kind.ADAPTED,)) for s in self.signals))
 
     def __getitem__(self, name: str) -> Signal:
         self.slice(name)

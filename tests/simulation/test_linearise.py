@@ -13,7 +13,13 @@ from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
-SHIPPED = ["two_mass:CTC+FPI (eq 6)", "two_mass:RHC", "noisy_motor:RHC+FPI", "van_der_pol_duffing:RHC offset-free"]
+SHIPPED = [
+    "two_mass:CTC+FPI (eq 6)",
+    "two_mass:RHC",
+    "noisy_motor:RHC+FPI",
+    "van_der_pol_duffing:RHC offset-free",
+    "mrac_pendulum:intelligent PD",
+]
 
 
 def asked(name: str) -> AskedLoop:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -26,7 +26,7 @@ from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, pair
 from fpirhc.symbolic.latest import Latest
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
 Gradient = Callable[[Signals, Expression, Expression], Pair]  # (signals, state of the response, estimate) -> (G, w)
@@ -92,7 +92,7 @@ class Learning:
         others = [k for k in range(len(plant.parameters)) if k not in regressor.covered]
         lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)
-        learned = Signal("learned", regressor.signal.elements, regressor.signal.units)
+        learned = replace(regressor.signal, name="learned", start=(), kinds=(Kind.ADAPTED,))
         pairs = ResponsePairs(problem, problem.dead_time)
         late = (pairs.state,) if pairs.waiting else ()
         begins = problem.warm_up_cycles if self.rule.reads_response else 1

@@ -22,7 +22,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers, power
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 
@@ -147,7 +147,9 @@ def _regressed(plant: Plant) -> tuple[str, ...]:
 
 def _gains(plant: Plant, name: str) -> Signal:
     """Theta column by column: torque_angle is the gain of the angle in the torque."""
-    return Signal(name, tuple(f"{u}_{x}" for x in _regressed(plant) for u in plant.input.elements))
+    return Signal(
+        name, tuple(f"{u}_{x}" for x in _regressed(plant) for u in plant.input.elements), kinds=(Kind.ADAPTED,)
+    )
 
 
 def _adapted(plant: Plant) -> tuple[Signal, ...]:

@@ -173,7 +173,7 @@ def for_channel(
 
     def renamed(signal: Signal) -> Signal:
         name = signal.name if signal.name in shared else names.get(signal.name, one.wire(signal.name))
-        return Signal(name, signal.elements, signal.units, signal.start)
+        return replace(signal, name=name)
 
     begun = one.signal("warm_up")
     reads = [s if s.name.startswith(PREFIX) else renamed(s) for s in block.inputs.signals]
@@ -209,10 +209,7 @@ def for_channel(
 
 def delays_for_channel(delays: tuple[Delay, ...], one: Channel) -> list[Delay]:
     """Return the delays of a law, on the slot's own copies of its signals."""
-    return [
-        Delay(Signal(one.wire(d.now.name), d.now.elements, d.now.units, d.now.start), one.wire(d.source))
-        for d in delays
-    ]
+    return [Delay(replace(d.now, name=one.wire(d.now.name)), one.wire(d.source)) for d in delays]
 
 
 def integrators(plant: Plant, quantities: Mapping[str, tuple[str, int]], inputs: Sequence[str]) -> Plant:

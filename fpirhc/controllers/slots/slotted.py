@@ -55,7 +55,7 @@ from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
 from fpirhc.symbolic.functions import ceil, exp, signed, stays
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar
 from fpirhc.task.problem import Problem
 
 
@@ -185,8 +185,9 @@ class Slotted(Controller):
         blocks += [
             for_channel(c.slot.tracking.update(c.plant, problem.period), c, {"clipped", "time"}, {}) for c in channels
         ]
-        remembered = {"warm_up": "_warm_up_now", "_slot_before": "slot", "_age_before": "_age"}
-        remembered |= {"_offset_before": "_offset", "_distance_before": "_distance"}
+        counted = {"warm_up": "_warm_up_now", "_slot_before": "slot", "_age_before": "_age"}
+        delays += [Delay(discrete(now), source) for now, source in counted.items()]
+        remembered = {"_offset_before": "_offset", "_distance_before": "_distance"}
         delays += [Delay(scalar(now), source) for now, source in remembered.items()]
         delays.append(Delay(command_before(problem), "command"))
         delays.append(Delay(by_slot(channels, "_deformed_before"), "deformed"))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Wrapper, discrete, forget, growing_in_a_row
+from fpirhc.deformation.base import Deformation, Wrapper, forget, growing_in_a_row, memory_of_map
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _OSCILLATES = -0.9
@@ -44,7 +44,7 @@ class Damped(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return r + factor (G(r, f, d) - r), and G(r, f, d) itself where the factor is one."""
-        inner = discrete(self, memory, request.numel())
+        inner = memory_of_map(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
         error, before = response - desired, memory["damper_error"]
         sign = forget(memory["damper_sign"], ca.sign(ca.dot(error, before)))

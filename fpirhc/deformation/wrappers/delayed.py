@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, memory_of_map
 from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne
@@ -73,7 +73,7 @@ class _Queued(Wrapper):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        inner, queue = discrete(self, memory, request.numel()), self._queue
+        inner, queue = memory_of_map(self, memory, request.numel()), self._queue
         first = memory["queue_filled"] < 0.5
         # The first request of a run is the desired response itself.
         desired_then = ca.if_else(first, request, memory["queue_now"])

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from fpirhc.deformation.base import Deformation, Iteration, Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Iteration, Wrapper, memory_of_map
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -36,7 +36,7 @@ class Filtered(Wrapper):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        inner = discrete(self, memory, request.numel())
+        inner = memory_of_map(self, memory, request.numel())
         error = self.pole * memory["filter_error"] + (1 - self.pole) * (response - desired)
         next_request, next_memory = self.map.step(request, desired + error, desired, inner)
         return next_request, {"filter_error": error, **next_memory}

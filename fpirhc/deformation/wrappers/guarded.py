@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Wrapper, discrete, forget, smooth_norm, start_of_map
+from fpirhc.deformation.base import Deformation, Wrapper, forget, memory_of_map, smooth_norm, start_of_map
 from fpirhc.fields.kinds import Positive
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -52,7 +52,7 @@ class Guarded(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         own = {name.removeprefix("guard_"): v for name, v in memory.items() if name.startswith("guard_")}
-        inner = discrete(self, memory, request.numel())
+        inner = memory_of_map(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
         # A model-referenced form begins at the desired response, not at the request that it is given.
         origin = self.map.mirror.origin(request, desired)

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Iteration, Wrapper, memory_of_map
 from fpirhc.fields.kinds import Positive, whole
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -47,7 +47,7 @@ class Haar(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return G(r, d + g, d), and the errors of the last 2^J - 1 cycles."""
-        inner, size = discrete(self, memory, request.numel()), request.numel()
+        inner, size = memory_of_map(self, memory, request.numel()), request.numel()
         errors = ca.vertcat(response - desired, memory["haar_errors"])
         smooth, jumps = ca.reshape(errors, size, 2**self.levels), 0 * request
         for level in range(1, self.levels + 1):

@@ -11,10 +11,10 @@ from typing import Annotated
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, memory_of_map
 from fpirhc.fields.kinds import Accuracy, whole
 from fpirhc.symbolic.expression import total
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
 
 _MOST = 200  # cycles: the estimate costs as many multiplications, twice, in every control cycle
 _PATIENCE = 100
@@ -51,7 +51,7 @@ class DelayWatched(Wrapper):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        inner = discrete(self, memory, request.numel())
+        inner = memory_of_map(self, memory, request.numel())
         next_request, next_memory = self.map.step(request, response, desired, inner)
         return next_request, {**_estimated(request, response, memory, self.most), **next_memory}
 
@@ -85,7 +85,7 @@ class SelfPaired(Wrapper):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        inner = discrete(self, memory, request.numel())
+        inner = memory_of_map(self, memory, request.numel())
         estimate = _estimated(request, response, memory, self.most)
         stood, candidate, cycles = self._adopted(estimate, memory)
         size = request.numel()
@@ -135,7 +135,7 @@ def _estimate_memory(elements: tuple[str, ...], most: int) -> Layout:
     """Running means, past requests, weights, and the estimate with its confidence."""
     past = tuple(f"{e}@{k}" for k in range(most + 1) for e in elements)
     means = Signal("delay_mean_request", elements), Signal("delay_mean_response", elements)
-    weights = Signal("delay_weights", tuple(f"w{k}" for k in range(most + 1)))
+    weights = Signal("delay_weights", tuple(f"w{k}" for k in range(most + 1)), kinds=(Kind.ADAPTED,))
     results = scalar("delay_cycles"), scalar("delay_confidence")
     return Layout((*means, Signal("delay_past", past), weights, *results))
 

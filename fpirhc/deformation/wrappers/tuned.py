@@ -12,7 +12,7 @@ from typing import Annotated, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Wrapper, discrete, growing_in_a_row, returning_in_a_row
+from fpirhc.deformation.base import Deformation, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Range
 from fpirhc.symbolic.functions import asin, larger, power, sqrt
@@ -57,7 +57,7 @@ class Tuned(Wrapper):
         counts = scalar("tuner_growing"), scalar("tuner_returning")
         errors = Signal("tuner_error", elements), Signal("tuner_earlier", elements)
         own = (scalar("tuner_factor", start=1.0), *counts, *errors)
-        return Layout(own) + self.map.memory(elements)
+        return Layout(own).adapted() + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
         return {"gain_factor": "tuner_factor", **self.map.shown()}
@@ -66,7 +66,7 @@ class Tuned(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return r + c (G(r, f, d) - r)."""
-        inner = discrete(self, memory, request.numel())
+        inner = memory_of_map(self, memory, request.numel())
         next_request, of_inner = self.map.step(request, response, desired, inner)
         factor, error, before = memory["tuner_factor"], response - desired, memory["tuner_error"]
         fast = ca.if_else(factor < 1, 1, _FAST)

@@ -63,7 +63,7 @@ class MovingHorizon(Learner):
                 Signal("window_information", information, start=tuple(np.eye(size).ravel())),
                 Signal("window_pairs", window),
             )
-        )
+        ).adapted()
 
     def step(self, problem: Problem) -> Correct:
         plant, size, row = problem.plant, len(self.parameters), _row_size(problem)

@@ -24,7 +24,7 @@ from fpirhc.learning.estimators.base import (
     deviations,
     forgetting_factor,
 )
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal
 from fpirhc.task.problem import Problem
 
 
@@ -74,7 +74,7 @@ def _estimate(names: tuple[str, ...]) -> Signal:
 
 def _covariance(size: int) -> Signal:
     entries = tuple(f"{i},{j}" for j in range(size) for i in range(size))
-    return Signal("least_squares_covariance", entries, start=tuple(np.eye(size).ravel()))
+    return Signal("least_squares_covariance", entries, start=tuple(np.eye(size).ravel()), kinds=(Kind.ADAPTED,))
 
 
 EXAMPLES = (RecursiveLeastSquares({"m": Uncertain(0.5, 3.0, 0.5)}, noise={"a": 0.1, "b": 0.1}, time=1.0),)

@@ -8,7 +8,6 @@ r+ = r - a (f - d), with the gain a in its memory: the loop for every gain is on
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -29,7 +28,7 @@ from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
 from fpirhc.task.disturbance import Step as Jump
 from fpirhc.task.problem import Problem
 
@@ -116,10 +115,6 @@ def _linear(deformation: Deformation, *, noisy: bool = False) -> Deformation:
     return with_inner(deformation, _linear(deformation.inner, noisy=noisy))
 
 
-# Columns of the memory that jump or are only recorded: counts, and what the line search of a plan remembers.
-_COUNTS = re.compile(r"^cycle$|(^|\.)plan_\w+$|plan_held_solve|_phase$|warm_up$")
-# Columns of maps and models that change on line, which stay what they are at the point.
-_LEARNED = re.compile(r"(^|\.)(tuner|delay_weights|_gains|_?learned|window|least_squares_covariance)")
 _SHARE = 0.01  # of their sizes, by which states and inputs are moved to find the scales of all else
 _SMALLEST = 1e-5  # scale of an entry, as a share of its value
 _ROOM = 0.01  # share of the range between an input's limits, nearer than which a command stands at one
@@ -164,7 +159,7 @@ class AskedLoop:
         self._errors = self.loop.trace.slice("true_error" if "true_error" in names else "error")
         self._state = self.loop.memory.slice("_state_before")
         self._request = [k for k, c in enumerate(self.loop.memory.columns) if "_deformed_last." in c]
-        self._phases = [k for k, c in enumerate(self.loop.memory.columns) if c.endswith("_phase")]
+        self._phases = [k for k, kind in enumerate(self.loop.memory.kinds) if kind == Kind.PHASE]
         self._gains, self._poles, self._noises = (
             [k for k, c in enumerate(self.loop.memory.columns) if name in c.split(".")] for name in (GAIN, POLE, NOISE)
         )
@@ -183,7 +178,7 @@ class AskedLoop:
     @property
     def keeps_learned(self) -> bool:
         """Whether a model or gains that change on line stay in the linear loop what they are at its point."""
-        return any(_LEARNED.search(column) for column in self.loop.memory.columns)
+        return Kind.ADAPTED in self.loop.memory.kinds
 
     @cached_property
     def repeats(self) -> int:
@@ -429,8 +424,8 @@ class AskedLoop:
 
     @cached_property
     def _free(self) -> np.ndarray:
-        """Entries that may deviate: all that neither jump, nor are parameters, nor are learned."""
-        fixed = np.array([bool(_COUNTS.search(c) or _LEARNED.search(c)) for c in self.loop.memory.columns])
+        """Entries that may deviate: all states that are no parameters."""
+        fixed = np.array([kind != Kind.STATE for kind in self.loop.memory.kinds])
         for name in ("_exact", "parameters"):
             fixed[self.loop.memory.slice(name)] = True
         fixed[self._gains] = True
