@@ -22,6 +22,7 @@ LEAST_GAIN = 1.4  # as a factor, up or down
 LEAST_PHASE = 25.0  # degrees
 _LARGEST = 400  # states of a loop whose margins are computed
 _FREQUENCIES = 300
+_PER_TURN = 4  # frequencies for half a turn of the longest delay line
 _LOWEST = 1e-5  # of the Nyquist frequency
 _REAL = 1e-2  # share of an imaginary part with which L is real at rest; one that is large there has an integrator
 _DECADES = math.log(1e3)  # of the gain margins that are looked for over a period
@@ -53,8 +54,9 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         return Answer(MARGINS, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
     first, radius = loops.loops[0], float(loops.radii.max())
     text = f"largest closed-loop pole magnitude {radius:.6g}"
-    if len(first.dynamics) > _LARGEST:
-        text += f"; no margins of a loop of {len(first.dynamics)} states"
+    size = first.cycles[0].dynamics.shape[1]
+    if size > _LARGEST:
+        text += f"; no margins of a loop of {size} states"
         return Answer(MARGINS, Verdict.UNKNOWN, text, "", {"radius": radius})
     if radius >= 1:  # there is no margin to lose
         change = SLOWER if learner else _poles_advice(loops, adapts)
@@ -115,8 +117,10 @@ def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
     if len(loop.cycles) > 1:
         return _of_a_period(loop, place)
     nyquist = math.pi / loop.period
-    frequencies = np.append(nyquist * np.geomspace(_LOWEST, 0.9999, _FREQUENCIES), nyquist)
-    opened = _response(loop, place)
+    turns = _PER_TURN * loop.longest
+    fine = np.arange(1, turns) / max(turns, 1)
+    frequencies = nyquist * np.union1d(np.append(np.geomspace(_LOWEST, 0.9999, _FREQUENCIES), 1.0), fine)
+    opened = loop.opened(place)
     values = opened(frequencies)
     turned = opened(_roots(lambda w: opened(w).imag, frequencies[:-1], values[:-1].imag))
     # At rest and at the Nyquist frequency, where most sampled loops leave the unit circle, L is real and crosses no phase.
@@ -175,24 +179,6 @@ def _between(
         old, f_old = np.where(crossed, new, old), np.where(crossed, f_new, f_old / 2)
         new, f_new = between, f
     return new
-
-
-def _response(loop: LinearLoop, place: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Function frequencies -> L_i; from the matrices, because polynomials of so many states lose all digits."""
-    from scipy.linalg import schur  # it takes longer to import than a problem to load
-
-    [one] = loop.cycles
-    g, c = one.entry[:, place], one.arriving[place]
-    form, turn = schur(loop.dynamics - np.outer(g, c), output="complex")
-    left, right = c @ turn, turn.conj().T @ g
-
-    def opened(frequencies: np.ndarray) -> np.ndarray:
-        points, states = np.exp(1j * frequencies * loop.period), np.zeros((len(form), len(frequencies)), dtype=complex)
-        for k in reversed(range(len(form))):
-            states[k] = (right[k] + form[k, k + 1 :] @ states[k + 1 :]) / (points - form[k, k])
-        return np.asarray(-left @ states)
-
-    return opened
 
 
 def _of_a_period(loop: LinearLoop, place: int) -> tuple[float, float, float]:

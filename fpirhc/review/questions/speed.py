@@ -12,6 +12,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.plant.maps import response_age
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.loops import is_planned
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.right_model import INCREMENT, REFERENCED, forms_of
 
@@ -133,7 +134,8 @@ def plan_keeps_up(case: Case) -> Answer | None:
         return None
     ratio = 1 / factor
     size = abs(deformation.effective_gain())
-    text = f"the effective gain is {size:.3g}, {ratio:.3g} times the smallest with which the plan converges"
+    least, loop = "at least " * (factor <= _SMALLEST), "plan" if is_planned(case.controller) else "loop"
+    text = f"the effective gain is {size:.3g}, {least}{ratio:.3g} times the smallest with which the {loop} converges"
     numbers = {"ratio": ratio, "least": factor * size}
     if ratio >= _PLAN_SPARE:
         return Answer(FAST, Verdict.YES, text, "", numbers)

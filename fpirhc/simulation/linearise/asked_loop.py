@@ -22,8 +22,9 @@ from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import resolved, with_optimiser
 from fpirhc.deformation.base import Deformation, Iteration, with_inner
 from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
+from fpirhc.simulation.linearise.late_loop import Late, LateLoop
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
-from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, reached
+from fpirhc.simulation.linearise.slopes import LARGEST, Directions, Step, Way, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
@@ -310,8 +311,52 @@ class AskedLoop:
         return np.asarray(np.all((commands > lower + room) & (commands < upper - room), axis=-1))
 
     def at(self, memory: np.ndarray) -> LinearLoop:
-        """Return the linear loop of the period that begins at a memory."""
-        return self._among([self._period(memory)])[0]
+        """Return the linear loop of the period that begins at a memory; entries of long delay lines are not written out."""
+        return self.late_at(memory, self._lines) if self._lines else self._among([self._period(memory)])[0]
+
+    def late_at(self, memory: np.ndarray, lines: Sequence[np.ndarray]) -> LateLoop:
+        """Return the linear loop at a memory without the entries of some delay lines.
+
+        Args:
+            memory: of a loop that repeats itself in every cycle.
+            lines: places of the entries of each line, the oldest first.
+
+        Raises:
+            NotSupported: entries that do more than wait, such as those of a plan.
+        """
+        scales, free = self._scales(memory), self._free.copy()
+        way, acting = self._step.way(memory, scales), []
+        for number, line in enumerate(lines):
+            free[line] = False
+            acting += [(number, k) for k in _acting(way, line, len(memory), self._step.width)]
+        places = [int(lines[number][k]) for number, k in acting]
+        [found] = reached([[way]], free, self._places, self._step.width, None, places)
+        own = ~found.basis[places].any(axis=0) if places else np.ones(found.basis.shape[1], dtype=bool)
+        onto = np.vstack([found.basis[:, own].T, np.eye(len(memory))[[line[-1] for line in lines]]])
+        moved, traces, (kicked, _) = found.moved[0], found.traces[0], found.kicked[0]
+        waiting = np.concatenate([line[:-1] for line in lines])
+        if max(np.abs(moved[waiting][:, own]).max(initial=0.0), np.abs(kicked[waiting]).max(initial=0.0)) > _FELT:
+            raise NotSupported(f"more than {LARGEST} entries of its memory move, and do not only wait")
+        count, more = int(own.sum()), len(lines)
+        late = []
+        for (number, k), place in zip(acting, places, strict=True):
+            column = int(np.argmax(np.abs(found.basis[place])))
+            cycles = len(lines[number]) - 1 - k
+            late.append(Late(count + number, cycles, onto @ moved[:, column], traces[self._arriving, column]))
+        wide = ((0, 0), (0, more))
+        state = np.pad(found.basis[self._state][:, own] * scales[self._places][:, None], wide)
+        cycle = LinearCycle(
+            np.pad(onto @ moved[:, own], wide), onto @ kicked, np.pad(traces[self._arriving][:, own], wide), state
+        )
+        placed = np.pad((found.basis[self._state][:, own] / scales[self._places][:, None]).T, ((0, more), (0, 0)))
+        errors = np.pad(traces[self._errors][:, own], wide)
+        return LateLoop((cycle,), errors, placed, self.problem.period, tuple(late))
+
+    @cached_property
+    def _lines(self) -> list[np.ndarray]:
+        """Places of the entries of delay lines that are too long to be written out."""
+        long = [np.array(places) for places in self._alike if len(places) > LARGEST]
+        return [line for line in long if self._free[line].all() and self.repeats == 1]
 
     def noisy(self, memory: np.ndarray, correlation: np.ndarray) -> LinearLoop:
         """Return the linear loop behind the noise of the sensors, n+ = c n + w, with the commands that are sent for v.
@@ -465,6 +510,37 @@ class AskedLoop:
         for k, column in enumerate(self.loop.memory.columns):
             groups.setdefault(column.split("@")[0], []).append(k)
         return [places for places in groups.values() if len(places) > 1]
+
+
+_FELT = 1e-7  # of a deviation
+
+
+def _acting(way: Way, line: np.ndarray, size: int, inputs: int) -> list[int]:
+    """Which entries of a delay line, the oldest first, do more than wait; sought by halves, because few do.
+
+    Args:
+        way: of the loop.
+        line: places of the entries.
+        size: of the memory.
+        inputs: entries of w.
+    """
+    random = np.random.default_rng(0).standard_normal(len(line))
+
+    def felt(some: range) -> bool:
+        deviation = np.zeros((size, 1))
+        deviation[line[some], 0] = random[some]
+        moved, traces = way(deviation, np.zeros((inputs, 1)))
+        moved[line[:-1]] -= deviation[line[1:]]
+        return bool(max(np.abs(moved).max(), np.abs(traces).max()) > _FELT)
+
+    found, sought = [], [range(len(line))]
+    while sought:
+        some = sought.pop()
+        if felt(some):
+            half = len(some) // 2
+            found += [some[0]] if not half else []
+            sought += [some[:half], some[half:]] if half else []
+    return sorted(found)
 
 
 def _started(problem: Problem, state: Mapping[str, float] | None, before: Mapping[str, float] | None) -> Problem:

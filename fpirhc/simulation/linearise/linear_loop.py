@@ -6,7 +6,7 @@ judged errors. A loop that repeats itself after n cycles only has n such matrice
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
@@ -88,6 +88,34 @@ class LinearLoop:
             np.array([share[one].max(initial=0.0) < _SHOWN for one in near]) for share in (by_error, by_any)
         )
         return (neutral & no_error) | (lasting & nothing)
+
+    @property
+    def longest(self) -> int:
+        """Cycles of the longest delay line that is not written out; see `LateLoop`."""
+        return 0
+
+    def opened(self, place: int) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the function frequencies -> L_i of the loop opened at one command.
+
+        It is found from the matrices, because polynomials of so many states lose all digits.
+        """
+        from scipy.linalg import schur  # it takes longer to import than a problem to load
+
+        [one] = self.cycles
+        g, c = one.entry[:, place], one.arriving[place]
+        form, turn = schur(self.dynamics - np.outer(g, c), output="complex")
+        left, right = c @ turn, turn.conj().T @ g
+
+        def response(frequencies: np.ndarray) -> np.ndarray:
+            points, states = (
+                np.exp(1j * frequencies * self.period),
+                np.zeros((len(form), len(frequencies)), dtype=complex),
+            )
+            for k in reversed(range(len(form))):
+                states[k] = (right[k] + form[k, k + 1 :] @ states[k + 1 :]) / (points - form[k, k])
+            return np.asarray(-left @ states)
+
+        return response
 
     def with_noise(self, feedthrough: Sequence[np.ndarray], correlation: np.ndarray) -> LinearLoop:
         """Return the loop whose w is a noise n+ = c n + w, of which z remembers the present value.

@@ -20,7 +20,7 @@ from fpirhc.symbolic.evaluate import Evaluator
 _STEP = 2.0**-19  # of a deviation, in scales: above rounding, and below what makes a line search choose another share
 _NEW = 1e-4  # what is new in a direction of length 1, below which it is left out
 _ROUNDING = 1e-9  # derivative in scales
-_LARGEST = 400  # directions
+LARGEST = 400  # directions
 
 Way: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -190,8 +190,8 @@ class _Part:
                 one = one - basis @ (one @ basis)
             length = math.sqrt(one @ one)
             if length > _NEW:
-                if self.count >= _LARGEST:
-                    raise NotSupported(f"more than {_LARGEST} entries of its memory move")
+                if self.count >= LARGEST:
+                    raise NotSupported(f"more than {LARGEST} entries of its memory move")
                 self._append((one / length)[:, None])
         return self.basis[:, before : self.count].copy()
 

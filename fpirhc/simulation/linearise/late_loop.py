@@ -1,0 +1,156 @@
+"""A linear loop with long delay lines: what comes out of one is what went in, many cycles later.
+
+A line of N entries is N states that only wait. Without them the loop is z+ = F0 z + sum_j f_j w_j, where w_j is an entry of z some
+cycles ago, and its poles are the zeros of
+
+    det M(z),    M(z) = z I - F0 - sum_j f_j e_j' z^(-l_j).
+
+Their number outside a circle is n less the turns of det M along it, by the argument principle: far away det M(z) is z^n.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NoReturn
+
+import numpy as np
+
+from fpirhc.errors import NoAnswer
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
+
+_TOGETHER = 4096  # matrices at once
+_PER_TURN = 8  # points of a circle for a turn of the longest line
+_LEAST = 512  # points of half a circle
+_SAFE = math.pi / 2  # turn between two points, from which there are more between them
+_HALVINGS = 30
+_EDGE = 1e-8  # relative error of a radius
+_DEEPEST = 200.0  # -log of what the longest line makes of a decaying mode, beyond which numbers end
+
+
+@dataclass(frozen=True, eq=False)
+class Late:
+    """What an entry of z does some cycles later.
+
+    Args:
+        place: of the entry.
+        cycles: later.
+        dynamics: f (n,).
+        arriving: what it adds to the commands (nu,).
+    """
+
+    place: int
+    cycles: int
+    dynamics: np.ndarray
+    arriving: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class LateLoop(LinearLoop):
+    """A loop of one cycle, whose matrices are those of what acts at once; build it with `AskedLoop.at`.
+
+    Args:
+        late: what acts later.
+    """
+
+    late: tuple[Late, ...] = ()
+
+    @property
+    def longest(self) -> int:
+        """Cycles of the longest delay."""
+        return max((one.cycles for one in self.late), default=0)
+
+    @cached_property
+    def radius(self) -> float:
+        """The factor per cycle of the slowest or fastest growing mode, by halving; no mode that is reached is left out."""
+        lower, upper = -_DEEPEST / max(self.longest, 1), 0.0
+        if not self._outside(lower):
+            return math.exp(lower)
+        while self._outside(upper):
+            lower, upper = upper, 2 * upper + 1e-3
+        while upper - lower > _EDGE:
+            middle = (lower + upper) / 2
+            lower, upper = (middle, upper) if self._outside(middle) else (lower, middle)
+        return math.exp(upper)
+
+    def opened(self, place: int) -> Callable[[np.ndarray], np.ndarray]:
+        [one] = self.cycles
+        entry = one.entry[:, place]
+
+        def response(frequencies: np.ndarray) -> np.ndarray:
+            values = np.empty(len(frequencies), dtype=complex)
+            for some in _parts(len(frequencies)):
+                points = np.exp(1j * frequencies[some] * self.period)
+                command = np.repeat(one.arriving[place].astype(complex)[None], len(points), axis=0)
+                for later in self.late:
+                    command[:, later.place] += later.arriving[place] * points**-later.cycles
+                matrices = self._matrices(points) + entry[:, None] * command[:, None, :]
+                moved = np.linalg.solve(matrices, np.broadcast_to(entry[:, None], (len(points), len(entry), 1)))
+                values[some] = -(command * moved[:, :, 0]).sum(axis=1)
+            return values
+
+        return response
+
+    @property
+    def poles(self) -> np.ndarray:
+        self._refuse()
+
+    @property
+    def hidden(self) -> np.ndarray:
+        return np.zeros(0, dtype=bool)
+
+    @property
+    def dynamics(self) -> np.ndarray:
+        self._refuse()
+
+    def with_noise(self, feedthrough: Sequence[np.ndarray], correlation: np.ndarray) -> LinearLoop:  # noqa: ARG002
+        self._refuse()
+
+    def delayed(self, inputs: Sequence[int], cycles: int) -> LinearLoop:  # noqa: ARG002
+        self._refuse()
+
+    def carried(self, deviation: np.ndarray, cycles: int) -> tuple[np.ndarray, np.ndarray]:  # noqa: ARG002
+        self._refuse()
+
+    def mixed(self, other: LinearLoop, share: float) -> LinearLoop:  # noqa: ARG002
+        self._refuse()
+
+    def _refuse(self) -> NoReturn:
+        raise NoAnswer(f"a loop with a delay line of {self.longest} cycles is not written out")
+
+    def _matrices(self, points: np.ndarray) -> np.ndarray:
+        """M(z) at some points."""
+        [one] = self.cycles
+        matrices = points[:, None, None] * np.eye(len(one.dynamics)) - one.dynamics
+        for later in self.late:
+            matrices[:, :, later.place] -= later.dynamics * (points**-later.cycles)[:, None]
+        return matrices
+
+    def _signs(self, points: np.ndarray) -> np.ndarray:
+        """The sign det M / |det M| at some points."""
+        return np.concatenate([np.linalg.slogdet(self._matrices(points[some]))[0] for some in _parts(len(points))])
+
+    def _outside(self, logarithm: float) -> int:
+        """The number of poles outside the circle with this logarithm of its radius: n less the turns of det M along it."""
+        signs = self._half(logarithm)
+        turns = float(np.angle(signs[1:] / signs[:-1]).sum()) / math.pi  # of half a circle, the other one is its mirror
+        return len(self.cycles[0].dynamics) - round(turns)
+
+    def _half(self, logarithm: float) -> np.ndarray:
+        """Signs of det M at points of the upper half of a circle, close enough to count turns."""
+        angles = np.linspace(0.0, math.pi, max(_LEAST, _PER_TURN * self.longest // 2) + 1)
+        signs = self._signs(np.exp(logarithm + 1j * angles))
+        for _ in range(_HALVINGS):
+            wide = np.flatnonzero(np.abs(np.angle(signs[1:] / signs[:-1])) > _SAFE)
+            if not wide.size:
+                break
+            between = (angles[wide] + angles[wide + 1]) / 2
+            more = self._signs(np.exp(logarithm + 1j * between))
+            angles, signs = np.insert(angles, wide + 1, between), np.insert(signs, wide + 1, more)
+        return signs
+
+
+def _parts(count: int) -> list[slice]:
+    return [slice(k, k + _TOGETHER) for k in range(0, count, _TOGETHER)]

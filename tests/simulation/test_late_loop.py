@@ -1,0 +1,93 @@
+"""A loop with delay lines that are not written out has the poles and the response of the one that is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import NoAnswer, NotSupported
+from fpirhc.review.questions.margins import margins
+from fpirhc.simulation.linearise.asked_loop import AskedLoop
+from fpirhc.simulation.linearise.late_loop import Late, LateLoop
+from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
+
+PERIOD, STATES, LONGEST = 0.01, 4, 15
+
+
+def both(seed: int, size: float) -> tuple[LateLoop, LinearLoop]:
+    """A random loop of four states, two of which act again after 3 and 15 cycles, and the same with 18 states that wait."""
+    random = np.random.default_rng(seed)
+    dynamics = random.normal(size=(STATES, STATES))
+    dynamics *= 0.9 / np.abs(np.linalg.eigvals(dynamics)).max()
+    entry, arriving = random.normal(size=(STATES, 1)), random.normal(size=(1, STATES))
+    late = [
+        Late(place, cycles, size * random.normal(size=STATES), random.normal(size=1))
+        for place, cycles in ((3, 3), (1, LONGEST))
+    ]
+    state = np.zeros((1, STATES))
+    short = LateLoop((LinearCycle(dynamics, entry, arriving, state),), state, state.T, PERIOD, tuple(late))
+    waits = sum(one.cycles for one in late)
+    whole, wide_entry = np.zeros((STATES + waits,) * 2), np.pad(entry, ((0, waits), (0, 0)))
+    whole[:STATES, :STATES], shown = dynamics, np.pad(arriving, ((0, 0), (0, waits)))
+    first = STATES
+    for one in late:
+        whole[first, one.place] = 1.0
+        whole[first + 1 : first + one.cycles, first : first + one.cycles - 1] = np.eye(one.cycles - 1)
+        last = first + one.cycles - 1
+        whole[:STATES, last], shown[0, last] = one.dynamics, one.arriving[0]
+        first += one.cycles
+    nothing = np.zeros((1, STATES + waits))
+    return short, LinearLoop((LinearCycle(whole, wide_entry, shown, nothing),), nothing, nothing.T, PERIOD)
+
+
+@pytest.mark.parametrize("size", [0.01, 0.3, 3.0])
+@pytest.mark.parametrize("seed", range(6))
+def test_radius_and_response_are_those_of_all_eigenvalues(seed, size):
+    """Loops that converge and loops that grow: the argument principle counts what eigenvalues show."""
+    short, whole = both(seed, size)
+    assert short.radius == pytest.approx(np.abs(np.linalg.eigvals(whole.dynamics)).max(), rel=1e-7)
+    frequencies = np.pi / PERIOD * np.linspace(0.003, 1.0, 40)
+    assert short.opened(0)(frequencies) == pytest.approx(whole.opened(0)(frequencies), rel=1e-8)
+
+
+def test_a_line_of_a_loop_is_found_in_its_memory():
+    """Repetitive control with a period of 60 cycles: written out it has 60 states more."""
+    task = fp.load_problem("mrac_pendulum")
+    problem = replace(task.problem, disturbances={})
+    control = fp.rivals.RepetitiveControl(fp.Exponential(6.0), repeats=60 * problem.period, gain=0.4, smoothing=0.05)
+    loop = AskedLoop(problem, control)
+    memory = loop.run(loop.start(), 300).memories[-1]
+    [line] = [np.flatnonzero([name in column for column in loop.loop.memory.columns]) for name in ("lessons",)]
+    whole, short = loop.at(memory), loop.late_at(memory, [line])
+    assert len(whole.dynamics) - len(short.cycles[0].dynamics) > 55
+    assert short.radius == pytest.approx(
+        whole.radius, abs=2e-5
+    )  # three poles of the law lie together, which rounding parts
+    frequencies = np.pi / problem.period * np.linspace(0.0123, 0.987, 40)
+    assert short.opened(0)(frequencies) == pytest.approx(whole.opened(0)(frequencies), rel=1e-4)
+    with pytest.raises(NoAnswer, match="delay line of 59 cycles"):
+        short.delayed([0], 3)
+
+
+def test_entries_that_do_more_than_wait_are_refused():
+    """The plan of `two_mass` is a row of entries by name too, and moves as a whole."""
+    task = fp.load_problem("two_mass")
+    loop = AskedLoop(replace(task.problem, disturbances={}), task.controllers["RHC"])
+    line = np.flatnonzero(["plan_inputs" in column and "Q1@" in column for column in loop.loop.memory.columns])
+    with pytest.raises(NotSupported, match="do not only wait"):
+        loop.late_at(loop.run(loop.start(), 50).memories[-1], [line])
+
+
+def test_gain_margin_of_a_long_period_is_that_of_the_learning():
+    """Learning a plant k times as strong as its model ends where gamma k is 2; here k = 1.65, gamma = 0.4."""
+    task = fp.load_problem("mrac_pendulum")
+    problem = replace(task.problem, disturbances={})
+    loop = AskedLoop(problem, task.controllers["repetitive control"])
+    linear = loop.at(loop.run(loop.start(), 200).memories[-1])
+    assert 0.999 < linear.radius < 1
+    gain = margins(linear, 0)[0]
+    assert gain == pytest.approx(2 / (0.4 * 1.65), rel=0.05)
+    assert gain < 2 / (0.4 * 1.65)  # the tracking law takes its share
