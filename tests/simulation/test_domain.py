@@ -19,7 +19,7 @@ from gaps import gone_on, status
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import FAILED, PATIENCE
-from fpirhc.deformation.base import Deformation, Wrapper, discrete
+from fpirhc.deformation.base import Deformation, Wrapper, memory_of_map
 from fpirhc.members import Example, examples
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.ranges import Dropped
@@ -310,7 +310,7 @@ class Rooted(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """The map's request, times the root of one."""
-        following, own = self.map.step(request, response, desired, discrete(self, memory, request.numel()))
+        following, own = self.map.step(request, response, desired, memory_of_map(self, memory, request.numel()))
         return following * ca.sqrt(memory["rooted"]), {"rooted": memory["rooted"], **own}
 
 
