@@ -26,7 +26,7 @@ from fpirhc.fields.kinds import Seed
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.simulation.changes import Changes, in_force
+from fpirhc.simulation.changes import Changes, InForce, in_force
 from fpirhc.simulation.log import with_common_columns
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, disturbance_values, moving
@@ -84,9 +84,12 @@ class Simulator:
         self, variant: Problem | None = None, settings: Numbers | None = None
     ) -> tuple[Problem, np.ndarray]:
         """Return the problem of a run and the first memory of its loop; arguments as in `run`."""
-        problem = variant or self.problem
-        force = in_force(self.live, self.loop, problem, settings or {}, {})
+        force = self.in_force(variant, settings)
         return force.problem, start_memory(self.loop, force.problem, force.controller, force.numbers)
+
+    def in_force(self, variant: Problem | None = None, settings: Numbers | None = None) -> InForce:
+        """Return problem and controller of a run; arguments as in `run`."""
+        return in_force(self.live, self.loop, variant or self.problem, settings or {}, {})
 
     def run(
         self,
@@ -276,6 +279,11 @@ def judged_run(
     problem, controller = ready.problem, ready.controller
     if settings:
         problem, controller, _ = ready.live.changed(settings)
+    return with_judgements(run, problem, controller)
+
+
+def with_judgements(run: Run, problem: Problem, controller: Controller) -> Run:
+    """Return a run with the signals that judge it, `JUDGING`; problem and controller are those of the run."""
     broken: list[str] = []
     judged = judgements(problem, controller, run.layout, run.log, broken)
     log = np.hstack([run.log, *(values for _, values in judged)])
@@ -415,6 +423,7 @@ def stopped(problem: Problem, cycle: int, what: str) -> str:
     return f"{what} {when}; the run keeps the cycles before it"
 
 
+JUDGING = ("cost", "contraction")  # signals that are computed from the log of a run
 _CHUNK = 500  # cycles whose costs are evaluated in one call
 Judgement = tuple[Signal, np.ndarray]
 # Every controller of a comparison is judged by the same cost.

@@ -25,7 +25,7 @@ from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, of_problem
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, fingerprint
+from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, fingerprint, is_of_judgements
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
@@ -382,7 +382,14 @@ class _Runner:
         cells = math.prod(
             size for size, axis in zip(grid.shape, grid.axes, strict=True) if axis.path not in self._without
         )
-        self._trials = Trials(task, name, list(self._now), conditions, side_by_side=cells >= SIDE_BY_SIDE)
+        self._trials = Trials(
+            task,
+            name,
+            list(self._now),
+            conditions,
+            side_by_side=cells >= SIDE_BY_SIDE,
+            judged=is_of_judgements(aim.metric),
+        )
 
     def map(self, progress: Progress | None) -> SweepMap:
         """Return the map; cells that the ledger has are not run again."""

@@ -43,6 +43,8 @@ def pump() -> fp.Problem:
 LAW = fp.ComputedTorque(fp.Exponential(rate=RATE, integral=False))
 ADAPTIVE = LAW.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.8)))
 
+PLAIN = LAW.with_deformation(fp.Affine(gain=-0.8))
+
 
 def task_of(**controllers: Controller) -> Task:
     return Task("pump", Path(__file__), "A pump", "", pump(), controllers or {"law": LAW, "FPI": ADAPTIVE})
@@ -116,6 +118,14 @@ def test_finished_cells_are_not_run_again(tmp_path: Path, monkeypatch: pytest.Mo
     assert [m.values.tolist() for m in again.maps] == [m.values.tolist() for m in first.maps]
     with pytest.raises(OutputError, match="holds results of something else"):
         swept(tmp_path, "exact.b=0.5:2:4")
+
+
+def test_a_map_of_the_contraction_factor(tmp_path: Path) -> None:
+    """|1 - a lambda| of every cell, with a of half the map's gain, and lambda the plant's b over the model's 1."""
+    texts = ("deformation.gain=-0.8:-0.2:4", "exact.b=0.5:1.5:3")
+    found = swept(tmp_path, *texts, task=task_of(FPI=PLAIN), metric="contraction.predicted").of("FPI")
+    expected = 1 - 0.5 * np.outer([0.8, 0.6, 0.4, 0.2], [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(found.values, expected, rtol=1e-9)
 
 
 def test_larger_is_better_where_the_figure_says_so(tmp_path: Path) -> None:

@@ -25,10 +25,10 @@ from fpirhc.fields.kinds import CountOrZero
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import with_settings
 from fpirhc.simulation.lanes import Lanes, OneRun
-from fpirhc.simulation.metrics import Metrics, measure
+from fpirhc.simulation.metrics import Metric, Metrics, measure
 from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Compiled, Simulator, built
+from fpirhc.simulation.simulate import JUDGING, Compiled, Simulator, built, with_judgements
 from fpirhc.studies.comparison.causes import error_left_alone
 from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
 from fpirhc.task.problem import Problem
@@ -110,6 +110,7 @@ class Bench:
         conditions: conditions of the scenarios.
         live: paths of the settings that `record` may change, by name of the controller.
         side_by_side: whether runs are side by side where they can be, see `records`.
+        judged: whether runs have the signals that judge them, which take longer than the run.
 
     Raises:
         InvalidProblem, InvalidValue: draws that could leave the parameters' physical bounds.
@@ -122,7 +123,9 @@ class Bench:
         live: Mapping[str, Sequence[str]] | None = None,
         *,
         side_by_side: bool = False,
+        judged: bool = False,
     ) -> None:
+        self._judging = judged
         self._live, self._side_by_side = live or {}, side_by_side and conditions.compiled is not False
         self.apart: dict[str, str] = {}
         self._task, self._conditions = task, conditions
@@ -184,6 +187,7 @@ class Bench:
         if code not in self._lanes:
             shown = [one.title for one in self._pictures(name) if one.keeps]
             why = f"the picture '{shown[0]}' keeps something of every run" if shown else ""
+            why = "the figure is of signals that judge a whole run" if self._judging else why
             self._lanes[code] = lanes = Lanes(ready, self._task.metrics, why=why)
             if lanes.why:
                 self.apart[name] = lanes.why
@@ -199,6 +203,9 @@ class Bench:
         try:
             ready = self._simulator(name, scenario)
             run = ready.run(seed=scenario.seed, name=name, variant=scenario.problem, settings=settings)
+            if self._judging:
+                force = ready.in_force(scenario.problem, settings)
+                run = with_judgements(run, force.problem, force.controller)
         except FpirhcError as error:
             return {"controller": name, "skipped": str(error)}
         metrics = measure(scenario.problem, run, self._task.metrics)
@@ -290,6 +297,11 @@ class Bench:
         return self._shared[key]
 
 
+def is_of_judgements(metric: Metric | None) -> bool:
+    """Whether a figure of merit is of the signals that judge a run, which a study computes where somebody asks for them."""
+    return metric is not None and bool({*JUDGING} & {*(metric.reads or ())})
+
+
 def scenarios(task: Task, conditions: Conditions) -> Scenarios:
     """Return the scenarios of a study."""
     if conditions.named:
@@ -307,18 +319,27 @@ class Trials:
         paths: of the settings.
         conditions: of the scenarios.
         side_by_side: as of `Bench`.
+        judged: as of `Bench`.
     """
 
     def __init__(
-        self, task: Task, name: str, paths: Sequence[str], conditions: Conditions, *, side_by_side: bool = False
+        self,
+        task: Task,
+        name: str,
+        paths: Sequence[str],
+        conditions: Conditions,
+        *,
+        side_by_side: bool = False,
+        judged: bool = False,
     ) -> None:
         self._task, self._name, self._paths = replace(task, controllers={name: task.controllers[name]}), name, paths
-        self._conditions, self._side_by_side = conditions, side_by_side
+        self._conditions, self._side_by_side, self._judged = conditions, side_by_side, judged
         self._rebuilt: tuple[dict[str, float], Bench] | None = None
 
     @cached_property
     def _bench(self) -> Bench:
-        return Bench(self._task, self._conditions, {self._name: self._paths}, side_by_side=self._side_by_side)
+        live = {self._name: self._paths}
+        return Bench(self._task, self._conditions, live, side_by_side=self._side_by_side, judged=self._judged)
 
     @property
     def apart(self) -> str:
@@ -350,7 +371,7 @@ class Trials:
         if self._rebuilt is None or self._rebuilt[0] != settings:
             changed = with_settings(self._task.controllers[self._name], settings)
             task = replace(self._task, controllers={self._name: changed})
-            self._rebuilt = dict(settings), Bench(task, self._conditions)
+            self._rebuilt = dict(settings), Bench(task, self._conditions, judged=self._judged)
         return self._rebuilt[1]
 
 

@@ -26,6 +26,7 @@ from fpirhc.studies.scenarios.bench import (
     Conditions,
     RecordFields,
     fingerprint,
+    is_of_judgements,
     scenario_numbers,
     scenarios,
 )
@@ -101,13 +102,15 @@ def compare_scenarios(
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
     conditions = Conditions(seed, COMPARING, float(percent), compiled, named=cases is not None)
+    judged = is_of_judgements(figure.metric)
     side_by_side = compiled and len(numbers) * shard[1] >= SIDE_BY_SIDE
-    bench, header = Bench(task, conditions, side_by_side=side_by_side), fingerprint(task, conditions)
+    bench, header = Bench(task, conditions, side_by_side=side_by_side, judged=judged), fingerprint(task, conditions)
     opening = {
         "path": str(task.path.resolve()),
         "tuned": tuned or {},
         "conditions": asdict(conditions),
         "side by side": side_by_side,
+        "judged": judged,
     }
     workers: Workers | Cluster | None = None
     if cluster is not None:

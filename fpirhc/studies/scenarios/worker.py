@@ -41,7 +41,7 @@ def study(opening: Mapping[str, Any]) -> Study:
     """
     task = with_tuned(load_problem(opening["path"]), opening["tuned"])
     conditions = Conditions(**opening["conditions"])
-    bench = Bench(task, conditions, side_by_side=opening["side by side"])
+    bench = Bench(task, conditions, side_by_side=opening["side by side"], judged=opening["judged"])
     return Study(bench, fingerprint(task, conditions))
 
 

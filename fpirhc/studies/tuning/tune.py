@@ -22,7 +22,14 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.pairwise import harm_of_adaptation
-from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, fingerprint, scenario_numbers
+from fpirhc.studies.scenarios.bench import (
+    SIDE_BY_SIDE,
+    Conditions,
+    Trials,
+    fingerprint,
+    is_of_judgements,
+    scenario_numbers,
+)
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.tuning.objective import Objective, objective
@@ -231,7 +238,14 @@ def _tuned(
     needed = [metric for metric in task.metrics if metric.name in ("rms_error", aim.metric.name if aim.metric else "")]
     # A trial is a call of its own, so its scenarios alone fill a register.
     side_by_side = len(numbers) >= _REGISTER and trials * len(numbers) >= SIDE_BY_SIDE
-    runs = Trials(replace(task, metrics=needed), name, tuple(spans), conditions, side_by_side=side_by_side)
+    runs = Trials(
+        replace(task, metrics=needed),
+        name,
+        tuple(spans),
+        conditions,
+        side_by_side=side_by_side,
+        judged=is_of_judgements(aim.metric),
+    )
     study = optuna.create_study()
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
     for number in range(_PRESENT, trials):
