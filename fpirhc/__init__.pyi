@@ -47,13 +47,11 @@ from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
-from .plant.disturbed import disturbed
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.motion import Algebraic, Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
 from .plant.plant import Parameter, Plant
-from .plant.regressor import linear_parameters
 from .probing.probe import probe
 from .problem_files.problem_file import load_problem
 from .problem_files.settings import LogSpan, Span, with_settings
@@ -248,9 +246,7 @@ __all__ = [
     "compare",
     "compare_information",
     "compare_scenarios",
-    "disturbed",
     "figures",
-    "linear_parameters",
     "load_problem",
     "load_run",
     "measure",

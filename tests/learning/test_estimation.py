@@ -17,6 +17,7 @@ from plants import linear, pendulum
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.learning.estimators.base import Seen
+from fpirhc.plant.disturbed import disturbed
 from fpirhc.symbolic.expression import expression
 
 PERIOD = 1e-2
@@ -264,16 +265,16 @@ def test_a_disturbed_plant():
         return {"u": (r.y + p.k * q.y) / p.b}
 
     for plant in (spring(), replace(spring(), inverse=inverse)):
-        result = fp.disturbed(plant, ("y",))
+        result = disturbed(plant, ("y",))
         assert result.parameters["w_y"] == fp.Parameter(0.0, 0.0, "m/s^2")
         x, u, p = np.array([0.3, 0.1]), np.array([0.7]), np.array([2.0, 1.5, 0.4])
         r = result.equations.response(x, u, p)
         assert float(r) == pytest.approx(1.5 * 0.7 - 2.0 * 0.3 + 0.4)
         assert float(result.equations.inverse(x, r, p)) == pytest.approx(0.7)
     with pytest.raises(InvalidProblem, match="parameter 'w_y' already"):
-        fp.disturbed(result, ("y",))
+        disturbed(result, ("y",))
     with pytest.raises(InvalidProblem, match=r"'z' is unknown.*Valid: y"):
-        fp.disturbed(plant, ("z",))
+        disturbed(plant, ("z",))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from plants import chain, pendulum
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported
 from fpirhc.plant.motion import places
-from fpirhc.plant.regressor import Combination, Regressor
+from fpirhc.plant.regressor import Combination, Regressor, linear_parameters
 
 INERTIAS = {
     "a1": Combination(lambda p: p.I1 + p.m1 * p.lc1**2 + p.Ie + p.me * (p.lce**2 + p.l1**2), "kg m^2"),
@@ -143,10 +143,10 @@ def test_more_combinations_than_parameters():
 
 def test_linear_parameters_are_found():
     """Linear jointly with all others; a Stribeck level is one only where its velocity is not learned."""
-    assert fp.linear_parameters(pendulum()) == ()
-    result = fp.linear_parameters(fp.load_problem("planar_arm").problem.plant)
+    assert linear_parameters(pendulum()) == ()
+    result = linear_parameters(fp.load_problem("planar_arm").problem.plant)
     assert result == ("J1", "k1", "m2", "I2", "load", "b1", "b2", "c1", "c2")
-    assert fp.linear_parameters(fp.load_problem("two_link_arm").problem.plant) == ("I1", "Ie", "b")
+    assert linear_parameters(fp.load_problem("two_link_arm").problem.plant) == ("I1", "Ie", "b")
 
 
 def test_parameters_that_enter_nonlinearly_are_refused_by_name():
@@ -171,4 +171,4 @@ def test_plants_without_a_regressor_are_refused():
     )
     with pytest.raises(NotSupported, match="root finder"):
         Regressor(nonlinear, ("m",))
-    assert fp.linear_parameters(chain(1)) == ("m",)
+    assert linear_parameters(chain(1)) == ("m",)
