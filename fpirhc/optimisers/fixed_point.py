@@ -22,7 +22,6 @@ from fpirhc.optimisers.base import Optimiser, first_plan, sane, stage_later
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
 from fpirhc.optimisers.plain import PlainSettings, plain_memory, plain_step, shifted_plain
-from fpirhc.optimisers.two_starts import of_two_starts
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import settled
@@ -116,7 +115,7 @@ class FixedPoint(Optimiser):
         return self._begun(ocp, plain_step(ocp, self._plain(converging=True)))
 
     def _begun(self, ocp: OptimalControl, one: ca.Function) -> ca.Function:
-        return of_two_starts(one, self.memory(ocp)) if self.second_start else one
+        return _of_two_starts(one, self.memory(ocp)) if self.second_start else one
 
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:
         if ocp.bounds_states:
@@ -207,3 +206,25 @@ def _better(
     count = ca.vertcat(ca.MX.zeros(3), first[1][3], 0)
     results = [inputs, diagnostics + count, layout.join(memory)]
     return [ca.if_else(better, new, old) for new, old in zip(results, first, strict=True)]
+
+
+def _of_two_starts(one: ca.Function, memory: Layout) -> ca.Function:
+    """Function like a step of an optimiser: the result of `one`, or of `one` from the start of its memory where that is cheaper.
+
+    A plan that is not solved is taken only if neither is. The iterations are those of both.
+
+    Args:
+        one: Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
+        memory: its layout.
+    """
+    arguments = [ca.MX.sym(one.name_in(k), *one.size_in(k)) for k in range(one.n_in())]
+    warm = one(*arguments)
+    cold = one(*arguments[:4], ca.MX(ca.DM(memory.start())))
+    solved = [result[1][4] == int(Status.OK) for result in (warm, cold)]
+    cheaper = ca.logic_or(ca.logic_not(solved[0]), cold[1][0] < warm[1][0])
+    better = ca.logic_and(solved[1], cheaper)
+    count = ca.vertcat(ca.MX.zeros(3), 1, 0)
+    chosen = [ca.if_else(better, new, old) for new, old in zip(cold, warm, strict=True)]
+    other = ca.if_else(better, warm[1][3], cold[1][3])
+    chosen[1] = chosen[1] + count * other
+    return ca.Function(f"{one.name()}_twice", arguments, chosen)

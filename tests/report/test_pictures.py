@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
 from fpirhc.report.html import own_pictures, render, render_scenarios
-from fpirhc.simulation.pictures.base import Kept, extremes
-from fpirhc.simulation.pictures.heat_map import averaged
+from fpirhc.simulation.pictures.base import Kept, averaged, extremes
 from fpirhc.simulation.pictures.lines import passages
 
 
@@ -158,10 +157,10 @@ def test_a_heat_map_has_one_scale_for_all_runs(runs):
 def test_many_cycles_of_a_heat_map_are_averaged():
     """A column is the mean of its interval, so the mean of the whole is kept."""
     values = np.random.default_rng(3).normal(size=20_000)
-    columns = averaged(values)
+    columns = averaged(values, 1000)
     assert columns.shape == (1000,)
     assert columns[0] == pytest.approx(values[:20].mean())
-    np.testing.assert_array_equal(averaged(values[:1000]), values[:1000])
+    np.testing.assert_array_equal(averaged(values[:1000], 1000), values[:1000])
 
 
 def test_a_heat_map_has_rows_of_one_unit(runs):

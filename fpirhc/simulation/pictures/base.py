@@ -89,6 +89,14 @@ def numbers(run: Run, what: str | Quantity) -> np.ndarray:
     return run[what] if isinstance(what, str) else np.asarray(what.values(run), dtype=float)
 
 
+def averaged(values: np.ndarray, columns: int) -> np.ndarray:
+    """Return means of equal intervals where there are more values than columns; a shorter series as it is."""
+    if values.size <= columns:
+        return values
+    edges = np.linspace(0, values.size, columns + 1).astype(int)
+    return np.asarray(np.add.reduceat(values, edges[:-1]) / np.diff(edges))
+
+
 def readable(kept: Mapping[str, Sequence[Kept]]) -> Mapping[str, Sequence[Kept]]:
     """Return what was kept.
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.simulation import drawing
-from fpirhc.simulation.pictures.base import Kept, Picture, Quantity, caption_axes, label, numbers
-from fpirhc.simulation.pictures.heat_map import averaged
+from fpirhc.simulation.pictures.base import Kept, Picture, Quantity, averaged, caption_axes, label, numbers
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.simulation import drawing
-from fpirhc.simulation.pictures.base import Picture, Quantity, numbers
+from fpirhc.simulation.pictures.base import Picture, Quantity, averaged, numbers
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
@@ -57,12 +57,12 @@ class HeatMap(Picture):
             InvalidValue: the rows have different units.
         """
         unit = self._unit(next(iter(runs.values())))
-        maps = {name: [averaged(numbers(run, row)) for row in self.rows] for name, run in runs.items()}
+        maps = {name: [averaged(numbers(run, row), _COLUMNS) for row in self.rows] for name, run in runs.items()}
         every = np.concatenate([np.ravel(values) for values in maps.values()])
         scale = {"vmin": np.nanmin(every), "vmax": np.nanmax(every)}
         panels = figure.subplots(len(runs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for axis, (name, run) in zip(panels, runs.items(), strict=True):
-            times = averaged(run.time)
+            times = averaged(run.time, _COLUMNS)
             shown = axis.pcolormesh(times, range(1, len(self.rows) + 1), maps[name], shading="nearest", **scale)
             axis.set_title(drawing.literal(name), fontsize=10)
             axis.set_ylabel(drawing.literal(self.place))
@@ -77,11 +77,3 @@ class HeatMap(Picture):
                 f"HeatMap {self.title!r}: one scale of colours shows one unit, and rows have {', '.join(units)}"
             )
         return next(iter(units))
-
-
-def averaged(values: np.ndarray, columns: int = _COLUMNS) -> np.ndarray:
-    """Return means of equal intervals where there are more values than columns; a shorter series as it is."""
-    if values.size <= columns:
-        return values
-    edges = np.linspace(0, values.size, columns + 1).astype(int)
-    return np.asarray(np.add.reduceat(values, edges[:-1]) / np.diff(edges))
