@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from fpirhc.contraction.spectrum import Array
+from fpirhc.deformation.base import Iteration
 from fpirhc.errors import InvalidValue
 
 _NONE = 1e-9  # a damping below this counts as none
@@ -22,23 +23,44 @@ _AT_ONCE = 20  # gains, so that a search that ends early is short
 _RANGE = 1e-3, 20.0  # of the gain times |lambda| that is searched
 
 
-def delayed_limit(weights: Array, *, pairing: float = 0.0, pole: float = 0.0, eigenvalue: complex = 1.0) -> float:
+def limit_behind_weights(iteration: Iteration, weights: Array, pairing: float, eigenvalue: complex) -> float:
+    """Return the effective gain below which an iteration converges whose response has these weights of past requests.
+
+    Args:
+        iteration: facts of the deformation: leak, pole of the filter, share of the model.
+        weights: w_1, w_2, ... of past requests in the response, dead time included.
+        pairing: age of the request that a response is paired with, cycles.
+        eigenvalue: lambda of the response Jacobian; give -lambda for the limit of a negative gain.
+    """
+    pole, modelled = iteration.error_pole, iteration.modelled
+    if not iteration.leak:
+        return delayed_limit(weights, pairing=pairing, pole=pole, eigenvalue=eigenvalue, modelled=modelled)
+    leak = iteration.leak
+    return leaking_limit(weights, cycles=pairing, leak=leak, pole=pole, eigenvalue=eigenvalue, modelled=modelled)
+
+
+def delayed_limit(
+    weights: Array, *, pairing: float = 0.0, pole: float = 0.0, eigenvalue: complex = 1.0, modelled: float = 0.0
+) -> float:
     """Return the effective gain below which the delayed iteration converges; 0 when no gain does.
 
-        D(z) = (1 - p / z) (1 - z^-(1+d)) + a lambda (1 - p) W(z) = 0
+        D(z) = (1 - p / z) (1 - z^-(1+d)) + a (1 - p) E(z) = 0,     E = (lambda - m) W(z) + m z^-(1+d)
 
-    For a small a lambda a root z0 of z0^(1+d) = 1 moves inwards when Re[lambda (1 - p) W(z0) / (1 - p / z0)] > 0. With a larger
-    gain the loop stays stable until a root meets the unit circle. A fraction of d interpolates between two requests.
+    For a small a a root z0 of z0^(1+d) = 1 moves inwards when Re[(1 - p) E(z0) / (1 - p / z0)] > 0. With a larger gain the loop
+    stays stable until a root meets the unit circle. A fraction of d interpolates between two requests.
 
     Args:
         weights: w_1, w_2, ... of past requests in the response.
         pairing: d, in cycles.
         pole: p of the filter of the error.
         eigenvalue: lambda of the response Jacobian; give -lambda for the limit of a negative gain.
+        modelled: m, share of the model's response in the error: 1 in the model-referenced form, else 0.
     """
     pairing = round(pairing, _DIGITS)
-    response = eigenvalue * (1 - pole) * np.append(0.0, weights)
-    iteration = np.convolve([1.0, -pole], _pairing(pairing))
+    own = _late(pairing, len(weights) + 1)
+    delayed = np.append(weights, np.zeros(own.size - len(weights) - 1))
+    response = (1 - pole) * ((eigenvalue - modelled) * np.append(0.0, delayed) + modelled * own)
+    iteration = np.convolve([1.0, -pole], np.append(1.0, -own[1:]))
     # A fraction of a cycle damps all but the constant request.
     count = 1 if pairing % 1 else round(pairing) + 1
     first = 2 * np.pi * np.arange(count) / count
@@ -60,14 +82,11 @@ def delayed_limit(weights: Array, *, pairing: float = 0.0, pole: float = 0.0, ei
     return float(np.min(np.abs(_at(iteration, meeting) / _at(response, meeting))))
 
 
-def _pairing(cycles: float) -> Array:
-    """Coefficients of 1 - z^-(1+d)."""
+def _late(cycles: float, least: int) -> Array:
+    """Coefficients of z^-(1+d), at least so many."""
     whole = math.floor(cycles)
-    share = cycles - whole
-    coefficients = np.zeros(whole + 3)
-    coefficients[0] = 1.0
-    coefficients[whole + 1] -= 1 - share
-    coefficients[whole + 2] -= share
+    coefficients = np.zeros(max(whole + 3, least))
+    coefficients[whole + 1 : whole + 3] = 1 - (cycles - whole), cycles - whole
     return coefficients
 
 
@@ -90,16 +109,15 @@ def leaking_limit(
     leak: float = 0.0,
     pole: float = 0.0,
     eigenvalue: complex = 1.0,
-    referenced: bool = False,
+    modelled: float = 0.0,
     width: int = 0,
 ) -> float:
     """Return the effective gain up to which every gain converges; 0 when none does, infinite when all below 20 / |lambda| do.
 
-    The deformation leaks, or is model-referenced:
+    The deformation leaks:
 
         1 = p / z + (1 - p) [ z^-(1+d) - a F(z) E(z) ],     F = (1 - f) / (1 - f / z),
-        E = lambda W(z)                                     increment
-        E = (lambda - 1) W(z) + z^-(1+d)                    model-referenced: the model's response passes W too
+        E = (lambda - m) W(z) + m z^-(1+d)                  m = 1: model-referenced, the model's response passes W too
 
     With a model of the right gain, lambda = 1, W drops out of the model-referenced form, and the limit is that without delay.
 
@@ -109,14 +127,14 @@ def leaking_limit(
         leak: p, dimensionless.
         pole: f of the filter of the error.
         eigenvalue: lambda of the response Jacobian; give -lambda for the limit of a negative gain.
-        referenced: whether the form is the model-referenced one.
+        modelled: m, share of the model's response in the error: 1 in the model-referenced form, else 0.
         width: half width of a triangular mean of the paired values, whole cycles (`Paired(uncertainty=...)`).
     """
     if complex(eigenvalue).real <= 0:
         return 0.0
 
     at_zero, at_one = (
-        _on_circle(loop_polynomial(weights, gain, cycles, leak, pole, eigenvalue, referenced, width))
+        _on_circle(loop_polynomial(weights, gain, cycles, leak, pole, eigenvalue, modelled, width))
         for gain in (0.0, 1.0)
     )
 
@@ -144,7 +162,7 @@ def loop_polynomial(
     leak: float,
     pole: float,
     eigenvalue: complex,
-    referenced: bool,
+    modelled: float,
     width: int = 0,
 ) -> Array:
     """Return the coefficients in 1 / z of (1 - f / z) times (left side minus right side); arguments as in `leaking_limit`."""
@@ -157,7 +175,7 @@ def loop_polynomial(
     delayed = np.zeros_like(own)
     delayed[1 : len(weights) + 1] = weights
     smooth = np.array([1.0, -pole])
-    error = (eigenvalue - 1) * delayed + own if referenced else eigenvalue * delayed
+    error = (eigenvalue - modelled) * delayed + modelled * own
     left_side = np.convolve(smooth, [1.0, -leak])
     right_side = (1 - leak) * (np.convolve(smooth, own) - gain * (1 - pole) * np.append(error, 0.0))
     return np.asarray(np.pad(left_side, (0, right_side.size - left_side.size)) - right_side)

@@ -10,16 +10,14 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.contraction.delayed import delayed_limit, leaking_limit
+from fpirhc.contraction.delayed import limit_behind_weights
 from fpirhc.contraction.measured import jacobians_along
 from fpirhc.contraction.spectrum import Spectrum, assess_gain, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.model_referenced import form_inside
+from fpirhc.deformation.base import Deformation, Iteration, against_wrappers
 from fpirhc.errors import NotContractive
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.live import nominal
@@ -66,21 +64,23 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     Raises:
         NotContractive: the gain is too large; the message names the limit, the gain, and remedies.
     """
-    gain, form = deformation.effective_gain(), _form(deformation)
-    if gain == 0 or not deformation.iteration.limited or not deformation.iteration.constant or not _REFUSES.get():
+    gain, iteration = deformation.effective_gain(), deformation.iteration
+    if gain == 0 or not iteration.limited or not iteration.constant or not _REFUSES.get():
         return
     spectrum = _at_start(problem, deformation)
     if spectrum is None:
         return
-    late = _delayed_weights(problem, form)
+    late = _delayed_weights(problem, iteration)
     weights = late or [np.ones(1)]
     eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
 
     def limit(pairing: float) -> float:
-        return min(form.limit(w, complex(v), pairing) for w in weights for v in eigenvalues)
+        return min(limit_behind_weights(iteration, w, pairing, complex(v)) for w in weights for v in eigenvalues)
 
-    plain = not (late or form.referenced or form.leak)
-    largest = max(map(abs, linear_limit(spectrum.eigenvalues))) if plain else limit(form.pairing if late else 0.0)
+    at_once = not (late or iteration.leak)
+    largest = (
+        max(map(abs, linear_limit(spectrum.eigenvalues))) if at_once else limit(_paired(iteration) if late else 0.0)
+    )
     largest = min(largest, _SOUGHT / float(np.abs(eigenvalues).max()))
     if abs(gain) < largest:
         return
@@ -89,14 +89,14 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     delay = problem.response_delay
     limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
-    best = None if form.referenced else next((d for d, most in limits.items() if abs(gain) < most), None)
-    raise NotContractive(_too_late(problem, deformation, form, largest, best))
+    best = None if iteration.modelled else next((d for d, most in limits.items() if abs(gain) < most), None)
+    raise NotContractive(_too_late(problem, deformation, largest, best))
 
 
 def limit_behind(deformation: Deformation, weights: np.ndarray, late: float, eigenvalue: float) -> float:
     """Return the largest effective gain for a response with these weights of past requests, late by some cycles."""
-    form = _form(deformation)
-    return form.limit(_late(weights, late), eigenvalue, form.pairing)
+    iteration = deformation.iteration
+    return limit_behind_weights(iteration, _late(weights, late), _paired(iteration), eigenvalue)
 
 
 def product_limit(problem: Problem, deformation: Deformation) -> float | None:
@@ -104,52 +104,25 @@ def product_limit(problem: Problem, deformation: Deformation) -> float | None:
 
     It is None without estimator and filter, and where the inputs have different dead times.
     """
-    form = _form(deformation)
-    weights = _delayed_weights(problem, form)
-    return min((form.limit(w, 1.0, form.pairing) for w in weights), default=None)
+    iteration = deformation.iteration
+    weights = _delayed_weights(problem, iteration)
+    return min((limit_behind_weights(iteration, w, _paired(iteration), 1.0) for w in weights), default=None)
 
 
-def _delayed_weights(problem: Problem, form: _Form) -> list[np.ndarray]:
+def _delayed_weights(problem: Problem, iteration: Iteration) -> list[np.ndarray]:
     """Weights of past requests in the estimated responses, dead time included; empty without estimator and filter."""
     orders = set(problem.plant.response_orders.values())
     weights = [problem.sensing.estimator.weights(order, problem.period) for order in orders]
     dead_times = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
-    if (form.pole == 0 and all(w.size == 1 for w in weights)) or len(dead_times) > 1:
+    if (iteration.error_pole == 0 and all(w.size == 1 for w in weights)) or len(dead_times) > 1:
         return []
     dead_time = (dead_times.pop() + problem.dead_time.measurement) / problem.period
     return [_late(w, dead_time) for w in weights]
 
 
-@dataclass(frozen=True)
-class _Form:
-    """The facts of a deformation that set its limit behind a delay.
-
-    Args:
-        pairing: age of the request that a response is paired with, cycles.
-        leak: pole of the leak.
-        pole: of the filter of the error.
-        referenced: whether the form is the model-referenced one.
-    """
-
-    pairing: float
-    leak: float
-    pole: float
-    referenced: bool
-
-    def limit(self, weights: np.ndarray, eigenvalue: complex, pairing: float) -> float:
-        """Largest effective gain for a response with these weights."""
-        if self.referenced or self.leak:
-            leak, pole = self.leak, self.pole
-            return leaking_limit(
-                weights, cycles=pairing, leak=leak, pole=pole, eigenvalue=eigenvalue, referenced=self.referenced
-            )
-        return delayed_limit(weights, pairing=pairing, pole=self.pole, eigenvalue=eigenvalue)
-
-
-def _form(deformation: Deformation) -> _Form:
-    pairing = deformation.iteration.pairing
-    cycles = (pairing.cycles or 0.0) if pairing else 0.0
-    return _Form(cycles, deformation.iteration.leak, deformation.iteration.error_pole, deformation.mirror.referenced)
+def _paired(iteration: Iteration) -> float:
+    """Age of the request that a response is paired with, cycles."""
+    return (iteration.pairing.cycles or 0.0) if iteration.pairing else 0.0
 
 
 def _late(weights: np.ndarray, cycles: float) -> np.ndarray:
@@ -179,12 +152,13 @@ def _named_gain(deformation: Deformation) -> tuple[str, float]:
     return (deformation.gain_name, float(own)) if own is not None else ("effective gain", deformation.effective_gain())
 
 
-def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: float, pairing: float | None) -> str:
+def _too_late(problem: Problem, deformation: Deformation, limit: float, pairing: float | None) -> str:
     gain, estimator = abs(deformation.effective_gain()), problem.sensing.estimator
     name, value = _named_gain(deformation)
     delay = problem.response_delay
     reasons = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
-    reasons += [f"the error is filtered with the pole {form.pole:g}"] if form.pole else []
+    pole = deformation.iteration.error_pole
+    reasons += [f"the error is filtered with the pole {pole:g}"] if pole else []
     remedies = [f"0 < |{name}| < {limit / gain * abs(value):.3g}"] if limit else []
     remedies += [f"Paired(map, cycles={pairing:.4g})"] if pairing is not None else []
     remedies += ["a shorter window or time constant"]
@@ -287,12 +261,7 @@ def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
             f"{type(deformation).__name__}: {channels} {_what(deformation)} are given, but the plant has {len(names)} "
             f"controlled coordinates ({', '.join(names)}); give one for each, or one number for all"
         )
-    if (outer := form_inside(deformation)) is not None:
-        name = type(outer).__name__
-        yield (
-            f"{name} around a model-referenced form changes what the form compares, the model's response with the measured one; "
-            f"put it inside: ModelReferenced({name}(map, ...))"
-        )
+    yield from against_wrappers(deformation)
     for setting, values in (("cycles", every(mirror.cycles)), ("lag", every(mirror.lag))):
         if len(values) not in (1, len(plant.inputs)):
             own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"

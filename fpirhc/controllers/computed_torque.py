@@ -14,7 +14,7 @@ from fpirhc.controllers.contract import Undeformed
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import NotInvertible
-from fpirhc.horizon.nominal import known_on_reference, reference_state, require_reference_of_states
+from fpirhc.horizon.nominal import reference_state, require_reference_of_states
 from fpirhc.members import Example
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
@@ -74,7 +74,7 @@ class FeedforwardOnly(Undeformed):
         """Block (reference, state, parameters) -> command, and the response that the model expects of it."""
         plant, wanted = problem.plant, problem.plant.response_signal("_reference_response")
         inverse, response = plant.equations.inverse, plant.equations.controlled_response
-        known = known_on_reference(plant)
+        known = plant.equations.known_on_reference
 
         def step(s: Signals) -> dict[str, Expression]:
             nominal = reference_state(plant, s.reference) if known else s.state

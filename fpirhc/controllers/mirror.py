@@ -16,10 +16,10 @@ from typing import NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.model_inputs import CommandPath
+from fpirhc.controllers.model_inputs import MEASURED, MEASURED_OUTPUT, CommandPath, measured_output, measured_state
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.maps import response_age
-from fpirhc.plant.motion import controlled_places, time_signal
+from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names, values_of
 from fpirhc.symbolic.block import GAP, Block, Delay, straightened, unseen
@@ -27,23 +27,6 @@ from fpirhc.symbolic.expression import Signals, expression, is_finite, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.queue import Queue
 from fpirhc.task.problem import Problem
-
-MEASURED_OUTPUT = "_measured_output"  # the outputs of the same instant
-MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
-MEASURED_TIME = "_measured_time"  # the time at which it is given, where a controller may act on a predicted one
-
-
-def measured_state(plant: Plant) -> Signal:
-    """Return the signal of the measured state."""
-    return Signal(MEASURED, plant.state.elements, plant.state.units)
-
-
-def measured_output(plant: Plant) -> Signal:
-    """Return the signal of the measured outputs."""
-    return Signal(MEASURED_OUTPUT, plant.output.elements, plant.output.units)
-
-
-__all__ = ["MEASURED", "MEASURED_OUTPUT", "MEASURED_TIME", "measured_reads", "mirror_blocks", "with_measured_state"]
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
@@ -63,26 +46,6 @@ def believed_path(problem: Problem, deformation: Deformation, owner: str = "mirr
     mirror, inputs = deformation.mirror, problem.plant.input
     last, waits = Signal("_command_before", inputs.elements, inputs.units), Queue(mirror.cycles, longest=mirror.longest)
     return CommandPath(problem, owner, last, waits, mirror.measurement, mirror.lag, counts=False)
-
-
-def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks behind one that writes the measured state or outputs, and their time, where a block reads them."""
-    writes = measured_reads(plant, blocks)
-    if not writes:
-        return list(blocks)
-    sources = {MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
-    reads = tuple(sources[w.name] for w in writes)
-    first = Block(
-        "measured", Layout(reads), Layout(writes), lambda s: {w.name: getattr(s, sources[w.name].name) for w in writes}
-    )
-    return [first, *blocks]
-
-
-def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
-    """Return the signals of the measured state and outputs and of their time, as far as some blocks read them."""
-    every = measured_state(plant), measured_output(plant), replace(time_signal(plant), name=MEASURED_TIME)
-    read = {name for block in blocks for name in block.reads.names}
-    return tuple([signal for signal in every if signal.name in read])
 
 
 class Answers(NamedTuple):

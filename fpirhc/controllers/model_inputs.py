@@ -10,7 +10,7 @@ the signals of the last cycle, `_signals_acted`. A parallel model and an observe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,6 +30,9 @@ from fpirhc.task.problem import Problem
 ACTED = "_signals_acted"
 NOW = "_parameters_now"
 NONE = 1e-9  # a fraction of a cycle below this counts as zero
+MEASURED_OUTPUT = "_measured_output"  # the outputs of the same instant
+MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
+MEASURED_TIME = "_measured_time"  # the time at which it is given, where a controller may act on a predicted one
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,3 +212,33 @@ class CommandPath:
     @property
     def _known(self) -> KnownSignals:
         return KnownSignals(self.problem.plant, self.problem.signals, self.problem.period)
+
+
+def measured_state(plant: Plant) -> Signal:
+    """Return the signal of the measured state."""
+    return Signal(MEASURED, plant.state.elements, plant.state.units)
+
+
+def measured_output(plant: Plant) -> Signal:
+    """Return the signal of the measured outputs."""
+    return Signal(MEASURED_OUTPUT, plant.output.elements, plant.output.units)
+
+
+def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
+    """Return the blocks behind one that writes the measured state or outputs, and their time, where a block reads them."""
+    writes = measured_reads(plant, blocks)
+    if not writes:
+        return list(blocks)
+    sources = {MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
+    reads = tuple(sources[w.name] for w in writes)
+    first = Block(
+        "measured", Layout(reads), Layout(writes), lambda s: {w.name: getattr(s, sources[w.name].name) for w in writes}
+    )
+    return [first, *blocks]
+
+
+def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
+    """Return the signals of the measured state and outputs and of their time, as far as some blocks read them."""
+    every = measured_state(plant), measured_output(plant), replace(time_signal(plant), name=MEASURED_TIME)
+    read = {name for block in blocks for name in block.reads.names}
+    return tuple([signal for signal in every if signal.name in read])

@@ -21,7 +21,7 @@ from fpirhc.controllers.contract import Controller, refuse
 from fpirhc.controllers.model_inputs import CommandPath
 from fpirhc.controllers.reference_states import nominal_motion
 from fpirhc.errors import NoAnswer
-from fpirhc.horizon.nominal import known_on_reference, nominal_run, reference_state
+from fpirhc.horizon.nominal import nominal_run, reference_state
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.maps import growth_of
@@ -306,7 +306,7 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
 def _points(problem: Problem) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """States and inputs of the model along the reference, or of a simulation where it does not give the states."""
     plant = problem.plant
-    if known_on_reference(plant):
+    if plant.equations.known_on_reference:
         reference, needed = nominal_motion(problem), problem.inputs_before
         for t in np.linspace(0.0, problem.duration, _INSTANTS):
             outputs, response = reference(t)

@@ -30,7 +30,7 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.cost import Cost
-from fpirhc.horizon.nominal import feedforward, known_on_reference, require_reference_of_states
+from fpirhc.horizon.nominal import feedforward, require_reference_of_states
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import SCALE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -414,7 +414,7 @@ def _feedforward(problem: Problem) -> ca.Function:
     own = [ca.MX.sym(signal.name, signal.size) for signal in own_signals(problem)]
     state, response = motion_of(problem)(t, *own)
     invertible = plant.controlled is not None or len(plant.inputs) == len(plant.chains)
-    known = invertible and known_on_reference(plant)
+    known = invertible and plant.equations.known_on_reference
     needed = feedforward(plant, state, response, p) if known else ca.MX.zeros(len(plant.inputs))
     return ca.Function("fpirhc_feedforward", [t, *own, p], [needed])
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
-from fpirhc.horizon.nominal import known_on_reference, nominal_run
+from fpirhc.horizon.nominal import nominal_run
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -78,7 +78,7 @@ def nominal_motion(problem: Problem) -> ca.Function:
 def reference_states(problem: Problem, count: int) -> np.ndarray:
     """Return states at evenly spaced instants of a run, shape (nx, count); NaN after a nominal run that does not stay finite."""
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
-    if known_on_reference(plant):
+    if plant.equations.known_on_reference:
         referenced = np.asarray(problem.reference.function(plant).map(count)(times[None, :])[0].full())
         return referenced[list(plant.equations.known_by_outputs)]
     states, _ = nominal_run(plant, problem.reference, *nominal_start(problem))
@@ -113,7 +113,7 @@ def largest_response(problem: Problem) -> tuple[float, ...]:
     reference are not known before a run.
     """
     free = (float("inf"),) * len(problem.plant.controlled_names)
-    largest = response_scale(problem).largest if known_on_reference(problem.plant) else free
+    largest = response_scale(problem).largest if problem.plant.equations.known_on_reference else free
     return tuple(2.0 ** math.ceil(math.log2(value)) if math.isfinite(value) else value for value in largest)
 
 

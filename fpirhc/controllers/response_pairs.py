@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from fpirhc.controllers.mirror import MEASURED, measured_output, measured_state
+from fpirhc.controllers.model_inputs import MEASURED, measured_output, measured_state
 from fpirhc.symbolic.block import straightened
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import ceil, larger

@@ -16,8 +16,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, fed, like
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import given_response
-from fpirhc.controllers.mirror import measured_reads, with_measured_state
-from fpirhc.controllers.model_inputs import ACTED, NOW, KnownSignals
+from fpirhc.controllers.model_inputs import ACTED, NOW, KnownSignals, measured_reads, with_measured_state
 from fpirhc.controllers.observed_state import Believing, check_believed
 from fpirhc.controllers.reference_states import given_signals, with_reference
 from fpirhc.errors import InvalidProblem

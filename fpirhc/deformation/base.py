@@ -47,7 +47,7 @@ class Mirror:
     """
 
     request: ClassVar[str] = "_modelled"  # the signal that the map is given as the request which caused the response
-    referenced: ClassVar[bool] = True
+    models: ClassVar[tuple[str, ...]] = ("_modelled",)  # signals of a model that the map reads
 
     cycles: float | tuple[float, ...] = 0.0
     measurement: float = 0.0
@@ -63,13 +63,22 @@ class Mirror:
         """Where the next request begins."""
         return desired
 
+    def step(self, request: Expression, candidate: Expression) -> Expression:  # noqa: ARG002
+        """By how much a map moves its request; zero here, where it is given a model's response in place of its last request."""
+        return 0 * candidate
+
     def require_last_request(self, refusal: str) -> None:
         """Raise where a map is not given its own last request, with the refusal; a plan, or a law on commands, has nothing else.
 
         Raises:
             NotSupported: a model-referenced form.
         """
-        raise NotSupported(refusal)
+        for reason in self.against_last_request(refusal):
+            raise NotSupported(reason)
+
+    def against_last_request(self, refusal: str) -> tuple[str, ...]:
+        """The refusal of a place that has only the last request to give, such as a plan; empty where a map wants just that."""
+        return (refusal,)
 
     @property
     def lags(self) -> bool:
@@ -81,13 +90,16 @@ class LastRequest(Mirror):
     """No model: a map is given the last request, and its next one begins there."""
 
     request = "_deformed_last"
-    referenced = False
+    models = ()
 
     def origin(self, request: Expression, desired: Expression) -> Expression:  # noqa: ARG002
         return request
 
-    def require_last_request(self, refusal: str) -> None:
-        pass
+    def step(self, request: Expression, candidate: Expression) -> Expression:
+        return candidate - request
+
+    def against_last_request(self, refusal: str) -> tuple[str, ...]:  # noqa: ARG002
+        return ()
 
 
 @dataclass(frozen=True)
@@ -149,6 +161,7 @@ class Iteration:
         channels: number of controlled coordinates that the map is made for; None: any number.
         limited: whether a gain beyond the limit of the iteration is refused.
         weights: W by rows where the gain is a matrix, r+ = r - a W (f - d); None: the one matrix.
+        modelled: share of the model's response in the response error, (f - d) - share (f^ - d): 1 in the model-referenced form.
     """
 
     constant: bool = True
@@ -160,6 +173,21 @@ class Iteration:
     channels: int | None = None
     limited: bool = True
     weights: tuple[tuple[float, ...], ...] | None = None
+    modelled: float = 0.0
+
+    @property
+    def form(self) -> str:
+        """What the form is called: 'model-referenced', 'increment', 'paired' or 'plain'."""
+        if self.modelled:
+            return "model-referenced"
+        if not self.slows_desired:
+            return "increment"
+        return "plain" if self.pairing is None else "paired"
+
+    @property
+    def of_last_pair(self) -> bool:
+        """Whether a request follows from the last request and its response alone: no model, pairing or filter of its own."""
+        return self.pairing is None and not (self.modelled or self.error_pole)
 
     def weighted(self, jacobian: np.ndarray) -> np.ndarray:
         """Return J W for a response Jacobian J, shape (..., n, n): response errors are multiplied by I - a J W per cycle."""
@@ -302,12 +330,6 @@ def smooth_norm(column: Expression, floor: float) -> Expression:
     return ca.sqrt(ca.sumsqr(column) + floor * floor)
 
 
-def of_last_pair(deformation: Deformation) -> bool:
-    """Whether a request follows from the last request and its response alone: no model, pairing or filter of its own."""
-    iteration = deformation.iteration
-    return not deformation.mirror.referenced and iteration.pairing is None and not iteration.error_pole
-
-
 _FORGETTING = 0.1  # share of the newest sign
 _RETURNED = 0.3  # relative distance below which an error counts as equal to the error of two cycles before
 
@@ -348,6 +370,18 @@ class Wrapper(Deformation, ABC):
 
     def with_effective_gain(self, gain: float) -> Self:
         return replace(self, map=self.map.with_effective_gain(gain))
+
+
+def against_wrappers(deformation: Deformation) -> Iterator[str]:
+    """Yield a sentence for every wrapper that changes what a model-referenced form inside it compares, the outermost first."""
+    while deformation.inner is not None:
+        name = type(deformation).__name__
+        if not getattr(deformation, "passes_pair", False):
+            yield from deformation.inner.mirror.against_last_request(
+                f"{name} around a model-referenced form changes what the form compares, the model's response with the measured "
+                f"one; put it inside: ModelReferenced({name}(map, ...))"
+            )
+        deformation = deformation.inner
 
 
 def memory_of_map(wrapper: Wrapper, memory: Mapping[str, Expression], size: int) -> dict[str, Expression]:

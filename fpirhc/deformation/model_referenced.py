@@ -79,6 +79,7 @@ class ModelReferenced(Wrapper):
             leak=self._leak,
             pairing=Pairing(longest, channels=several(self._delays)) if longest else None,
             channels=len(every(self._cycles)) if several_channels else self.map.iteration.channels,
+            modelled=1.0,
         )
 
     @property
@@ -147,15 +148,6 @@ def settled(deformation: Deformation, request: Expression, response: Expression)
     if "own_deformation" not in memory:
         return {}
     return {"own_deformation": ca.repmat(request - response, memory["own_deformation"].size // size, 1)}
-
-
-def form_inside(deformation: Deformation) -> Deformation | None:
-    """Return the wrapper that changes what a model-referenced form inside it compares; None where there is no such wrapper."""
-    while deformation.inner is not None:
-        if deformation.inner.mirror.referenced and not getattr(deformation, "passes_pair", False):
-            return deformation
-        deformation = deformation.inner
-    return None
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:

@@ -28,18 +28,13 @@ _NOTHING = 1e-9  # share of the largest gain that counts as none
 _SMALL = 1e-2  # share of the largest gain before a run that is not finite
 
 
-def known_on_reference(plant: Plant) -> bool:
-    """Whether the reference gives the whole state."""
-    return min(plant.equations.known_by_outputs) >= 0
-
-
 def require_reference_of_states(plant: Plant, refusal: str) -> None:
     """Raise with the refusal where the reference does not give the whole state.
 
     Raises:
         NotSupported: the plant has states that no output shows.
     """
-    if not known_on_reference(plant):
+    if not plant.equations.known_on_reference:
         raise NotSupported(refusal)
 
 
@@ -80,7 +75,7 @@ def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> 
     Raises:
         NotSupported: see `reference_state`.
     """
-    follows = None if known_on_reference(plant) else followed_state(plant)
+    follows = None if plant.equations.known_on_reference else followed_state(plant)
     state = reference_state(plant, outputs) if follows is None else follows(outputs, p)
     return plant.equations.inverse(state, nominal_responses(plant, outputs, responses), p)
 

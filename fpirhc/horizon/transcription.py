@@ -26,7 +26,7 @@ from fpirhc.horizon.constraint_states import (
 )
 from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.nominal import feedforward, known_on_reference, nominal_motion, reference_state
+from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
 from fpirhc.plant.integrators import spurious_growth
@@ -438,7 +438,7 @@ def _nodes(
     layout = data_layout(plant, horizon)
     along = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
     states, inputs = along["reference"], along["feedforward"]
-    if not known_on_reference(plant):
+    if not plant.equations.known_on_reference:
         first = np.zeros(plant.state.size) if start is None else start
         bounds = nominal(limits).input_bounds(plant)
         states, inputs = nominal_motion(plant, reference, _advance(plant, horizon), first, bounds, data[0])

@@ -295,6 +295,11 @@ class Equations(MotionEquations):
         equal = [[k for k, e in enumerate(entries) if ca.is_equal(e, x[i], 1)] for i in range(x.numel())]
         return tuple(places[0] if places else -1 for places in equal)
 
+    @property
+    def known_on_reference(self) -> bool:
+        """Whether the reference gives the whole state."""
+        return min(self.known_by_outputs) >= 0
+
     @cached_property
     def controlled_response(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of the controlled coordinates or outputs.

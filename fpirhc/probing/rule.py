@@ -28,7 +28,6 @@ from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import FpirhcError, NotSupported
-from fpirhc.horizon.nominal import known_on_reference
 from fpirhc.plant.chain import require_rates
 from fpirhc.plant.parameter import Parameter, outside
 from fpirhc.plant.plant import Plant
@@ -97,7 +96,7 @@ def estimated_problem(
 
 def _start(own: Problem) -> Mapping[str, float]:
     """A start on the reference, where it gives the whole state: what is judged is what comes after the transient."""
-    if not known_on_reference(own.plant):
+    if not own.plant.equations.known_on_reference:
         return own.start
     return dict(zip(own.plant.state.elements, map(float, reference_states(own, 2)[:, 0]), strict=True))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like
 from fpirhc.controllers.contract import refuse, resolved, tracking_law, without_deformation
-from fpirhc.controllers.mirror import with_measured_state
+from fpirhc.controllers.model_inputs import with_measured_state
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, NoAnswer

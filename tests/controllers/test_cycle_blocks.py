@@ -35,7 +35,7 @@ from fpirhc.controllers.contract import (
     with_optimiser,
     without_deformation,
 )
-from fpirhc.controllers.mirror import MEASURED
+from fpirhc.controllers.model_inputs import MEASURED
 from fpirhc.controllers.reference_states import request_along_reference, request_of_commands, request_of_plans
 from fpirhc.controllers.sensing_chain import compose_controller, controller_reads, embedded
 from fpirhc.deformation.base import Deformation, with_inner

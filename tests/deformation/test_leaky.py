@@ -10,8 +10,9 @@ import pytest
 from test_dead_time import DUFFING, LAW, affine, iteration_radius
 
 import fpirhc as fp
-from fpirhc.contraction.delayed import leaking_limit, loop_polynomial
+from fpirhc.contraction.delayed import limit_behind_weights, loop_polynomial
 from fpirhc.deformation import Deformation
+from fpirhc.deformation.base import Iteration
 from fpirhc.deformation.leaky import leaky_margin, leaky_pole
 from fpirhc.errors import InvalidValue, NotSupported
 
@@ -205,29 +206,30 @@ def test_limit_of_the_additive_estimate(delay):
     weights = np.eye(delay + 1)[delay]
 
     def stable(ratio: float) -> bool:
-        row = loop_polynomial(weights, 0.2, 0.0, 0.0, 0.0, ratio, referenced=True)
+        row = loop_polynomial(weights, 0.2, 0.0, 0.0, 0.0, ratio, modelled=1.0)
         return bool(np.abs(np.roots(row.real)).max() < 1)
 
     assert stable(0.999 * ESTIMATE_LIMITS[delay] - 0.01)
     assert not stable(1.001 * ESTIMATE_LIMITS[delay] + 0.01)
 
 
-@pytest.mark.parametrize("referenced", [True, False])
-def test_limit_agrees_with_the_roots(referenced):
+@pytest.mark.parametrize(("modelled", "leaks"), [(1.0, True), (1.0, False), (0.0, True)])
+def test_limit_agrees_with_the_roots(modelled, leaks):
     """The limit by counting turns of a curve, at random windows, pairs and leaks, is where a root leaves the circle."""
-    random = np.random.default_rng(5)
+    random, limits = np.random.default_rng(5), []
     for _ in range(25):
         weights = random.uniform(0, 1, int(random.integers(1, 9)))
         weights /= weights.sum()
-        cycles, leak = float(random.integers(0, 6)), float(random.uniform(0.2, 0.8))
+        cycles, leak = float(random.integers(0, 6)), float(random.uniform(0.2, 0.8)) * leaks
         pole, ratio = float(random.choice([0.0, 0.6])), float(random.uniform(0.4, 2.5))
-        limit_value = leaking_limit(
-            weights, cycles=cycles, leak=leak, pole=pole, eigenvalue=ratio, referenced=referenced
-        )
-        assert limit_value > 0
-        for share, inside in ((0.98, True), (1.02, False)) if np.isfinite(limit_value) else ():
-            row = loop_polynomial(weights, share * limit_value, cycles, leak, pole, ratio, referenced)
+        iteration = Iteration(leak=leak, error_pole=pole, modelled=modelled)
+        limits.append(limit_behind_weights(iteration, weights, cycles, ratio))
+        shares = ((0.98, True), (1.02, False)) if limits[-1] > 0 else ((1e-3, False),)
+        for share, inside in shares if np.isfinite(limits[-1]) else ():
+            row = loop_polynomial(weights, share * (limits[-1] or 1.0), cycles, leak, pole, ratio, modelled)
             assert (np.abs(np.roots(row.real)).max() < 1) == inside
+    assert sum(limit > 0 for limit in limits) > 10
+    assert min(limits) > 0 or not leaks
 
 
 def test_a_dead_time_for_every_channel():

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, bounded, closing_blocks, desired_blocks, fed, like
-from fpirhc.controllers.mirror import MEASURED_TIME
+from fpirhc.controllers.model_inputs import MEASURED_TIME
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays

@@ -16,8 +16,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import refuse
 from fpirhc.controllers.mirror import believed_path
-from fpirhc.deformation.base import Deformation, Identity
-from fpirhc.deformation.model_referenced import form_inside
+from fpirhc.deformation.base import Deformation, Identity, against_wrappers
 from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.lie_derivatives import lie_derivatives, output_expression, structural_order
@@ -134,16 +133,16 @@ def _differences(plant: Plant, chain: OutputChain) -> int:
 
 def _against(problem: Problem, deformation: Deformation, differences: int) -> Iterator[str]:
     """Reasons against a deformation in a slot."""
-    estimator, referenced = problem.sensing.estimator, deformation.mirror.referenced
+    estimator, iteration = problem.sensing.estimator, deformation.iteration
     at_once = estimator.of_steps or (estimator.shows_response and differences < 2)
-    if referenced and not at_once:
-        yield (
+    if not at_once:
+        yield from deformation.mirror.against_last_request(
             f"ModelReferenced in a slot compares with the model's response of one cycle, and {estimator} gives a mean over "
             "several; use the map inside"
         )
-    if referenced and believed_path(problem, deformation).fraction:
+    if believed_path(problem, deformation).fraction:
         yield "ModelReferenced in a slot: a measurement is late by whole cycles; round measurement=..."
-    if not referenced and deformation.iteration.pairing is not None:
+    if iteration.pairing is not None and not iteration.modelled:
         pairs = deformation
         while pairs.inner is not None and pairs.inner.iteration.pairing is not None:
             pairs = pairs.inner
@@ -151,11 +150,7 @@ def _against(problem: Problem, deformation: Deformation, differences: int) -> It
             f"{type(pairs).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch, where the command "
             "would jump back to them; use the map itself, or behind a dead time ModelReferenced(map, cycles=...)"
         )
-    outer = form_inside(deformation)
-    if outer is not None:
-        yield (
-            f"{type(outer).__name__} around a model-referenced form: put it inside, ModelReferenced({type(outer).__name__}(map))"
-        )
+    yield from against_wrappers(deformation)
 
 
 def for_channel(

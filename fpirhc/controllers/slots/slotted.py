@@ -26,7 +26,8 @@ from fpirhc.controllers.base import (
 )
 from fpirhc.controllers.check import limit_behind
 from fpirhc.controllers.contract import late_deformation
-from fpirhc.controllers.mirror import Answers, believed_path, instant_mirror, measured_output
+from fpirhc.controllers.mirror import Answers, believed_path, instant_mirror
+from fpirhc.controllers.model_inputs import measured_output
 from fpirhc.controllers.reference_states import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.schedules import Schedule, linear_modes
 from fpirhc.controllers.slots.slot import (
@@ -174,8 +175,7 @@ class Slotted(Controller):
         for one in channels:
             light, law = one.plant, one.slot.tracking
             blocks.append(for_channel(law.law(light, problem.period), one, {"time"}, {"desired": one.wire("law")}))
-            if one.slot.deformation.mirror.referenced:
-                blocks.append(_mirror(problem, one))
+            blocks += [_mirror(problem, one, name) for name in one.slot.deformation.mirror.models]
             blocks.append(join_block(problem, realised, one, self.blend, self.blank))
             names = {name: f"{name}_{one.slot.coordinate}" for name in one.slot.deformation.shown()}
             names["warm_up"] = one.wire("valid")
@@ -291,13 +291,11 @@ def _count_block(problem: Problem, channels: Sequence[Channel]) -> Block:
     return Block("running", Layout((scalar("warm_up"),)), Layout((scalar("_warm_up_now"),)), step)
 
 
-def _mirror(problem: Problem, one: Channel) -> Block:
+def _mirror(problem: Problem, one: Channel, name: str) -> Block:
     """Block -> y^(r) of the model at what is measured and under the command that acted, as late as the plant's."""
     chain, calm = one.chain, ca.DM.zeros(len(problem.plant.names))
     path = believed_path(problem, one.slot.deformation, f"mirror_{one.number}")
-    answers = Answers(
-        lambda x, u, p: chain.response(x, u, p, calm), {chain.coordinate: chain.order}, one.signal("_modelled")
-    )
+    answers = Answers(lambda x, u, p: chain.response(x, u, p, calm), {chain.coordinate: chain.order}, one.signal(name))
     return instant_mirror(path, answers)
 
 
@@ -497,8 +495,8 @@ def join_block(problem: Problem, measured: Signal, one: Channel, blend: float, b
     """
     decay = exp(-problem.period / blend) if live.nominal(blend) > 0 else 0.0
     place = problem.plant.input.elements.index(one.chain.input)
-    request_before, referenced = _request_before(one), one.slot.deformation.mirror.referenced
-    names = ("law", "free", "gain", "active", "warm_up", *((request_before,) if referenced else ()))
+    request_before, models = _request_before(one), [n.removeprefix("_") for n in one.slot.deformation.mirror.models]
+    names = ("law", "free", "gain", "active", "warm_up", *models)
     first = _usable_from(problem, one, problem.dead_time.measurement)
     at_once = stays(first, 1)
 
@@ -525,14 +523,14 @@ def join_block(problem: Problem, measured: Signal, one: Channel, blend: float, b
             "realised": realised if at_once else ca.if_else(usable, realised, pair),
             "valid": ca.logic_and(ca.logic_and(active, usable), ca.logic_not(blanked)),
             "blanked": blanked,
-            **({} if referenced else {request_before: own_request}),
+            **({} if models else {request_before: own_request}),
         }
         return {one.wire(name): value for name, value in values.items()}
 
     shared = [scalar(n) for n in ("warm_up", "_age", "_offset_before", "_distance_before")]
     columns = [measured, replace(measured, name="_deformed_before")]
     reads = [*(one.signal(n) for n in names), *shared, *columns, like(problem.plant.input, "_command_before")]
-    own = () if referenced else (request_before,)
+    own = () if models else (request_before,)
     results = ("offset", "desired", "distance", "realised", "valid", "blanked", *own)
     return Block(f"join_{one.number}", Layout(tuple(reads)), Layout(tuple(one.signal(n) for n in results)), step)
 

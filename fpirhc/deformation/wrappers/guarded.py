@@ -83,8 +83,8 @@ class Guarded(Wrapper):
         sign = forget(own["sign"], ca.sign(ca.dot(error, own["error"])))
         limit = own["factor"] * self.map.largest_step()
         at_limit = (
-            smooth_norm(candidate - request, 1e-12) >= _AT_LIMIT * limit
-            if math.isfinite(nominal(self.map.largest_step())) and not self.map.mirror.referenced
+            smooth_norm(self.map.mirror.step(request, candidate), 1e-12) >= _AT_LIMIT * limit
+            if math.isfinite(nominal(self.map.largest_step()))
             else 0
         )
         fast = own["fast"] + _FAST * (size - own["fast"])

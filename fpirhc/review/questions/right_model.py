@@ -50,15 +50,6 @@ def recommended_form(problem: Problem) -> tuple[str, str]:
     return REFERENCED, "it leaves an exact model alone whatever the period and the plant's drift"
 
 
-def form_of(deformation: Deformation) -> str:
-    """The form in use."""
-    if deformation.mirror.referenced:
-        return REFERENCED
-    if not deformation.iteration.slows_desired:
-        return INCREMENT
-    return PLAIN if deformation.iteration.pairing is None else "paired"
-
-
 def right_form(
     problem: Problem,
     deformation: Deformation,
@@ -74,7 +65,7 @@ def right_form(
         error: errors of a run with a deformation by coordinate, none without a run; None: nothing is run.
     """
     form, why = recommended_form(problem)
-    used = form_of(deformation)
+    used = deformation.iteration.form
     text = f"it is {used}; measurements speak for {form}, because {why}"
     if used == form:
         return Answer(FORM, Verdict.YES, f"it is {used}: {why}")
@@ -277,7 +268,7 @@ def _cures_more(case: Case, runs: ErrorPair, nominal: NominalRun | None, predict
 def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, dict[str, float]]:
     """Which form passes, by a run, and which period would do, by the prediction."""
     sentences, numbers = [], {}
-    used = form_of(case.controller.deformation)
+    used = case.controller.deformation.iteration.form
     others = 0
     for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
         trial = case.trial(form) if name != used else "it is in use"
