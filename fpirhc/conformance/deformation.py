@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fpirhc.conformance.deformation_facts import check_deformation_facts
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, of_last_pair
 from fpirhc.symbolic.layout import Layout
 
 Array = npt.NDArray[Any]
@@ -41,7 +41,7 @@ def check_deformation(
         AssertionError: the first law that does not hold, in one sentence.
         FpirhcError: the map is not complete, a Sigmoid without scale for instance.
     """
-    laws = LAWS if deformation.iteration.of_last_pair else ANY
+    laws = LAWS if of_last_pair(deformation) else ANY
     keep(deformation, _Trial(deformation, tuple(elements), amplitude), laws, seed)
     check_deformation_facts(deformation, seed=seed, amplitude=amplitude)
 

@@ -125,7 +125,7 @@ def gain_is_proportional_to_its_field(trial: _Cycles, generator: np.random.Gener
 
 def exact_model_is_left_alone(trial: _Cycles, generator: np.random.Generator) -> None:
     """With a `mirror` it is given the model's response, and where this is the plant's the request is the desired response."""
-    if not trial.deformation.iteration.modelled:
+    if not trial.deformation.mirror.share:
         return
     memory = trial.layout.start()
     for response, desired in generator.normal(size=(_WARM, 2)) * trial.amplitude:

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from fpirhc.contraction.spectrum import Array
-from fpirhc.deformation.base import Iteration
+from fpirhc.deformation.base import Iteration, Mirror
 from fpirhc.errors import InvalidValue
 
 _NONE = 1e-9  # a damping below this counts as none
@@ -23,16 +23,19 @@ _AT_ONCE = 20  # gains, so that a search that ends early is short
 _RANGE = 1e-3, 20.0  # of the gain times |lambda| that is searched
 
 
-def limit_behind_weights(iteration: Iteration, weights: Array, pairing: float, eigenvalue: complex) -> float:
+def limit_behind_weights(
+    iteration: Iteration, mirror: Mirror, weights: Array, pairing: float, eigenvalue: complex
+) -> float:
     """Return the effective gain below which an iteration converges whose response has these weights of past requests.
 
     Args:
-        iteration: facts of the deformation: leak, pole of the filter, share of the model.
+        iteration: of the deformation: leak, and pole of the filter.
+        mirror: of the deformation: share of the model.
         weights: w_1, w_2, ... of past requests in the response, dead time included.
         pairing: age of the request that a response is paired with, cycles.
         eigenvalue: lambda of the response Jacobian; give -lambda for the limit of a negative gain.
     """
-    pole, modelled = iteration.error_pole, iteration.modelled
+    pole, modelled = iteration.error_pole, mirror.share
     if not iteration.leak:
         return delayed_limit(weights, pairing=pairing, pole=pole, eigenvalue=eigenvalue, modelled=modelled)
     leak = iteration.leak

@@ -64,7 +64,7 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     Raises:
         NotContractive: the gain is too large; the message names the limit, the gain, and remedies.
     """
-    gain, iteration = deformation.effective_gain(), deformation.iteration
+    gain, iteration, mirror = deformation.effective_gain(), deformation.iteration, deformation.mirror
     if gain == 0 or not iteration.limited or not iteration.constant or not _REFUSES.get():
         return
     spectrum = _at_start(problem, deformation)
@@ -75,7 +75,9 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
 
     def limit(pairing: float) -> float:
-        return min(limit_behind_weights(iteration, w, pairing, complex(v)) for w in weights for v in eigenvalues)
+        return min(
+            limit_behind_weights(iteration, mirror, w, pairing, complex(v)) for w in weights for v in eigenvalues
+        )
 
     at_once = not (late or iteration.leak)
     largest = (
@@ -89,14 +91,14 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     delay = problem.response_delay
     limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
-    best = None if iteration.modelled else next((d for d, most in limits.items() if abs(gain) < most), None)
+    best = None if mirror.share else next((d for d, most in limits.items() if abs(gain) < most), None)
     raise NotContractive(_too_late(problem, deformation, largest, best))
 
 
 def limit_behind(deformation: Deformation, weights: np.ndarray, late: float, eigenvalue: float) -> float:
     """Return the largest effective gain for a response with these weights of past requests, late by some cycles."""
     iteration = deformation.iteration
-    return limit_behind_weights(iteration, _late(weights, late), _paired(iteration), eigenvalue)
+    return limit_behind_weights(iteration, deformation.mirror, _late(weights, late), _paired(iteration), eigenvalue)
 
 
 def product_limit(problem: Problem, deformation: Deformation) -> float | None:
@@ -106,7 +108,9 @@ def product_limit(problem: Problem, deformation: Deformation) -> float | None:
     """
     iteration = deformation.iteration
     weights = _delayed_weights(problem, iteration)
-    return min((limit_behind_weights(iteration, w, _paired(iteration), 1.0) for w in weights), default=None)
+    return min(
+        (limit_behind_weights(iteration, deformation.mirror, w, _paired(iteration), 1.0) for w in weights), default=None
+    )
 
 
 def _delayed_weights(problem: Problem, iteration: Iteration) -> list[np.ndarray]:

@@ -48,6 +48,7 @@ class Mirror:
 
     request: ClassVar[str] = "_modelled"  # the signal that the map is given as the request which caused the response
     models: ClassVar[tuple[str, ...]] = ("_modelled",)  # signals of a model that the map reads
+    share: ClassVar[float] = 1.0  # of the model's response in the response error, (f - d) - share (f^ - d)
 
     cycles: float | tuple[float, ...] = 0.0
     measurement: float = 0.0
@@ -91,6 +92,7 @@ class LastRequest(Mirror):
 
     request = "_deformed_last"
     models = ()
+    share = 0.0
 
     def origin(self, request: Expression, desired: Expression) -> Expression:  # noqa: ARG002
         return request
@@ -161,7 +163,6 @@ class Iteration:
         channels: number of controlled coordinates that the map is made for; None: any number.
         limited: whether a gain beyond the limit of the iteration is refused.
         weights: W by rows where the gain is a matrix, r+ = r - a W (f - d); None: the one matrix.
-        modelled: share of the model's response in the response error, (f - d) - share (f^ - d): 1 in the model-referenced form.
     """
 
     constant: bool = True
@@ -173,21 +174,6 @@ class Iteration:
     channels: int | None = None
     limited: bool = True
     weights: tuple[tuple[float, ...], ...] | None = None
-    modelled: float = 0.0
-
-    @property
-    def form(self) -> str:
-        """What the form is called: 'model-referenced', 'increment', 'paired' or 'plain'."""
-        if self.modelled:
-            return "model-referenced"
-        if not self.slows_desired:
-            return "increment"
-        return "plain" if self.pairing is None else "paired"
-
-    @property
-    def of_last_pair(self) -> bool:
-        """Whether a request follows from the last request and its response alone: no model, pairing or filter of its own."""
-        return self.pairing is None and not (self.modelled or self.error_pole)
 
     def weighted(self, jacobian: np.ndarray) -> np.ndarray:
         """Return J W for a response Jacobian J, shape (..., n, n): response errors are multiplied by I - a J W per cycle."""
@@ -328,6 +314,21 @@ def innermost(deformation: Deformation) -> Deformation:
 def smooth_norm(column: Expression, floor: float) -> Expression:
     """Return sqrt(|column|^2 + floor^2): the Euclidean norm, differentiable at zero and never zero."""
     return ca.sqrt(ca.sumsqr(column) + floor * floor)
+
+
+def of_last_pair(deformation: Deformation) -> bool:
+    """Whether a request follows from the last request and its response alone: no model, pairing or filter of its own."""
+    iteration = deformation.iteration
+    return iteration.pairing is None and not (deformation.mirror.share or iteration.error_pole)
+
+
+def form_of(deformation: Deformation) -> str:
+    """What the form is called: 'model-referenced', 'increment', 'paired' or 'plain'."""
+    if deformation.mirror.share:
+        return "model-referenced"
+    if not deformation.iteration.slows_desired:
+        return "increment"
+    return "plain" if deformation.iteration.pairing is None else "paired"
 
 
 _FORGETTING = 0.1  # share of the newest sign

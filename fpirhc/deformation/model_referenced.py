@@ -79,7 +79,6 @@ class ModelReferenced(Wrapper):
             leak=self._leak,
             pairing=Pairing(longest, channels=several(self._delays)) if longest else None,
             channels=len(every(self._cycles)) if several_channels else self.map.iteration.channels,
-            modelled=1.0,
         )
 
     @property

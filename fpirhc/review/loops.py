@@ -500,7 +500,7 @@ def _limit(deformation: Deformation, late: float, own: float, size: float) -> fl
         leak=deformation.iteration.leak,
         pole=deformation.iteration.error_pole,
         eigenvalue=size,
-        modelled=deformation.iteration.modelled,
+        modelled=deformation.mirror.share,
         width=pairing.uncertainty if pairing else 0,
     )
     return min(limit * size, _LIMIT)

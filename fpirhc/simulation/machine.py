@@ -20,6 +20,7 @@ from fpirhc.controllers.gate import Gate, across_gaps, gap_of, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.plausible import response_jumps
 from fpirhc.controllers.sensing_chain import compose_with_sensing, given_states, raw_signal
+from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported
 from fpirhc.plant.chain import measured_signals
@@ -95,7 +96,7 @@ def _iterates(problem: Problem, controller: Controller) -> bool:
     """Whether the map compares the last request with its response, undelayed."""
     deformation = controller.deformation
     direct = not problem.answers_late and controller.response(problem) is None and controller.deforms == "response"
-    return deformation.adapts and deformation.iteration.of_last_pair and direct and deformation.effective_gain() != 0
+    return deformation.adapts and of_last_pair(deformation) and direct and deformation.effective_gain() != 0
 
 
 def _fit_memory(plant: Plant) -> tuple[Signal, ...]:

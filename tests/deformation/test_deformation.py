@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from fpirhc import RFPT, Affine, Guarded, RFPTVector, Rotation, Sigmoid
 from fpirhc.conformance import check_deformation
 from fpirhc.deformation import Deformation, Identity
+from fpirhc.deformation.base import of_last_pair
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.members import examples, member_classes
 
@@ -24,7 +25,7 @@ ITERATING = tuple(m for m in MAPS if m.effective_gain() != 0)
 INNER = (Sigmoid(gain=-0.5, scale=1.0), Affine(gain=-0.5), RFPTVector(offset=1e5, sign=-1, gain=5e-6))
 ALL_WRAPPERS = tuple(w for inner in INNER for w in examples("deformations", inner) if w not in MAPS)
 # The others answer from what was measured earlier, or from the model's response.
-WRAPPERS = tuple(w for w in ALL_WRAPPERS if w.iteration.of_last_pair)
+WRAPPERS = tuple(w for w in ALL_WRAPPERS if of_last_pair(w))
 NEARLY_LINEAR = (
     Affine(gain=-0.5),
     RFPT(offset=1e5, sign=-1, gain=5e-6),

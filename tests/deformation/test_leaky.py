@@ -12,7 +12,7 @@ from test_dead_time import DUFFING, LAW, affine, iteration_radius
 import fpirhc as fp
 from fpirhc.contraction.delayed import limit_behind_weights, loop_polynomial
 from fpirhc.deformation import Deformation
-from fpirhc.deformation.base import Iteration
+from fpirhc.deformation.base import Iteration, LastRequest, Mirror
 from fpirhc.deformation.leaky import leaky_margin, leaky_pole
 from fpirhc.errors import InvalidValue, NotSupported
 
@@ -213,8 +213,8 @@ def test_limit_of_the_additive_estimate(delay):
     assert not stable(1.001 * ESTIMATE_LIMITS[delay] + 0.01)
 
 
-@pytest.mark.parametrize(("modelled", "leaks"), [(1.0, True), (1.0, False), (0.0, True)])
-def test_limit_agrees_with_the_roots(modelled, leaks):
+@pytest.mark.parametrize(("mirror", "leaks"), [(Mirror(), True), (Mirror(), False), (LastRequest(), True)])
+def test_limit_agrees_with_the_roots(mirror, leaks):
     """The limit by counting turns of a curve, at random windows, pairs and leaks, is where a root leaves the circle."""
     random, limits = np.random.default_rng(5), []
     for _ in range(25):
@@ -222,11 +222,11 @@ def test_limit_agrees_with_the_roots(modelled, leaks):
         weights /= weights.sum()
         cycles, leak = float(random.integers(0, 6)), float(random.uniform(0.2, 0.8)) * leaks
         pole, ratio = float(random.choice([0.0, 0.6])), float(random.uniform(0.4, 2.5))
-        iteration = Iteration(leak=leak, error_pole=pole, modelled=modelled)
-        limits.append(limit_behind_weights(iteration, weights, cycles, ratio))
+        iteration = Iteration(leak=leak, error_pole=pole)
+        limits.append(limit_behind_weights(iteration, mirror, weights, cycles, ratio))
         shares = ((0.98, True), (1.02, False)) if limits[-1] > 0 else ((1e-3, False),)
         for share, inside in shares if np.isfinite(limits[-1]) else ():
-            row = loop_polynomial(weights, share * (limits[-1] or 1.0), cycles, leak, pole, ratio, modelled)
+            row = loop_polynomial(weights, share * (limits[-1] or 1.0), cycles, leak, pole, ratio, mirror.share)
             assert (np.abs(np.roots(row.real)).max() < 1) == inside
     assert sum(limit > 0 for limit in limits) > 10
     assert min(limits) > 0 or not leaks

@@ -115,7 +115,7 @@ def test_gain_that_the_delay_does_not_allow_is_refused():
     sensing = fp.Sensing(estimator=fp.SavitzkyGolay(window=41, degree=2))
     problem = short(replace(TWO_MASS, plant=replace(TWO_MASS.plant, parameters=known), sensing=sensing), 50)
     with pytest.raises(
-        NotContractive, match=r"ModelReferenced\(gain=-0.8\): the response comes 19.5 cycles late.*below 0.192"
+        NotContractive, match=r"ModelReferenced\(gain=-0.8\): the response comes 19.5 cycles late.*below 0.191"
     ):
         fp.simulate(problem, fp.ComputedTorque(LAW, fp.ModelReferenced(fp.Affine(gain=-0.8))), seed=0)
 

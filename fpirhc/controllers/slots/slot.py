@@ -133,7 +133,7 @@ def _differences(plant: Plant, chain: OutputChain) -> int:
 
 def _against(problem: Problem, deformation: Deformation, differences: int) -> Iterator[str]:
     """Reasons against a deformation in a slot."""
-    estimator, iteration = problem.sensing.estimator, deformation.iteration
+    estimator = problem.sensing.estimator
     at_once = estimator.of_steps or (estimator.shows_response and differences < 2)
     if not at_once:
         yield from deformation.mirror.against_last_request(
@@ -142,7 +142,7 @@ def _against(problem: Problem, deformation: Deformation, differences: int) -> It
         )
     if believed_path(problem, deformation).fraction:
         yield "ModelReferenced in a slot: a measurement is late by whole cycles; round measurement=..."
-    if iteration.pairing is not None and not iteration.modelled:
+    if deformation.iteration.pairing is not None and not deformation.mirror.share:
         pairs = deformation
         while pairs.inner is not None and pairs.inner.iteration.pairing is not None:
             pairs = pairs.inner

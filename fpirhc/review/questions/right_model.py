@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, form_of
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Increment
 from fpirhc.describe import as_written
@@ -65,7 +65,7 @@ def right_form(
         error: errors of a run with a deformation by coordinate, none without a run; None: nothing is run.
     """
     form, why = recommended_form(problem)
-    used = deformation.iteration.form
+    used = form_of(deformation)
     text = f"it is {used}; measurements speak for {form}, because {why}"
     if used == form:
         return Answer(FORM, Verdict.YES, f"it is {used}: {why}")
@@ -268,7 +268,7 @@ def _cures_more(case: Case, runs: ErrorPair, nominal: NominalRun | None, predict
 def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, dict[str, float]]:
     """Which form passes, by a run, and which period would do, by the prediction."""
     sentences, numbers = [], {}
-    used = case.controller.deformation.iteration.form
+    used = form_of(case.controller.deformation)
     others = 0
     for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
         trial = case.trial(form) if name != used else "it is in use"
