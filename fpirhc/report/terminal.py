@@ -6,8 +6,10 @@ the rows.
 
 from __future__ import annotations
 
+import json
 import re
 import sys
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +18,7 @@ from typing import TYPE_CHECKING, cast
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
 from rich.console import Console, JustifyMethod
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as Grid
 from rich.text import Text
 
@@ -46,6 +48,7 @@ _IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\d{3}\b)"), "\ue000"  # thousands, a
 _MOST_STEPS = 6  # of the set-points of one coordinate in a text
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
+_EVERY = 1.0  # s from one line of progress to the next
 _EDGES = 2  # columns left and right of a table
 
 
@@ -143,18 +146,53 @@ def _widths(table: Table, places: Sequence[int], width: int) -> list[int]:
 
 
 @contextmanager
-def progress_bars() -> Iterator[Report]:
-    """Yield a function (name, done, total) that shows one bar per controller on standard error."""
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+def progress_bars(*, as_json: bool = False) -> Iterator[Report]:
+    """Yield a function (name, done, total) that shows on standard error how far each controller is, its rate and the time left.
+
+    Args:
+        as_json: in place of bars, a line with a JSON object every second.
+    """
+    if as_json:
+        yield _Status().report
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.completed:.0f} of {task.total:.0f}"),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         known: dict[str, TaskID] = {}
 
         def report(name: str, done: int, total: int) -> None:
             if name not in known:
-                known[name] = bars.add_task(printable(name), total=total)
-            bars.update(known[name], completed=done)
+                known[name] = bars.add_task(printable(name), total=total, rate="")
+            speed = bars.tasks[bars.task_ids.index(known[name])].speed
+            bars.update(known[name], completed=done, rate=f"{speed:.3g}/s" if speed else "")
 
         yield report
+
+
+class _Status:
+    """Lines of progress for programs: what was done when this process began counts for no rate."""
+
+    def __init__(self) -> None:
+        self._begun: dict[str, tuple[float, int]] = {}
+        self._told = time.monotonic()
+
+    def report(self, name: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        since, before = self._begun.setdefault(name, (now, done))
+        if now - self._told < _EVERY:
+            return
+        self._told = now
+        rate = (done - before) / (now - since) if now > since else 0.0
+        left = (total - done) / rate if rate else None
+        line = {"controller": name, "done": done, "of": total, "per second": rate, "seconds left": left}
+        print(json.dumps(line), file=sys.stderr, flush=True)
 
 
 def announce_backend(runs: Iterable[Run]) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -17,6 +19,7 @@ import fpirhc as fp
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.report import terminal
 from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run
 from fpirhc.review.answer import Answer, Review, Verdict
@@ -267,3 +270,15 @@ def test_tables_escape_every_part():
     page = table("<a>", ("<b>",), [("<c>", "<d>")], ["<e>"])
     assert read(page).tags == {"div", "table", "caption", "tr", "th", "td", "p"}
     assert read(page).text == "<a><b><c><d><e>"
+
+
+def test_progress_for_programs_is_a_line_of_json(monkeypatch, capsys):
+    """What was finished before counts for no rate: 30 of 90 in two seconds leave four."""
+    clock = iter([0.0, 10.0, 10.5, 12.0])
+    monkeypatch.setattr(terminal, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    with progress_bars(as_json=True) as report:
+        for done in (10, 20, 40):
+            report("RHC", done, 100)
+    first, last = map(json.loads, capsys.readouterr().err.splitlines())
+    assert first == {"controller": "RHC", "done": 10, "of": 100, "per second": 0.0, "seconds left": None}
+    assert last == {"controller": "RHC", "done": 40, "of": 100, "per second": 15.0, "seconds left": 4.0}

@@ -205,7 +205,7 @@ def _compared(options: argparse.Namespace, task: Task, folder: Path) -> Scenario
     from fpirhc.studies.tuning.tuned_file import read_tuned
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
-    with resumable(folder / LEDGER), progress_bars() as progress:
+    with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:
         return compare_scenarios(
             task,
             count=options.scenarios,

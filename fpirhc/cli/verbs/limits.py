@@ -28,7 +28,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.operating_limits import operating_limits
 
     folder = results_folder(options.out, task.name, "limits")
-    with progress_bars() as progress:
+    with progress_bars(as_json=options.json) as progress:
         result = operating_limits(task, **study_settings(VERB, options, "over", "fails"), progress=progress)
     if result.limits:
         save_figure(limits_figure(result), folder / "limits.png")

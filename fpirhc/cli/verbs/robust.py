@@ -32,7 +32,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.robust import robust_boxes
 
     folder = results_folder(options.out, task.name, "robust")
-    with progress_bars() as progress:
+    with progress_bars(as_json=options.json) as progress:
         result = robust_boxes(task, **study_settings(VERB, options, *_SHARES, "fails"), progress=progress)
     publish(result.view, render_charted(result.view), folder, as_json=options.json)
     return ExitCode.FINISHED if result.boxes else ExitCode.BAD_INPUT

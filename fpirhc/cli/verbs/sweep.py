@@ -32,7 +32,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     write_table = table_writer(options.format)
     axes = [Axis.parsed(text) for text in options.over]
     folder = results_folder(options.out, task.name, "_".join(["sweep", *(axis.path for axis in axes)]))
-    with resumable(folder / LEDGER), progress_bars() as progress:
+    with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:
         result = sweep(task, axes, folder=folder, **study_settings(VERB, options, "metric"), progress=progress)
     write_table(result.to_dataframe(), folder / "sweep")
     save_figure(sweep_figure(result), folder / "sweep.png")
