@@ -155,14 +155,17 @@ struct Node { std::map<std::string, Parameter> all;
     "pluginlib/class_list_macros.hpp": '#define PLUGINLIB_EXPORT_CLASS(type, base) static_assert(true, "");\n',
     "controller_interface/controller_interface.hpp": r"""
 #pragma once
+#include <cmath>
+#include <optional>
+#include <type_traits>
 #include <rclcpp/rclcpp.hpp>
 #include <rclcpp_lifecycle/state.hpp>
 namespace controller_interface {
 enum class CallbackReturn { SUCCESS, ERROR };
-enum class return_type { OK };
+enum class return_type { OK, ERROR };
 enum class interface_configuration_type { INDIVIDUAL };
 struct InterfaceConfiguration { interface_configuration_type type; std::vector<std::string> names; };
-struct Interface { double value = 0; double get_value() const { return value; } void set_value(double v) { value = v; } };
+INTERFACE
 struct ControllerInterface {
   virtual ~ControllerInterface() = default;
   virtual CallbackReturn on_init() = 0;
@@ -182,6 +185,15 @@ struct ControllerInterface {
 };
 }
 """,
+}
+# Numbers of interfaces as in ROS 2 Humble, and as from Jazzy on, where another thread may hold them.
+INTERFACES = {
+    "humble": "struct Interface { double value = 0; bool held = false; double get_value() const { return held ? 0 / 0. : value; } "
+    "void set_value(double v) { value = v; } };",
+    "jazzy": """struct Interface { double value = 0; bool held = false;
+  template <typename T = double> [[nodiscard]] std::optional<T> get_optional(unsigned = 10) const {
+    return held ? std::nullopt : std::optional<T>(value); }
+  template <typename T> [[nodiscard]] bool set_value(const T& v, unsigned = 10) { if (!held) value = v; return !held; } };""",
 }
 MANAGER = r"""
 #include "arm_controller.cpp"
@@ -203,8 +215,13 @@ int main() {
   double in[7];
   while (std::scanf("%la %la %la %la %la %la %la", in, in + 1, in + 2, in + 3, in + 4, in + 5, in + 6) == 7) {
     for (int k = 0; k < 6; ++k) c.state_interfaces_[k].value = in[k + 1];
-    c.update(rclcpp::Time{in[0]}, rclcpp::Duration{0.001});
+    c.state_interfaces_[0].held = std::isnan(in[1]);
+    if (c.update(rclcpp::Time{in[0]}, rclcpp::Duration{0.001}) != controller_interface::return_type::OK) return 7;
     std::printf("%a %a %a\n", double(c.status()), c.command_interfaces_[0].value, c.command_interfaces_[1].value);
+  }
+  if (std::is_same_v<decltype(c.command_interfaces_[0].set_value(0.0)), bool>) { /* a command that is not taken is an error */
+    c.command_interfaces_[1].held = true;
+    if (c.update(rclcpp::Time{in[0] + 0.001}, rclcpp::Duration{0.001}) == controller_interface::return_type::OK) return 8;
   }
 }
 """
@@ -212,12 +229,13 @@ int main() {
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
-def test_a_plugin_of_ros2_control_answers_as_the_stepper_bit_by_bit(tmp_path):
-    """Names of interfaces, a rate that is not the period's, a gain outside its bounds, a bad sample."""
+@pytest.mark.parametrize("release", INTERFACES)
+def test_a_plugin_of_ros2_control_answers_as_the_stepper_bit_by_bit(release, tmp_path):
+    """Names of interfaces, a rate that is not the period's, a gain outside its bounds, a number that another thread holds."""
     device = exported(tmp_path, "ros2_control")
     for file, text in ROS.items():
         (tmp_path / file).parent.mkdir(exist_ok=True)
-        (tmp_path / file).write_text(text)
+        (tmp_path / file).write_text(text.replace("INTERFACE\n", f"{INTERFACES[release]}\n"))
     (tmp_path / "main.cpp").write_text(MANAGER)
     rows, answers = answered(device)
     said = run(tmp_path, "g++", ["-std=c++17", "-pedantic"], ["main.cpp"], rows)

@@ -7,7 +7,9 @@
 #include <cmath>
 #include <cstddef>
 #include <cstring>
+#include <limits>
 #include <string>
+#include <type_traits>
 #include <vector>
 
 #include <controller_interface/controller_interface.hpp>
@@ -20,6 +22,23 @@
 namespace @name@_ros {
 
 using Return = controller_interface::CallbackReturn;
+
+// Interfaces of ROS 2 Jazzy and later may be locked by another thread. A number that cannot be read is none, which is a bad sample.
+template <class Interface>
+auto read(const Interface& from, int) -> decltype(from.get_optional().value_or(0.0)) {
+  return from.get_optional().value_or(std::numeric_limits<double>::quiet_NaN());
+}
+template <class Interface>
+double read(const Interface& from, long) {
+  return from.get_value();
+}
+template <class Interface>
+bool written(Interface& to, double value) {
+  if constexpr (std::is_void_v<decltype(to.set_value(value))>)
+    return to.set_value(value), true;
+  else
+    return to.set_value(value);
+}
 
 class Controller : public controller_interface::ControllerInterface {
  public:
@@ -54,10 +73,11 @@ class Controller : public controller_interface::ControllerInterface {
     casadi_real *sample = reinterpret_cast<casadi_real*>(&in), *command = reinterpret_cast<casadi_real*>(&out);
     if (!begun_) begin_ = time, begun_ = true;
     sample[0] = (time - begin_).seconds() / SECONDS_PER_UNIT;
-    for (std::size_t k = 1; k < @NAME@_INPUTS; ++k) sample[k] = state_interfaces_[k - 1].get_value();
+    for (std::size_t k = 1; k < @NAME@_INPUTS; ++k) sample[k] = read(state_interfaces_[k - 1], 0);
     status_ = @name@_step(&controller_, &in, &out);
-    for (std::size_t k = 0; k < @NAME@_COMMANDS; ++k) command_interfaces_[k].set_value(command[k]);
-    return controller_interface::return_type::OK;
+    bool sent = true;
+    for (std::size_t k = 0; k < @NAME@_COMMANDS; ++k) sent = written(command_interfaces_[k], command[k]) && sent;
+    return sent ? controller_interface::return_type::OK : controller_interface::return_type::ERROR;
   }
 
   @name@_status status() const { return status_; }
