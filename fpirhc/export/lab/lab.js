@@ -5,6 +5,7 @@ const ink = style("--ink"), faint = style("--line");
 const colors = DATA.loops.map((_, k) => (DATA.colors[k] === "#111111" ? ink : DATA.colors[k]));
 const say = (id, text) => (document.getElementById(id).textContent = text);
 const short = (value) => (value === 0 || (Math.abs(value) >= 1e-3 && Math.abs(value) < 1e5) ? String(+value.toPrecision(4)) : value.toExponential(2));
+const quantity = (value, unit) => short(value) + (unit && unit !== "1" ? " " + unit : "");
 const STEPS = 1000;
 
 // A slider with one sign goes by equal ratios, another one by equal steps.
@@ -27,8 +28,8 @@ function set(k, value, run = true) {
   const s = DATA.sliders[k], { label, number, input } = rows[k];
   now[k] = Math.min(Math.max(value, Math.min(s.low, s.high)), Math.max(s.low, s.high));
   input.value = atValue(s, now[k]);
-  input.setAttribute("aria-valuetext", short(now[k]) + " " + s.unit);
-  number.textContent = short(now[k]) + (s.unit && s.unit !== "1" ? " " + s.unit : "");
+  input.setAttribute("aria-valuetext", quantity(now[k], s.unit));
+  number.textContent = quantity(now[k], s.unit);
   label.classList.toggle("moved", now[k] !== s.value);
   if (run) changed();
 }
@@ -105,7 +106,7 @@ function verdict(answers) {
   const specs = DATA.charts.filter((c) => c.error !== undefined);
   const texts = answers.map((one, k) => {
     if (one.cycles < DATA.cycles) return DATA.loops[k].name + " stops at " + short(one.cycles * DATA.period) + " " + DATA.timeUnit;
-    return DATA.loops[k].name + " " + specs.map((c) => short(Math.sqrt(one.squares[c.error] / counted)) + " " + c.unit).join(", ");
+    return DATA.loops[k].name + " " + specs.map((c) => quantity(Math.sqrt(one.squares[c.error] / counted), c.unit)).join(", ");
   });
   const errors = answers.map((one) => specs.map((c) => (one.cycles < DATA.cycles ? NaN : Math.sqrt(one.squares[c.error] / counted))));
   if (answers.length === 2 && errors.flat().every((e) => e > 0)) {
@@ -113,7 +114,7 @@ function verdict(answers) {
     const word = less.every((yes) => yes) ? " lowers" : less.some((yes) => yes) ? " changes" : " raises";
     const how = (k) => (less[k] ? short(+(plain[k] / other[k]).toPrecision(3)) + " times less)" : short(+(other[k] / plain[k]).toPrecision(3)) + " times as much)");
     return DATA.loops[1].name + word + " the rms error of " +
-      specs.map((c, k) => c.title.slice(9) + " from " + short(plain[k]) + " to " + short(other[k]) + " " + c.unit + " (" + how(k)).join(", ") + " against " + DATA.loops[0].name;
+      specs.map((c, k) => c.title.slice(9) + " from " + short(plain[k]) + " to " + quantity(other[k], c.unit) + " (" + how(k)).join(", ") + " against " + DATA.loops[0].name;
   }
   return "rms error of " + specs.map((c) => c.title.slice(9)).join(", ") + ": " + texts.join("; ");
 }
