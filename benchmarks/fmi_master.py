@@ -96,3 +96,23 @@ def apart_from_a_run(
             state = advance(state, command, plant.exact, np.zeros(advance.numel_in(3))).full().ravel()
             realised = plant.equations.response(state, command, plant.exact).full().ravel()
     return float(worst[0]), float(worst[1])
+
+
+def apart_with_samples_of_a_run(run: fp.Run, columns: list[str], path: Path, cycles: int) -> float:
+    """Return how far a unit's commands are from those of a run, at most, where it is given the samples of the run.
+
+    Args:
+        run: a log.
+        columns: names of the signals of a sample, without the time.
+        path: of the unit.
+        cycles: from the start, at most.
+    """
+    rows, period = np.hstack([run[name].reshape(len(run.time), -1) for name in columns]), run.period
+    worst = 0.0
+    with master(path) as unit:
+        inputs, outputs = unit.names("input"), unit.names("output")
+        for k, row in enumerate(rows[:cycles]):
+            unit.set(inputs, row)
+            worst = max(worst, float(np.abs(unit.get(outputs) - run["command"][k]).max()))
+            unit.step(k * period, period)
+    return worst

@@ -25,6 +25,8 @@ from fpirhc.export.target import device_of, processor_of, target_called, write
 from fpirhc.symbolic.native import find_compiler
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+from uno import answered
+
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "targets.md"
 Limited = dict[str, tuple[float, float]]
 CASES: tuple[tuple[str, str, Limited], ...] = (
@@ -34,22 +36,18 @@ CASES: tuple[tuple[str, str, Limited], ...] = (
     ("anaesthesia", "RHC+FPI", {}),
     ("fishery", "RHC+FPI", {}),
     ("noisy_motor", "RHC+FPI", {}),
-)
-WEB = (
-    ("two_mass", "CTC+FPI (eq 6)"),
-    ("two_mass", "RHC+FPI"),
-    ("anaesthesia", "RHC+FPI"),
-    ("fishery", "RHC+FPI"),
-    ("noisy_motor", "RHC+FPI"),
-)
-BOARDS: tuple[tuple[str, str, Limited], ...] = (
-    ("two_mass", "CTC+FPI (eq 6)", {}),
-    ("two_mass", "RHC+FPI", {}),
-    ("two_mass", "RHC+FPI", {"q1": (1.85, 2.35)}),
     ("leaking_tanks", "RHC+FPI", {}),
 )
-UNITS = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"))
-SMALL = (("two_mass", "CTC+FPI (eq 6)"), ("fishery", "RHC+FPI"), ("two_mass", "RHC+FPI"))
+PLAIN = tuple(case[:2] for case in CASES if not case[2])
+SMALL = (
+    ("two_mass", "CTC+FPI (eq 6)"),
+    ("anaesthesia", "CTC+FPI"),
+    ("fishery", "CTC+FPI"),
+    ("noisy_motor", "RHC+FPI"),
+    ("leaking_tanks", "RHC+FPI"),
+    ("fishery", "RHC+FPI"),
+    ("two_mass", "RHC+FPI"),
+)
 CYCLES = 2000
 QEMU = (
     "qemu-system-arm", "-M", "mps2-an500", "-display", "none", "-serial", "none", "-monitor", "none",
@@ -98,8 +96,11 @@ def _called(problem: str, title: str, states: Limited) -> str:
 
 
 def unit_row(problem: str, title: str, target: str) -> list[str]:
-    """One line of the table of units: what FMPy finds, and how far a loop with the plant is from the run."""
-    from fmi_master import apart_from_a_run
+    """One line of the table of units: what FMPy finds, and how far commands are from those of the run.
+
+    The plant of two_mass, which is measured as it is, runs beside the unit; of other problems the samples of the run are given.
+    """
+    from fmi_master import apart_from_a_run, apart_with_samples_of_a_run
     from fmpy.validation import validate_fmu
 
     task = fp.load_problem(problem)
@@ -108,9 +109,17 @@ def unit_row(problem: str, title: str, target: str) -> list[str]:
         write(device, target_called(target), Path(name))
         path = Path(name) / "c.fmu"
         found, size = len(validate_fmu(str(path))), path.stat().st_size
-        through = apart_from_a_run(device.problem, device.controller, path, CYCLES)
-        late = apart_from_a_run(device.problem, device.controller, path, CYCLES, late=True)
-    return [f"{problem}, {title}", target, f"{size / 1000:.0f}", f"{found}", f"{through[1]:.1g}", f"{late[1]:.3g}"]
+        if problem == "two_mass":
+            ways = [
+                apart_from_a_run(device.problem, device.controller, path, CYCLES, late=late)[1]
+                for late in (False, True)
+            ]
+        else:
+            run = fp.simulate(device.problem, device.controller, seed=0)
+            columns = [name for name in device.inputs.names if name != "time"]
+            ways = [apart_with_samples_of_a_run(run, columns, path, CYCLES)]
+    late = f"{ways[1]:.3g}" if len(ways) > 1 else ""
+    return [f"{problem}, {title}", target, f"{size / 1000:.0f}", f"{found}", f"{ways[0]:.1g}", late]
 
 
 def web_row(problem: str, title: str) -> list[str]:
@@ -135,7 +144,8 @@ def web_row(problem: str, title: str) -> list[str]:
 def cortex_row(problem: str, title: str, states: Limited) -> list[str]:
     """One line of the table of Cortex-M7: sizes, instructions, and the commands of a run with it and with C here."""
     task = fp.load_problem(problem)
-    shorter = replace(_limited(task.problem, states), duration=500 * task.problem.period, measure_from=0.0)
+    duration = min(500 * task.problem.period, task.problem.duration)
+    shorter = replace(_limited(task.problem, states), duration=duration, measure_from=0.0)
     device = device_of(shorter, task.controllers[title], title, name="c", cycles=1, libm="own")
     with tempfile.TemporaryDirectory() as name:
         board, here, lines = Path(name) / "board", Path(name) / "c", io.BytesIO()
@@ -218,20 +228,29 @@ def misra_rows() -> list[list[str]]:
 
 
 def board_row(problem: str, title: str, bare: bool) -> list[str]:
-    """One line of the table of small boards: what a controller takes of them."""
+    """One line of the table of small boards: what a controller takes of them, and on an Uno its longest step and its commands."""
     task = fp.load_problem(problem)
     device = device_of(task.problem, task.controllers[title], title, name="c", cycles=1, bare=bare)
-    try:
-        said = str(target_called("arduino").files(device)["sizes.txt"])
-    except NotSupported as error:
-        said = str(error)
-    flash = re.search(r"Uno: (\d+) of", said)
-    uno, mega = (
-        re.search(rf"{board}(?:: .*: (?:does not fit: )?| )(fits|lacks [^;.\n]*)", said)
-        for board in ("Uno", "Mega 2560")
-    )
-    words = [found[1] if found else "" for found in (uno, mega)]
-    return [f"{problem}, {title}{', bare' if bare else ''}", f"{int(flash[1]) / 1000:.1f}" if flash else "", *words]
+    called, took, apart = f"{problem}, {title}{', bare' if bare else ''}", "", ""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "uno"
+        try:
+            write(device, target_called("arduino"), folder)
+        except NotSupported as error:
+            lacks = [re.search(rf"{board} (lacks [^;.]*)", str(error)) for board in ("Uno", "Mega 2560")]
+            return [called, "", "", *(found[1] if found else "" for found in lacks), "", ""]
+        said = (folder / "sizes.txt").read_text()
+        if "Uno" in said and ": fits" in said.splitlines()[0]:
+            run = fp.simulate(task.problem, device.controller, seed=0)
+            columns = (np.reshape(run[n], (len(run.time), -1)) for n in device.inputs.names)
+            commands, longest = answered(folder, "c", np.hstack(list(columns))[:60])
+            wanted = run["command"][:60]
+            took, apart = f"{1e3 * longest:.2f}", f"{np.abs(commands - wanted).max() / np.abs(wanted).max():.1g}"
+    sizes = re.search(r"Uno: (\d+) of .*?, (\d+ \+ \d+) of stack", said)
+    assert sizes is not None
+    words = [re.search(rf"{board}: .*: (?:does not fit: )?(fits|lacks .*)", said) for board in ("Uno", "Mega 2560")]
+    fits = [found[1] if found else "" for found in words]
+    return [called, f"{int(sizes[1]) / 1000:.1f}", sizes[2], *fits, took, apart]
 
 
 def _said(*command: str) -> str:
@@ -245,7 +264,7 @@ TABLES: dict[str, tuple[list[str], Callable[[], list[list[str]]]]] = {
     ),
     "units": (
         ["controller", "target", "archive, kB", "problems by FMPy", "command, inputs pass through", "one period late"],
-        lambda: [unit_row(*case, target) for case in UNITS for target in ("fmu", "fmu2")],
+        lambda: [unit_row(*case, target) for case in PLAIN for target in ("fmu", "fmu2")],
     ),
     "cortex": (
         [
@@ -258,16 +277,24 @@ TABLES: dict[str, tuple[list[str], Callable[[], list[list[str]]]]] = {
             "commands in QEMU",
             "commands here",
         ],
-        lambda: [cortex_row(*case) for case in BOARDS],
+        lambda: [cortex_row(*case) for case in CASES],
     ),
     "misra": (["rule", "CTC+FPI (eq 6)", "RHC+FPI", "why it stays"], misra_rows),
     "boards": (
-        ["controller", "flash, kB", "Uno", "Mega 2560"],
+        [
+            "controller",
+            "flash, kB",
+            "RAM, stack, bytes",
+            "Uno",
+            "Mega 2560",
+            "longest step on an Uno, ms",
+            "command, relative",
+        ],
         lambda: [board_row(*case, bare) for case in SMALL for bare in (True, False)],
     ),
     "web": (
         ["controller", "module, kB", "compressed, kB", "commands in Node", "commands in C here"],
-        lambda: [web_row(*case) for case in WEB],
+        lambda: [web_row(*case) for case in PLAIN],
     ),
 }
 

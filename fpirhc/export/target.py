@@ -34,6 +34,7 @@ class Target:
         processor: function (folder of the files, prefix) -> program with its arguments that answers samples, see `Processor`; None:
             the target has none.
         builder: function that raises where this program cannot be built here.
+        told: name of a text among the files that says how large all is on the target; empty where there is none.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Target:
     libm: str = "system"
     processor: Callable[[Path, str], Sequence[str]] | None = None
     builder: Callable[[], object] | None = None
+    told: str = ""
 
 
 @cache

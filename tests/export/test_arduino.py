@@ -14,6 +14,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from uno import answered
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue, NotSupported
@@ -27,7 +28,7 @@ needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compil
 needs_avr = pytest.mark.skipif(shutil.which("avr-gcc") is None, reason="no avr-gcc (packages gcc-avr and avr-libc)")
 needs_simavr = pytest.mark.skipif(shutil.which("simavr") is None, reason="no simavr (package simavr)")
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-ffp-contract=off")
-CYCLES, CLOCK = 60, 16e6
+CYCLES = 60
 
 
 def device(title: str, *, bare: bool = True, cycles: int = 400, problem: str = "two_mass") -> Device:
@@ -129,40 +130,6 @@ def test_sizes_on_boards_and_what_fits_none(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-MAIN = """
-#include <stdio.h>
-#include <string.h>
-#include <avr/io.h>
-#include <avr/interrupt.h>
-#include <avr/pgmspace.h>
-#include <avr/sleep.h>
-#include "arm.h"
-static const float SAMPLES[][7] PROGMEM = ROWS;
-static arm_controller c;
-static int put(char one, FILE* to) { (void)to; while (!(UCSR0A & 1 << UDRE0)) {} UDR0 = one; return 0; }
-static FILE out = FDEV_SETUP_STREAM(put, 0, _FDEV_SETUP_WRITE);
-int main(void) {
-  int k;
-  UCSR0B = 1 << TXEN0, TCCR1B = 2; /* clocks in eights */
-  stdout = &out;
-  arm_init(&c);
-  for (k = 0; k < COUNT; ++k) {
-    arm_inputs in;
-    arm_command command;
-    unsigned took;
-    memcpy_P(&in, SAMPLES[k], sizeof in);
-    TCNT1 = 0;
-    arm_step(&c, &in, &command);
-    took = TCNT1;
-    printf("= %08lx %08lx %u\\n", *(unsigned long*)&command.Q1, *(unsigned long*)&command.Q2, took);
-  }
-  cli();
-  sleep_enable();
-  sleep_cpu();
-}
-"""
-
-
 @needs_avr
 @needs_simavr
 @pytest.mark.parametrize(("bare", "longest"), [(True, 2.5e-3), (False, 3.3e-3)])
@@ -172,25 +139,10 @@ def test_an_uno_keeps_pace_with_the_controller(bare, longest, tmp_path):
     write(one, target_called("arduino"), tmp_path)
     run = fp.simulate(one.problem, one.controller, seed=0)
     rows = np.hstack([np.reshape(run[n], (len(run.time), -1)) for n in one.inputs.names])[:CYCLES]
-    table = ",\n".join("{" + ", ".join(repr(float(np.float32(v))) for v in row) + "}" for row in rows)
-    (tmp_path / "main.c").write_text(MAIN.replace("ROWS", "{" + table + "}").replace("COUNT", str(CYCLES)))
-    answers = [line.split() for line in simulated(tmp_path).splitlines() if line.startswith("=")]
-    assert len(answers) == CYCLES
-    words = np.array([[int(word, 16) for word in line[1:3]] for line in answers], dtype=np.uint32)
+    commands, longest_step = answered(tmp_path, "arm", rows)
     largest = np.abs(run["command"][:CYCLES]).max()
-    np.testing.assert_allclose(words.view(np.float32), run["command"][:CYCLES], rtol=0, atol=1e-4 * largest)
-    assert max(int(line[3]) for line in answers) * 8 / CLOCK < longest
-
-
-def simulated(folder: Path) -> str:
-    """What the program of a library with a main file says on the serial port of an ATmega328P."""
-    sources = [*map(str, sorted((folder / "src").glob("*.c"))), str(folder / "main.c")]
-    flags = ["-mmcu=atmega328p", "-std=gnu99", "-Os", "-ffunction-sections", "-Wl,--gc-sections", f"-I{folder / 'src'}"]
-    program = str(folder / "program.elf")
-    subprocess.run(["avr-gcc", *flags, *sources, "-lm", "-o", program], check=True)
-    command = ["simavr", "-m", "atmega328p", "-f", f"{CLOCK:.0f}", program]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    return re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr).replace(".\n", "\n")
+    np.testing.assert_allclose(commands, run["command"][:CYCLES], rtol=0, atol=1e-4 * largest)
+    assert longest_step < longest
 
 
 # A motor with a finger on it, held by a library on a simulated board

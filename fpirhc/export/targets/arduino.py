@@ -79,7 +79,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     }
 
 
-TARGET = Target("arduino", "a library folder of the Arduino IDE, in float, with an example", _files)
+TARGET = Target("arduino", "a library folder of the Arduino IDE, in float, with an example", _files, told="sizes.txt")
 
 
 def size_on(files: Mapping[str, str], name: str, board: _Board) -> _Size:
