@@ -34,7 +34,10 @@ _STARTED = 900  # bytes of flash of Arduino's own core, without what a sketch ca
 
 @dataclass(frozen=True)
 class _Board:
-    """Memory of a board, less what its loader takes: bytes."""
+    """Memory of a board, less what its loader takes, in bytes, and the processor of its kind that has most flash.
+
+    With that one what is too large for the board is measured too.
+    """
 
     name: str
     processor: str
@@ -42,7 +45,7 @@ class _Board:
     ram: int
 
 
-_BOARDS = (_Board("Uno", "atmega328p", 32256, 2048), _Board("Mega 2560", "atmega2560", 253_952, 8192))
+_BOARDS = (_Board("Uno", "atmega1284p", 32256, 2048), _Board("Mega 2560", "atmega2560", 253_952, 8192))
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def size_on(files: Mapping[str, str], name: str, board: _Board) -> _Size:
     Args:
         files: C files and headers by name.
         name: prefix of the controller.
-        board: with its processor.
+        board: and its processor.
 
     Raises:
         CompileError: avr-gcc refuses them.
@@ -100,9 +103,8 @@ def size_on(files: Mapping[str, str], name: str, board: _Board) -> _Size:
         for file, text in {**files, "main.c": main}.items():
             (folder / file).write_text(text, encoding="utf-8")
         texts = [file for file in (*files, "main.c") if file.endswith(".c")]
-        # The processor with most flash, so that what is too large for a board is measured too.
         for command in (
-            ["avr-gcc", "-mmcu=atmega2560", *_FLAGS, *_LARGE, "-o", "program", *texts, "-lm"],
+            ["avr-gcc", f"-mmcu={board.processor}", *_FLAGS, *_LARGE, "-o", "program", *texts, "-lm"],
             ["avr-size", "program"],
         ):
             done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
