@@ -36,7 +36,13 @@ from fpirhc.controllers.contract import (
     without_deformation,
 )
 from fpirhc.controllers.model_inputs import MEASURED
-from fpirhc.controllers.reference_states import request_along_reference, request_of_commands, request_of_plans
+from fpirhc.controllers.reference_states import (
+    reference_states,
+    request_along_reference,
+    request_of_commands,
+    request_of_plans,
+    response_scale,
+)
 from fpirhc.controllers.sensing_chain import compose_controller, controller_reads, embedded
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.errors import InvalidField, InvalidValue, NotContractive, NotSupported
@@ -411,6 +417,30 @@ def test_demands_count_the_beginning_of_the_reference():
     demand = request_along_reference(problem, TRACK)
     assert demand.change == pytest.approx(27.0 * PERIOD, rel=1e-2)
     assert demand.recovery == pytest.approx(step_for_basin(np.hypot(9.0, 3 / 8), 3, 2.0, PERIOD), rel=1e-9)
+
+
+def test_states_along_a_reference_are_those_of_a_motion_that_follows_it():
+    """Of y = x, x' = u and z' = x - z along sin t: x = sin t, and z = (sin t - cos t + e^-t) / 2, which no output shows."""
+    plant = fp.Plant.of_states(
+        states={"x": "m", "z": "m"},
+        inputs={"u": "m/s"},
+        rates=lambda x, u, p: {"x": u.u, "z": x.x - x.z},
+        parameters={},
+        outputs={"y": fp.Output("m", lambda x, p: x.x)},
+    )
+    reference = fp.Trajectory(lambda t: {"y": ca.sin(t)})
+    problem = fp.Problem(plant, reference, {"x": 0.0, "z": 0.0}, period=0.01, duration=10.0)
+    t = np.linspace(0.0, 10.0, 5)
+    wanted = [np.sin(t), (np.sin(t) - np.cos(t) + np.exp(-t)) / 2]
+    np.testing.assert_allclose(reference_states(problem, 5), wanted, atol=0.02)
+
+
+def test_a_response_is_as_large_as_its_limits_allow():
+    """By the model a'' = u and b'' = (w - 3) / 8: from the middle of the limits, plus what half of them adds."""
+    scale = response_scale(masses(limits=fp.Limits(inputs={"u": (-5.0, 3.0), "w": (-2.0, 6.0)})))
+    assert scale.largest == pytest.approx((1 + 4, (1 + 4) / 8))
+    np.testing.assert_allclose(scale.slope, np.diag([1.0, 1 / 8]))
+    assert response_scale(masses(limits=fp.Limits(inputs={"u": (-5.0, 3.0)}))).largest == (np.inf, np.inf)
 
 
 def test_a_small_error_asks_for_a_small_step():

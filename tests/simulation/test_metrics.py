@@ -153,6 +153,18 @@ def test_contraction_is_the_factor_of_the_plant_and_the_gain():
     assert plain["contraction.predicted"] == {}
 
 
+def test_contraction_of_an_exact_model_is_that_of_the_reality_that_it_is():
+    """Of a reality y'' = 2 u the model y'' = 1.6 u sees 1.25 of its own response, and the reality as the model sees one."""
+    deformation = fp.Affine(gain=-0.8)
+    other = replace(linear(1.0, 1.0), response=lambda q, v, u, p: {"y": 2 * p.b * u.u})
+    believed = problem(plant=linear(1.6, 1.6), start={"y": 0.5}, period=1e-3, duration=1.0, measure_from=0.0)
+    task = replace(believed, reality=fp.Reality(other))
+    law = fp.ComputedTorque(fp.Exponential(rate=6.0), deformation)
+    for controller, gain in ((law, 1.25), (fp.ExactModel(law), 1.0)):
+        metrics = fp.measure(task, fp.simulate(task, controller, seed=0, compiled=False))
+        assert metrics["contraction.predicted"][""] == pytest.approx(abs(1 - gain * deformation.effective_gain()))
+
+
 def test_contraction_is_that_of_the_measured_cycles():
     """Y'' = (1 + 2 exp(-4 t)) u in effect: the gain J falls from 3 to 1, so that a = 0.8 contracts from t = 0.0719 on.
 

@@ -204,16 +204,20 @@ def test_a_tenth_more_or_less_is_a_difference(pair, after, words):
     assert said(pair, 1.0, after).startswith(f"adaptive {words}")
 
 
-def test_a_coordinate_that_stays_is_named(pair):
-    """Ten times less in one coordinate and the same in the other: better, and what stays is said."""
-    plain, adaptive = entry(pair[0], y=1.0, z=1.0), entry(pair[1], y=0.1, z=1.0)
+@pytest.mark.parametrize(
+    ("after", "outcome", "words"),
+    [
+        (0.1, Outcome.BETTER, "adaptive lowers the rms error of y from 1 to 0.1 m (10 times less)"),
+        (10.0, Outcome.WORSE, "adaptive does not help: it raises the rms error of y from 1 to 10 m (10 times more)"),
+    ],
+)
+def test_a_coordinate_that_stays_is_named(pair, after, outcome, words):
+    """Ten times less or more in one coordinate and nearly the same in the other: what stays is said, without a factor."""
+    plain, adaptive = entry(pair[0], y=1.0, z=1.0), entry(pair[1], y=after, z=1.05)
     plain, adaptive = (replace(e, run=_with_second_error(e.run)) for e in (plain, adaptive))
     [only] = findings([plain, adaptive], {}, None)
-    assert (
-        only.text
-        == "adaptive lowers the rms error of y from 1 to 0.1 m (10 times less); no clear change: z from 1 to 1 m."
-    )
-    assert only.outcome is Outcome.BETTER
+    assert only.text == f"{words}; no clear change: z from 1 to 1.05 m."
+    assert only.outcome is outcome
 
 
 def _with_second_error(run):
