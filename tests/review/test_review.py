@@ -216,7 +216,7 @@ def test_an_inverse_that_vanishes_on_the_way_is_found():
         period=PERIOD,
         duration=4.0,
     )
-    assert about(answers(problem), "inverse exist").verdict == "no"
+    assert answer(problem, torque(), "inverse exist").verdict == "no"
 
 
 def test_unstable_zero_dynamics_are_found():

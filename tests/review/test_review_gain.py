@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chains import chain, errors_after_request
-from reviewed import about, answer, answers
+from reviewed import answer
 from test_review_laws import PERIOD, RATE, moving
 
 import fpirhc as fp
@@ -82,7 +82,7 @@ def test_a_secant_below_the_bound_of_the_map_may_be_beyond_that_of_the_loop(shar
     sigmoid = fp.Sigmoid(gain=-1.0, scale=5.0)
     chosen = sigmoid.with_effective_gain(share * 2 / 1.5 * sigmoid.effective_gain() / sigmoid.secant_gain())
     problem, controller = chain(2, 1.5), fp.ComputedTorque(fp.Exponential(rate=RATE), chosen)
-    converges = about(answers(problem, controller), "Does the deformation converge")
+    converges = answer(problem, controller, "Does the deformation converge")
     assert converges.verdict == predict(problem, controller).verdict
     slowest = converges.numbers["radius"] ** problem.cycles
     requests = np.random.default_rng(0).uniform(-10, 10, size=(12, 1))
@@ -109,13 +109,12 @@ def test_the_gain_of_a_map_on_targets_is_limited_by_the_whole_loop(name):
     """The heat exchanger: a run comes to rest with nine tenths of the limit, and never does with 1.15 times the limit."""
     task = fp.load_problem("heat_exchanger")
     controller, problem = task.controllers[name], replace(task.problem.of_model, duration=800.0)
-    answers = fp.review(task.problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
-    [answer] = [a for a in answers if a.question == "Is the map's gain admissible?"]
-    assert answer.verdict == "yes"
+    admissible = answer(task.problem, controller, "Is the map's gain admissible?")
+    assert admissible.verdict == "yes"
 
     def ripple(share: float) -> float:
         deformation = controller.deformation
-        factor = share * answer.numbers["limit"] / answer.numbers["gain"]
+        factor = share * admissible.numbers["limit"] / admissible.numbers["gain"]
         changed = deformation.with_effective_gain(factor * deformation.effective_gain())
         run = fp.simulate(problem, controller.with_deformation(changed), seed=0, compiled=False)
         return float(np.abs(np.diff(run["command"][-200:, 0])).max())

@@ -14,7 +14,7 @@ from reviewed import answer
 
 import fpirhc as fp
 from fpirhc.review.grid import inner_motion, inner_places, review_grid
-from fpirhc.review.questions.convergence import zero_dynamics
+from fpirhc.review.questions.convergence import rates_inside, zero_dynamics
 from fpirhc.review.questions.margins import SLOWER
 from fpirhc.review.review import review
 
@@ -70,6 +70,53 @@ def test_unstable_zero_dynamics_that_a_plan_holds_are_told_as_both():
         "unstable by themselves and held by the plan: while the reference is followed they grow at up to 19 1/s; the slowest mode "
         "of the linear loop is multiplied by 0.99 per cycle"
     )
+
+
+@pytest.mark.parametrize(
+    ("rate", "planned", "radius", "learns", "verdict"),
+    [
+        (19.0, True, 0.999, False, "yes"),  # the plan holds them
+        (19.0, True, 1 + 1e-9, False, "unknown"),  # a mode that neither grows nor decays
+        (19.0, True, 1.0003, False, "unknown"),  # growth of 8 % over the 250 cycles of the run does not show
+        (19.0, True, 1.01, False, "no"),
+        (
+            0.01,
+            True,
+            1.01,
+            False,
+            "unknown",
+        ),  # by themselves they grow by 5 % in the run, and no plan needs to hold them
+        (19.0, True, 1.01, True, "unknown"),  # what learns changes the loop
+        (1e-6, False, 1.01, False, "unknown"),  # neutral
+        (19.0, False, 0.9, False, "no"),  # a law that does not see them holds none
+        (0.01, False, 1.01, False, "unknown"),
+        (-1.0, True, 1.01, False, "yes"),
+    ],
+)
+def test_zero_dynamics_that_grow_are_a_no_where_nothing_holds_them_and_the_run_shows_it(
+    rate, planned, radius, learns, verdict
+):
+    found: Any = SimpleNamespace(loops=(None,), radii=np.array([0.9, radius]), learns=learns)
+    assert zero_dynamics(companion(rate), rate, planned, found).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("rate", "radius", "verdict", "change"),
+    [
+        (-32.9, 0.999, "yes", ""),
+        (-32.9, 1.0 + 1e-9, "unknown", "A mode neither grows nor decays"),
+        (-32.9, 1.2, "no", "Lower the rate, or shorten the period."),
+        (19.0, 1.4, "unknown", "It is the mode of the zero dynamics"),  # e^(19 x .02) = 1.46
+        (19.0, 1.6, "no", "Lower the rate, or shorten the period."),
+    ],
+)
+def test_the_ideal_loop_says_whether_the_sampling_is_fast_enough(rate, radius, verdict, change):
+    """A mode that grows faster than the zero dynamics is the law's, and a slower one theirs."""
+    loops: Any = SimpleNamespace(ideal=SimpleNamespace(radius=radius), reason="")
+    one = rates_inside(review_grid(companion(rate), 0.0, 0), LAW, loops)
+    assert (one.verdict, one.change[: len(change)]) == (verdict, change)
+    assert (one.numbers["ideal_radius"], one.numbers["rate_period"]) == pytest.approx((radius, 0.04))
+    assert bool(one.change) == bool(change)
 
 
 @pytest.mark.parametrize("rate", [19.0, -32.9])
@@ -150,7 +197,7 @@ def test_states_without_a_task_are_where_the_plant_takes_them(invented):
     assert grid.states_at(np.array([3.3]))[0] == pytest.approx(
         [2 + np.sin(3.3), float(in_tissue(np.array(3.3), 0.5))], abs=1e-4
     )
-    [well] = [a for a in fp.review(tissue(invented), {}, mismatch=0.0, seed=0).answers if "well posed" in a.question]
+    well = answer(tissue(invented), None, "well posed")
     assert well.evidence.endswith("z has no task and is simulated")
 
 
@@ -205,7 +252,7 @@ def test_currents_of_the_nerve_cell_are_those_of_a_run():
 def test_parameters_of_a_plant_stay_together(name, most):
     """Bristles and the friction that they carry are wrong together: the box needs little more than the plant itself."""
     task = fp.load_problem(f"problems/gallery/{name}.py")
-    [one] = [a for a in fp.review(task.problem, {}, mismatch=0.0, seed=0).answers if "commands" in a.question]
+    one = answer(task.problem, None, "commands")
     assert one.verdict == "yes"
     assert one.numbers["share_over_box"] < most
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reviewed import about, answers, mass
+from reviewed import answer, mass
 
 import fpirhc as fp
 from fpirhc.plant.motion import with_exact_parameters
@@ -150,7 +150,7 @@ def test_an_observer_of_disturbances_is_part_of_the_loop_that_is_judged(factor: 
     problem = mass(plant=plant, period=0.01)
     seen = fp.DisturbanceKalman(drift={"q": 100.0}, measured={"q": 1e-3, "q'": 1e-2})
     controller = fp.Estimating(fp.ComputedTorque(fp.Exponential(rate=6.0)), seen)
-    one = about(answers(problem, controller), "margin")
+    one = answer(problem, controller, "margin")
     assert (one.verdict, one.numbers["radius"] > 1) == (verdict, grows)
     run = fp.simulate(problem, controller, seed=0, compiled=False)
     assert (run.stop is not None) == grows
