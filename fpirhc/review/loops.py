@@ -88,7 +88,7 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     points = points_of(grid, controller)
     quick = points.asked.quick
     sought = thinned(usable(grid), _POINTS if quick else _POINTS_OF_PLANS)
-    every = {k: points.at(k) for k in points.solved(sought)}
+    every = {k: points.at(k) for k in points.feasible(sought)}
     strongest = np.max([_fed_back(one) for one in every.values()], axis=0)
     places = tuple(k for k, one in every.items() if (_fed_back(one) >= _SMALL * strongest).all())
     if not places or not (strongest.all() or all(points.asked.inside(points.quiet(k)) for k in places)):
@@ -135,18 +135,18 @@ class Points:
         strongest = np.max([_fed_back(one) for one in own.loops], axis=0)
         pairs = _pairs(self.grid, own.places, _DRAWN if self.asked.quick else _DRAWN_OF_PLANS)
         finite = [pair for pair in pairs if np.isfinite(self.grid.commands[pair[::-1]]).all()]
-        drawn = {pair: self.at(*pair) for pair in self._of_solved(finite)}
+        drawn = {pair: self.at(*pair) for pair in self._feasible(finite)}
         return {pair: one for pair, one in drawn.items() if (_fed_back(one) >= _SMALL * strongest).all()}
 
-    def solved(self, places: Sequence[int]) -> list[int]:
-        """Return those of some points whose plan is solved; all of them where none is, as with one iteration in a cycle."""
-        return [place for place, _ in self._of_solved([(place, 0) for place in places])]
+    def feasible(self, places: Sequence[int]) -> list[int]:
+        """Return those of some points whose plan keeps its limits of states; all of them where none does."""
+        return [place for place, _ in self._feasible([(place, 0) for place in places])]
 
-    def _of_solved(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    def _feasible(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
         moved = [pair for pair in pairs if not self.asked.skips(self.quiet(*pair))]
         if pairs and not moved:
             raise NoAnswer("every cycle is skipped along the reference, because a signal is not finite there")
-        return [pair for pair in moved if self.asked.solved(self.quiet(*pair))] or moved
+        return [pair for pair in moved if self.asked.feasible(self.quiet(*pair))] or moved
 
     def between(self, place: int, draw: int, gains: tuple[float, float], *, held: bool) -> tuple[LinearLoop, ...]:
         """Return the linear loops of two gains of the map at a point, in the same coordinates; held: plans are held for ever."""

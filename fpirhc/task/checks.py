@@ -23,6 +23,7 @@ from fpirhc.plant.maps import over
 from fpirhc.plant.motion import followed_units, outside_of
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.external_plant import ExternalPlant
@@ -119,8 +120,16 @@ def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -
 
 
 def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
-    """Add every mistake in the cost's names and weights, and in the user's functions of a stage."""
-    cost, limits = nominal(cost), nominal(limits)
+    """Add every mistake in the cost's names and weights, and in the user's functions of a stage; problems share what they share."""
+    for mistake in _STAGES.of((plant, cost, limits), (), lambda: _of_stage(plant, nominal(cost), nominal(limits))):
+        mistakes.add(mistake)
+
+
+_STAGES: Latest[list[str]] = Latest(8)
+
+
+def _of_stage(plant: Plant, cost: Cost | None, limits: Limits) -> list[str]:
+    mistakes = list[str]()
     view = _view_of_symbols(plant)
     parts = (view.state, view.output, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
     symbols = (*(part.vector for part in parts), view.time)
@@ -130,12 +139,13 @@ def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mista
             for name, term in named_results("cost", cost.stage(view)).items():
                 scalar_expression(f"cost: term '{name}'", term, symbols=symbols, finite=False)
         except FpirhcError as error:
-            mistakes.add(str(error))
+            mistakes.append(str(error))
     for name, path in limits.paths.items():
         try:
             path.named_value(name, view, symbols)
         except FpirhcError as error:
-            mistakes.add(str(error))
+            mistakes.append(str(error))
+    return mistakes
 
 
 def _view_of_symbols(plant: Plant) -> View:

@@ -163,7 +163,7 @@ def test_a_plan_that_also_begins_anew_is_linearised_where_it_is_solved():
     grid = review_grid(problem, 0.0, 0)
     points, found = points_of(grid, controller), own_loops(grid, controller)
     assert found.places == (0,)
-    assert [points.asked.solved(points.quiet(k)) for k in (0, 20, 40)] == [True, False, False]
+    assert [points.asked.feasible(points.quiet(k)) for k in (0, 20, 40)] == [True, False, False]
     memory, linear, whole = points.quiet(0), points.at(0), AskedLoop(problem, controller)
     state = whole.loop.memory.slice("_state_before")
     sizes = 1e-5 * np.abs(memory[state])

@@ -14,7 +14,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation
-from fpirhc.plant.maps import growth_of, step_of
+from fpirhc.plant.maps import growth_of, quick_step_of
 from fpirhc.review.answer import Answer, Verdict, duration, per_cycle
 from fpirhc.review.by_run import by_run
 from fpirhc.review.grid import ReviewGrid, StateSlopes, is_late, state_slopes
@@ -35,6 +35,7 @@ from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
 ZERO_DYNAMICS = "Are the zero dynamics stable?"
+_INSIDE = 1e-12  # of the largest singular value, below which a direction moves no derivative below the responses
 _BESIDE = 1.1  # the growth of the zero dynamics is that of the plant, and the nominal loop is that of the model
 _STILL = 1e-4  # growth over the run, as a share, below which a mode is neutral
 
@@ -57,7 +58,7 @@ def of_zero_dynamics(grid: ReviewGrid, radius: float) -> bool:
     rate, period = zero_dynamics_rate(grid), grid.problem.period
     if rate is None or not rate > 0:
         return False
-    grown = float(step_of(grid.problem.plant, np.array([[rate]]), period)[0, 0]) - 1
+    grown = float(quick_step_of(grid.problem.plant, np.array([[rate]]), period)[0, 0]) - 1
     return radius - 1 <= _BESIDE * grown
 
 
@@ -69,9 +70,8 @@ def zero_dynamics_modes(grid: ReviewGrid, places: Sequence[int]) -> list[np.ndar
 
 def _modes(slopes: StateSlopes) -> np.ndarray:
     """Eigenvalues of A - B D^-1 C on the states that leave all derivatives below the responses at zero, Y x = 0."""
-    from scipy.linalg import null_space  # it takes longer to import than a problem to load
-
-    inside = null_space(slopes.y)
+    _, sizes, turned = np.linalg.svd(slopes.y)
+    inside = turned[int((sizes > _INSIDE * sizes.max(initial=0.0)).sum()) :].T
     motion = slopes.a - slopes.b @ np.linalg.solve(slopes.d, slopes.c)
     return np.asarray(np.linalg.eigvals(inside.T @ motion @ inside))
 

@@ -20,7 +20,7 @@ from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.chain import nominal_responses
-from fpirhc.plant.maps import growth_of, step_of
+from fpirhc.plant.maps import growth_of, quick_step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, state_slopes
@@ -183,7 +183,7 @@ def _growth(grid: ReviewGrid, feedback: np.ndarray) -> float:
     a, b = _model(grid)
     nx, nu = b.shape
     rates = np.block([[a, b], [np.zeros((nu, nx + nu))]])
-    held = step_of(grid.problem.plant, rates, step)[:nx]
+    held = quick_step_of(grid.problem.plant, rates, step)[:nx]
     stage = np.vstack([held[:, :nx] @ np.eye(nx, nx + nu) + held[:, nx:] @ feedback, feedback])
     radius = float(np.abs(np.linalg.eigvals(stage)).max())
     return 0.0 if abs(radius - 1) < _STILL else math.log(radius) / step

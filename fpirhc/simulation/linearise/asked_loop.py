@@ -22,6 +22,7 @@ from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import resolved, with_optimiser
 from fpirhc.deformation.base import Deformation, Iteration, with_inner
 from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
+from fpirhc.optimisers.base import FEASIBLE
 from fpirhc.simulation.linearise.late_loop import Late, LateLoop
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 from fpirhc.simulation.linearise.slopes import LARGEST, Directions, Step, Way, along, reached
@@ -156,7 +157,7 @@ class AskedLoop:
         self._command = self.loop.trace.slice("command")
         self._arriving = self.loop.trace.slice("arriving" if "arriving" in names else "command")
         self._statuses = [k for k, c in enumerate(self.loop.trace.columns) if c == "status"]
-        self._solves = [k for k, c in enumerate(self.loop.trace.columns) if c.endswith("solve.status")]
+        self._violations = [k for k, c in enumerate(self.loop.trace.columns) if c.endswith("solve.feasibility")]
         self._errors = self.loop.trace.slice("true_error" if "true_error" in names else "error")
         self._state = self.loop.memory.slice("_state_before")
         self._request = [k for k, c in enumerate(self.loop.memory.columns) if "_deformed_last." in c]
@@ -296,9 +297,9 @@ class AskedLoop:
         """Return whether no command of the next cycle stands at a limit."""
         return bool(self._inside(self._step(memory)[1][self._command]))
 
-    def solved(self, memory: np.ndarray) -> bool:
-        """Return whether the next cycle has a plan that is solved; a loop without plans has nothing to solve."""
-        return bool((self._step(memory)[1][self._solves] == Status.OK).all())
+    def feasible(self, memory: np.ndarray) -> bool:
+        """Return whether the next cycle has a plan that keeps its limits of states; a loop without such a plan breaks none."""
+        return bool((self._step(memory)[1][self._violations] <= FEASIBLE).all())
 
     def skips(self, memory: np.ndarray) -> bool:
         """Return whether the next cycle is skipped, with the last command and every memory as it was."""

@@ -13,6 +13,9 @@ from functools import cached_property, reduce
 import numpy as np
 
 NEUTRAL = 1e-6  # distance of |pole| from 1, where a mode neither decays nor grows
+_MANY = (
+    60  # states, from which a triangle is quicker than a solution for every frequency, and the import of scipy.linalg
+)
 _DOUBLINGS, _OVER = 16, 1e-12  # of a sum over periods, and what is left of a state where it is over
 _SHOWN = 1e-6  # share of a judged error in an eigenvector, in scales
 
@@ -74,8 +77,8 @@ class LinearLoop:
         square root of rounding, so the mean of poles that lie together is what counts.
         """
         count = len(self.cycles)
-        near = [np.abs(self.poles - pole) < 10 * NEUTRAL * count for pole in self.poles]
-        means = np.array([abs(self.poles[one].mean()) for one in near])
+        near = np.abs(self.poles[:, None] - self.poles) < 10 * NEUTRAL * count
+        means = np.abs(near @ self.poles / near.sum(axis=1))
         lasting = means > 1 - NEUTRAL * count
         if not len(self.errors) or not lasting.any():
             return np.zeros(len(self.poles), dtype=bool)
@@ -99,10 +102,22 @@ class LinearLoop:
 
         It is found from the matrices, because polynomials of so many states lose all digits.
         """
-        from scipy.linalg import schur  # it takes longer to import than a problem to load
-
         [one] = self.cycles
         g, c = one.entry[:, place], one.arriving[place]
+        if len(self.dynamics) > _MANY:
+            return self._by_schur(g, c)
+        closed, unit = self.dynamics - np.outer(g, c), np.eye(len(self.dynamics))
+
+        def response(frequencies: np.ndarray) -> np.ndarray:
+            points = np.exp(1j * frequencies * self.period)
+            return np.asarray(-(np.linalg.solve(points[:, None, None] * unit - closed, g[:, None])[:, :, 0] @ c))
+
+        return response
+
+    def _by_schur(self, g: np.ndarray, c: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """The same for many states, which are brought into a triangle once."""
+        from scipy.linalg import schur  # it takes longer to import than a problem to load
+
         form, turn = schur(self.dynamics - np.outer(g, c), output="complex")
         left, right = c @ turn, turn.conj().T @ g
 
