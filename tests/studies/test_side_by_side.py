@@ -189,3 +189,28 @@ def test_a_map_over_starts_has_one_loop(tmp_path: Path, monkeypatch: pytest.Monk
         run = fp.simulate(problem, task.controllers["RHC"], seed=0)
         error = relative_error(fp.measure(problem, run), ranges(task.problem))
         assert found.values[place] == pytest.approx(error, rel=SMOOTH)
+
+
+def test_a_population_is_judged_as_its_members_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    """Every trial has the cost of a search that runs its trials one after the other in scenarios one after the other."""
+    spans = {"CTC+FPI (eq 6)": {"deformation.gain": fp.LogSpan(-1.2, -0.2)}}
+    task = replace(short(TWO_MASS), tuning=spans)
+    settings: dict[str, Any] = {"trials": 24, "seed": 1, "count": 3, "percent": 10.0, "population": 8}
+    whole = tune(task, folder=tmp_path / "whole", **settings)
+    plain = tune(task, folder=tmp_path / "plain", **settings, compiled=False)
+    one, other = (
+        [json.loads(line) for line in (tmp_path / name / "trials.jsonl").read_text().splitlines()[1:]]
+        for name in ("whole", "plain")
+    )
+    assert [r["trial"] for r in one] == list(range(-1, 24))
+    for record, expected in zip(one, other, strict=True):
+        assert record["settings"] == pytest.approx(expected["settings"], rel=1e-9)
+        assert record["cost"] == pytest.approx(expected["cost"], rel=1e-9)
+    assert whole.entries[0].cost < whole.entries[0].cost_before
+    assert plain.entries[0].settings == pytest.approx(whole.entries[0].settings, rel=1e-9)
+    lines = (tmp_path / "whole" / "trials.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "trials.jsonl").write_text("".join(lines[:13]))  # in the middle of the second generation
+    again = tune(task, folder=tmp_path / "cut", **settings)
+    assert again.entries[0].cost == whole.entries[0].cost
+    assert (tmp_path / "cut" / "trials.jsonl").read_text() == "".join(lines)

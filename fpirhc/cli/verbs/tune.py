@@ -29,6 +29,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_controllers(parser, "all with a search space in the problem file")
     text = "trials of every controller (default: 50)"
     parser.add_argument("--trials", type=whole(1), default=50, metavar="N", help=text)
+    text = "trials that are proposed at once and run side by side, 1 learns from every trial (default: 1)"
+    parser.add_argument("--population", type=whole(1), default=1, metavar="N", help=text)
     add_seed(parser, "the proposals and scenarios")
     add_scenarios(parser, 1, "scenarios in every trial (default: 1)")
     add_mismatch(parser)
@@ -53,6 +55,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     drawn = f"{options.scenarios}x{options.mismatch:g}percent"
     name = f"tuning_{'cases' if options.cases else drawn}_seed{options.seed}"
     name += f"_by_{options.metric}" if options.metric else ""
+    name += f"_population{options.population}" if options.population > 1 else ""
     folder = results_folder(options.out, task.name, name)
     with resumable(folder / LEDGER), progress_bars() as progress:
         tuning = tune(
@@ -66,6 +69,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
             cases=options.cases,
             metric=options.metric,
             compiled=options.compiled,
+            population=options.population,
             progress=progress,
         )
     write_tuned(tuning.facts(), folder / "tuning.json")

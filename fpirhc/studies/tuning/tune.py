@@ -5,8 +5,9 @@ Theory: docs/theory-questions.md.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -38,7 +39,7 @@ from fpirhc.studies.view import Progress
 from fpirhc.symbolic.paths import content_at, paths_to
 
 LEDGER = "trials.jsonl"
-_REGISTER = 8  # scenarios of a trial from which they run side by side
+_REGISTER = 8  # runs of a generation from which they are side by side
 _PRESENT = -1  # number of the trial of the settings as they are, which no budget counts
 
 
@@ -129,6 +130,7 @@ def tune(
     cases: Sequence[str] | None = None,
     metric: str | None = None,
     compiled: bool | None = None,
+    population: int = 1,
     progress: Progress | None = None,
 ) -> Tuning:
     """Try settings of every controller with a search space and return the best; trials that `folder` holds are not repeated.
@@ -147,6 +149,7 @@ def tune(
             where larger is better. None: the problem's headline metric, or the relative error.
         compiled: whether runs use compiled C. None: where all settings of the search can be live, so that one compiled loop
             serves all trials; other settings are other C code, and compiling pays only where runs last longer than the compiler.
+        population: number of trials that are proposed at once, from all before them, and run side by side; 1 learns from every one.
         progress: function of (controller, trials done, trials in all) that is called after every trial.
 
     Raises:
@@ -157,8 +160,9 @@ def tune(
     """
     optuna = _optuna()
     names = _tunable(task, controllers)
-    if trials < 1:
-        raise InvalidValue(f"trials {trials}: expected at least 1")
+    for what, value in (("trials", trials), ("population", population)):
+        if value < 1:
+            raise InvalidValue(f"{what} {value}: expected at least 1")
     # One scenario may be without draws: it is the problem itself.
     numbers = scenario_numbers(task, None if cases is not None and count == 1 else count, percent, cases, same=True)
     conditions = Conditions(seed, TUNING, float(percent), compiled, named=cases is not None)
@@ -168,9 +172,12 @@ def tune(
         "scenarios": list(numbers),
         "optuna": optuna.__version__,
         "metric": aim.name,
+        **({"population": population} if population > 1 else {}),
     }
     with Ledger(folder / LEDGER, header, TrialFields) as ledger:
-        entries = tuple(_tuned(optuna, task, n, conditions, numbers, trials, aim, ledger, progress) for n in names)
+        entries = tuple(
+            _tuned(optuna, task, n, conditions, numbers, (trials, population), aim, ledger, progress) for n in names
+        )
     words = f"{count} scenario{'s' if count > 1 else ''} within {percent:g} %"
     if cases is not None and task.cases is not None:
         words = f"cases {', '.join(task.cases.names[k] for k in numbers)}: {len(numbers)} of {len(task.cases.names)}"
@@ -226,18 +233,18 @@ def _tuned(
     name: str,
     conditions: Conditions,
     numbers: Sequence[int],
-    trials: int,
+    budget: tuple[int, int],
     aim: Objective,
     ledger: Ledger,
     progress: Progress | None,
 ) -> TunedController:
-    spans = task.tuning[name]
+    spans, (trials, population) = task.tuning[name], budget
     known = {r["trial"]: r for r in ledger.records if r["controller"] == name}
     before = {path: current_setting(task.controllers[name], path) for path in spans}
     # A trial keeps its cost alone, so no other metric is measured.
     needed = [metric for metric in task.metrics if metric.name in ("rms_error", aim.metric.name if aim.metric else "")]
-    # A trial is a call of its own, so its scenarios alone fill a register.
-    side_by_side = len(numbers) >= _REGISTER and trials * len(numbers) >= SIDE_BY_SIDE
+    # A generation is a call of its own, so its runs alone fill a register.
+    side_by_side = len(numbers) * population >= _REGISTER and trials * len(numbers) >= SIDE_BY_SIDE
     runs = Trials(
         replace(task, metrics=needed),
         name,
@@ -248,23 +255,27 @@ def _tuned(
     )
     study = optuna.create_study()
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
-    for number in range(_PRESENT, trials):
-        record, trial = known.get(number), None
-        if record is None:
+    generations = [range(at, min(at + population, trials)) for at in range(0, trials, population)]
+    for generation in (range(_PRESENT, _PRESENT + 1), *generations):
+        asked: dict[int, Any] = {}
+        new: list[dict[str, Any]] = []
+        for number in (k for k in generation if k not in known):
             trial = None if number == _PRESENT else _proposal(optuna, study, ranges, conditions.seed, number)
             shares = {} if trial is None else dict(trial.params)
             settings = before if number == _PRESENT else _numbers(task, name, spans, shares)
-            record = {"controller": name, "trial": number, "shares": shares, "settings": settings}
-            record |= _judged(runs, numbers, aim, settings)
-            ledger.append(record)
-            known[number] = record
-        if trial is not None:
-            study.tell(trial, record["cost"])
-        elif number != _PRESENT:
-            finished = optuna.trial.create_trial(params=record["shares"], distributions=ranges, value=record["cost"])
-            study.add_trial(finished)
-        if progress:
-            progress(name, number + 1, trials)
+            asked[number] = trial
+            new.append({"controller": name, "trial": number, "shares": shares, "settings": settings})
+        for record, judged in zip(new, _judged(runs, numbers, aim, [one["settings"] for one in new]), strict=True):
+            ledger.append(record | judged)
+            known[record["trial"]] = record | judged
+            if progress:
+                progress(name, record["trial"] + 1, trials)
+        for number in generation:
+            if asked.get(number) is not None:
+                study.tell(asked[number], known[number]["cost"])
+            elif number != _PRESENT:
+                shares, cost = known[number]["shares"], known[number]["cost"]
+                study.add_trial(optuna.trial.create_trial(params=shares, distributions=ranges, value=cost))
     tried = [known[n] for n in range(_PRESENT, trials)]
     best = min(tried, key=lambda r: (r["cost"], r["trial"]))
     failed = sum(bool(r["failures"]) for r in tried[1:])
@@ -287,13 +298,17 @@ def _numbers(task: Task, name: str, spans: TuningSpans, shares: Mapping[str, flo
 
 
 def _judged(
-    trials: Trials, scenarios: Sequence[int], aim: Objective, settings: Mapping[str, float]
-) -> dict[str, float]:
-    """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all of them."""
+    trials: Trials, scenarios: Sequence[int], aim: Objective, some: Sequence[Mapping[str, float]]
+) -> Iterator[dict[str, float]]:
+    """Cost of each of these settings, and in how many scenarios they fail; settings that are refused fail in all of them."""
+    refused = {"cost": aim.refused, "failures": len(scenarios)}
     try:
-        live = trials.live(scenarios)
-        records = list(trials.records([(k, settings) for k in scenarios], live=live))
+        live = not some or trials.live(scenarios)
     except (InvalidValue, InvalidProblem):
-        return {"cost": aim.refused, "failures": len(scenarios)}
-    failures = sum(r.get("outcome") != "finished" for r in records)
-    return {"cost": math.fsum(map(aim.cost, records)) / len(scenarios), "failures": failures}
+        yield from [refused] * len(some)
+        return
+    records = trials.records([(k, settings) for settings in some for k in scenarios], live=live)
+    for _ in some:
+        own = list(itertools.islice(records, len(scenarios)))
+        failures = sum(r.get("outcome") != "finished" for r in own)
+        yield {"cost": math.fsum(map(aim.cost, own)) / len(scenarios), "failures": failures}
