@@ -12,7 +12,7 @@ typedef struct {
 
 typedef struct {
   Plan plans[2];
-  casadi_real v[N * NU], k[N * NU * NS], t[N * NU], planned[N * NS];
+  casadi_real v[N * NU], k[N * NU * NS];
   casadi_real partials[N * NM], lambda[(N + 1) * NS], final[NS * NS];
   casadi_real envelope, reach, tau, gamma, resume;
 #ifdef SCALE_AT
@@ -34,11 +34,16 @@ INLINE casadi_real middle(casadi_real low, casadi_real high) {
   return EITHER((fabs(low) <= FINITE) & (fabs(high) <= FINITE), 0.5 * (low + high), ALL(0));
 }
 
+/* Entry k of U - gamma D g, which the limits clip. */
+INLINE casadi_real descended(const Search* s, const Plan* plan, int k) {
+  return plan->u[k] - s->gamma * scale[k % NU] * plan->g[k];
+}
+
 /* Roll out the next plan, with its cost and gradient; NO when something is not finite. The partial derivatives stay, for the
    Jacobians of a plan that is accepted. */
 INLINE Truth try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In lower, In upper) {
   int i, j, l;
-  Truth bold = s->tau >= SHORTEST;
+  Truth bold = s->tau >= SHORTEST, untried = best->value >= UNTRIED;
   In arg[8];
   Out res[8];
   casadi_real cost, slope[NS];
@@ -47,11 +52,15 @@ INLINE Truth try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, I
   for (i = 0; i < N; ++i) {
     Out u = plan->u + i * NU, x = plan->x + i * NS;
     casadi_real apart[NS];
-    for (j = 0; j < NS; ++j) apart[j] = x[j] - s->planned[i * NS + j];
+    for (j = 0; j < NS; ++j) apart[j] = x[j] - best->x[i * NS + j];
     for (l = 0; l < NU; ++l) {
       casadi_real wanted = best->u[i * NU + l] + s->tau * s->v[i * NU + l];
       for (j = 0; j < NS; ++j) wanted += s->k[(i * NS + j) * NU + l] * apart[j];
-      u[l] = EITHER(bold, between(wanted, lower[l], upper[l]), s->t[i * NU + l]);
+      if (!EVERY(bold)) {
+        casadi_real plain = EITHER(untried, ALL(0), descended(s, best, i * NU + l));
+        wanted = EITHER(bold, wanted, plain);
+      }
+      u[l] = between(wanted, lower[l], upper[l]);
     }
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
     res[0] = x + NS, res[1] = &cost, res[2] = s->partials + i * NM;
@@ -72,37 +81,31 @@ INLINE Truth try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, I
 }
 
 /* The plain fixed-point step t = clip(U - gamma D g); returns g'(t - U), and in reach |t - U|^2 / (2 gamma). */
-INLINE casadi_real plain_step(Search* s, const Plan* plan, In lower, In upper, Out t, casadi_real* reach) {
-  int i, l;
+INLINE casadi_real plain_step(const Search* s, const Plan* plan, In lower, In upper, casadi_real* reach) {
+  int k;
   casadi_real descent = ALL(0), size = ALL(0);
-  for (i = 0; i < N; ++i)
-    for (l = 0; l < NU; ++l) {
-      int k = i * NU + l;
-      casadi_real move;
-      t[k] = between(plan->u[k] - s->gamma * scale[l] * plan->g[k], lower[l], upper[l]);
-      move = t[k] - plan->u[k];
-      descent += plan->g[k] * move;
-      size += move * move / scale[l];
-    }
+  for (k = 0; k < N * NU; ++k) {
+    casadi_real move = between(descended(s, plan, k), lower[k % NU], upper[k % NU]) - plan->u[k];
+    descent += plan->g[k] * move;
+    size += move * move / scale[k % NU];
+  }
   *reach = size / (2 * s->gamma);
   return descent;
 }
 
-/* Which search goes on from here, with this plain step and its envelope. */
-INLINE void settle(Search* s, Truth here, In t, casadi_real envelope, casadi_real reach) {
-  int i;
+/* Which search goes on from here, with the envelope of its plain step. */
+INLINE void settle(Search* s, Truth here, casadi_real envelope, casadi_real reach) {
   s->envelope = EITHER(here, envelope, s->envelope);
   s->reach = EITHER(here, reach, s->reach);
-  for (i = 0; i < N * NU; ++i) s->t[i] = EITHER(here, t[i], s->t[i]);
 }
 
 /* Where the search goes on, accept the tried plan and return YES, or draw in and return NO. */
 INLINE Truth judged(Search* s, const Plan* best, const Plan* plan, Truth ok, Truth on, In lower, In upper) {
   int i;
   Truth untried = best->value >= UNTRIED, bold = s->tau >= SHORTEST, rejected, drawn;
-  casadi_real slack = ROUNDING * (1 + fabs(best->value)), reach = ALL(0), envelope = ALL(0), rise = ALL(0), t[N * NU], step;
+  casadi_real slack = ROUNDING * (1 + fabs(best->value)), reach = ALL(0), envelope = ALL(0), rise = ALL(0), step;
   if (ANY(ok)) {
-    step = plain_step(s, plan, lower, upper, t, &reach);
+    step = plain_step(s, plan, lower, upper, &reach);
     envelope = plan->value + step + reach;
   }
   if (ANY(ok & NOT(untried))) {
@@ -120,15 +123,14 @@ INLINE Truth judged(Search* s, const Plan* best, const Plan* plan, Truth ok, Tru
   drawn = rejected & NOT(untried) & NOT(bold);
   ok &= on;
   if (ANY(ok)) {
-    settle(s, ok, t, envelope, reach);
-    for (i = 0; i < N * NS; ++i) s->planned[i] = EITHER(ok, plan->x[i], s->planned[i]);
+    settle(s, ok, envelope, reach);
     s->tau = EITHER(ok, EITHER(untried, s->resume, ALL(1)), s->tau);
   }
   if (ANY(drawn)) {
     /* The quadratic that the cost followed along T - U says which gamma would have been short enough. */
     s->gamma *= EITHER(drawn, EITHER(rise > 2, larger(1 / rise, ALL(DRAWN_IN)), ALL(0.5)), ALL(1));
-    step = plain_step(s, best, lower, upper, t, &reach);
-    settle(s, drawn, t, best->value + step + reach, reach);
+    step = plain_step(s, best, lower, upper, &reach);
+    settle(s, drawn, best->value + step + reach, reach);
   }
   s->tau = EITHER(rejected, EITHER(untried, ALL(SHORTEST * SHORTER), SHORTER * s->tau), s->tau);
   return ok;
@@ -295,9 +297,8 @@ INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
     for (l = 0; l < NU; ++l) {
       best->u[i * NU + l] = between(EITHER(known, memory[i * NU + l], ALL(0)), lower[l], upper[l]);
       s->v[i * NU + l] = best->g[i * NU + l] = ALL(0);
-      s->t[i * NU + l] = between(ALL(0), lower[l], upper[l]);
     }
-  for (i = 0; i < N * NS; ++i) s->planned[i] = EITHER(known, memory[N * NU + i], ALL(0));
+  for (i = 0; i < N * NS; ++i) best->x[i] = EITHER(known, memory[N * NU + i], ALL(0));
   for (i = 0; i < N * NU * NS; ++i) s->k[i] = EITHER(known, memory[N * (NU + NS) + i], ALL(0));
   best->value = s->envelope = ALL(10 * UNTRIED);
   s->reach = ALL(0);
@@ -313,7 +314,7 @@ INLINE void remember(const Search* s, const Plan* best, Truth good, Truth posed,
   int i;
 #define FRESH(k, value) EITHER(posed, value, old[k])
   for (i = 0; i < N * NU; ++i) to[i] = EITHER(good, best->u[i], FRESH(i, middle(lower[i % NU], upper[i % NU])));
-  for (i = 0; i < N * NS; ++i) to[N * NU + i] = EITHER(good, s->planned[i], FRESH(N * NU + i, ALL(0)));
+  for (i = 0; i < N * NS; ++i) to[N * NU + i] = EITHER(good, best->x[i], FRESH(N * NU + i, ALL(0)));
   for (i = 0; i < N * NU * NS; ++i) to[N * (NU + NS) + i] = EITHER(good, s->k[i], FRESH(N * (NU + NS) + i, ALL(0)));
   to[MEMORY - 2] = EITHER(good, s->gamma, FRESH(MEMORY - 2, ALL(0)));
   to[MEMORY - 1] = EITHER(good, s->tau, FRESH(MEMORY - 1, ALL(0)));

@@ -9,6 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple, TypeAlias
 
 import casadi as ca
@@ -47,6 +48,7 @@ _ON_DEVICES = {  # in OpenCL a number of double precision is no condition
 }  # fmt: skip
 _ENDS = "(-INFINITY)", "INFINITY"
 _MOST = 4000  # instructions of scalar code that is written into its caller
+_LONG = 32  # numbers of a part of a choice that gets a place of its own
 _SPLITS = (ca.OP_VERTSPLIT, ca.OP_HORZSPLIT)
 
 
@@ -244,6 +246,14 @@ def part(value: Value, begin: int, end: int) -> Value:
     return tuple(result)
 
 
+def _parted(ends: tuple[Value, Value]) -> list[tuple[Value, Value]]:
+    """The two ways of a result, with its longest part by itself: it need not stay where the others are wanted."""
+    parts = ((piece.size, length(end[:k])) for end in ends if len(end) > 1 for k, piece in enumerate(end))
+    size, begin = max(parts, default=(0, 0))
+    cuts = {0, length(ends[0])} | ({begin, begin + size} if size >= _LONG else set())
+    return [(part(ends[0], low, high), part(ends[1], low, high)) for low, high in pairwise(sorted(cuts))] or [ends]
+
+
 def length(value: Value) -> int:
     """Return the number of entries."""
     return sum(piece.size for piece in value)
@@ -372,9 +382,12 @@ class Dataflow:
         regions = Region(), Region()
         for inner, branch in zip(regions, branches, strict=True):
             inner.outputs = self._called(inner, branch, operands[1:])
-        results = [Node(branches[0].nnz_out(k), region=region) for k in range(branches[0].n_out())]
-        region.steps.append(Choice(operands[0], regions, results))
-        return [whole(node) for node in results]
+        parted = [_parted(ends) for ends in zip(*(inner.outputs for inner in regions), strict=True)]
+        for k, inner in enumerate(regions):
+            inner.outputs = [ends[k] for parts in parted for ends in parts]
+        made = [[Node(length(ends[0]), region=region) for ends in parts] for parts in parted]
+        region.steps.append(Choice(operands[0], regions, [node for nodes in made for node in nodes]))
+        return [joined(piece for node in nodes for piece in whole(node)) for nodes in made]
 
     def _call(self, function: ca.Function, operands: Sequence[Value], results: list[Node]) -> Call:
         if function.class_name() != "Map":

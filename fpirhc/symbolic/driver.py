@@ -242,7 +242,7 @@ def kept_if_finite(new: Expression, old: Expression, good: Expression) -> tuple[
 @cache
 def _kept(size: int) -> ca.Function:
     new, old, good = ca.MX.sym("new", size), ca.MX.sym("old", size), ca.MX.sym("good")
-    driver = Driver(_KEPT, {}, {"SIZE": size})
+    driver = Driver(_KEPT, {}, {"SIZE": size}, in_place=(0, 0))
     fine = _none_large(new)
     kept = ca.if_else(
         ca.logic_and(good, fine), new, old, True

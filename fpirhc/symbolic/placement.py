@@ -52,6 +52,7 @@ class Placement:
         self._places: list[Place] = []
         self._rooms: dict[Call, Place] = {}
         self._joins: dict[tuple[Region, Value], Node] = {}
+        self._readers: dict[Node, list[Step | Region]] = {}
         self._locals, self._time = 0, 0
         self._fuse(region)
         for k, value in enumerate(region.outputs):
@@ -68,7 +69,7 @@ class Placement:
 
     def _fuse(self, region: Region) -> None:
         """Write an operation into the one that reads it, where nothing else does."""
-        readers: dict[Node, list[Step | Region]] = {}
+        readers = self._readers
         _note_readers(region, readers)
         self.uses.update({node: len(found) for node, found in readers.items()})
         for node, found in readers.items():
@@ -89,7 +90,10 @@ class Placement:
         for step in region.steps:
             if isinstance(step, Call) and step.scalar is None:
                 self._share(step, region)
-                step.rows = [self._row(value, region) for value in step.arguments]
+                step.rows = [
+                    self._row_in_place(value, step, k, region) or self._row(value, region)
+                    for k, value in enumerate(step.arguments)
+                ]
         for step in region.steps:
             for k, node in enumerate(step.results):
                 if not node.base and self._needs_place(step, node) and not self._is_pointer(step, k):
@@ -123,6 +127,29 @@ class Placement:
         step.results[k].base = f"p{len(self.pointed)}"
         self.pointed.add(step.results[k])
         return True
+
+    def _row_in_place(self, value: Value, step: Call, argument: int, region: Region) -> Value:
+        """A row of several values where the result lies that the call computes in its place; nothing where it may not.
+
+        What is read later, too, does not lie there: the call writes over it.
+        """
+        if len(value) < 2 or step.callee.in_place is None or step.callee.in_place[0] != argument:
+            return ()
+        result = step.results[step.callee.in_place[1]]
+        if not result.base or (region, value) in self._joins:
+            return ()
+        row = Node(length(value), result.base, result.offset, region)
+        at = row.offset
+        for piece in value:
+            if self._ends_with(piece.node, step):
+                self._claim((piece,), row.base, at, region)
+            at += piece.size
+        return whole(row)
+
+    def _ends_with(self, node: Node, step: Call) -> bool:
+        """Whether nothing reads a node after this call; a fused operation reads where it is written."""
+        readers = self._readers[node]
+        return readers[-1] is step and not any(isinstance(one, Operation) and one.fused for one in readers)
 
     def _row(self, value: Value, region: Region) -> Value:
         """The value in one row: a new one where it lies in several, or nowhere."""

@@ -385,7 +385,7 @@ def test_results_of_calls_are_written_where_they_are_wanted():
     one = device_of(task.problem, task.controllers["RHC+FPI"], "RHC+FPI", name="c", cycles=1)
     whole = generate(one.stepper.function)[0]
     loops = re.findall(r"for \(i=0; i<(\d+); \+\+i\) \S+ = [^?;]*;", one.sources[0])
-    assert [int(size) for size in loops if int(size) > 40] == [291], (
+    assert [int(size) for size in loops if int(size) > 40] == [282], (
         "a plan is copied where it is held, and nowhere else"
     )
     assert one.sizes["w"] < int(re.findall(r"\*sz_w = (\d+);", whole)[0])
