@@ -193,6 +193,17 @@ def test_a_box_around_a_loop_that_diverges_is_not_told_to_shrink(grid, monkeypat
     ]
 
 
+def test_the_middle_of_a_box_is_in_it(grid, monkeypatch):
+    """The worst of all plants is no better than that with the exact parameters, at any point of the reference."""
+    monkeypatch.setattr("fpirhc.review.questions.convergence.loops_over_box", lambda *_: (loop(0.5), loop(0.7)))
+    cases: list[Any] = [SimpleNamespace(grid=grid, controller=None, loops=loops(0.6, r)) for r in (0.9, 1.25)]
+    inside, outside = (box_converges(one) for one in cases)
+    assert inside.verdict == "yes"
+    assert inside.numbers["radius"] == pytest.approx(0.9)
+    assert outside.verdict == "unknown"
+    assert outside.change == "It does not converge at some points of the reference: see there."
+
+
 @pytest.mark.parametrize(
     ("share", "ideal", "seconds"),
     [(0.5, 0.5, "20 s"), (0.25, 0.5, "40 s"), (0.5, 0.999, ""), (-0.5, 0.5, ""), (0.0, 0.5, ""), (0.5, None, "")],

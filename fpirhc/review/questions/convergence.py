@@ -246,17 +246,22 @@ def box_converges(case: Case) -> Answer:
         return Answer(BOX, Verdict.UNKNOWN, f"no linear loop: {own.reason}")
     # Without draws the box is a point: approximate and exact parameters are the same.
     radii = np.array([one.radius for one in loops_over_box(grid, case.controller, own) or own.loops])
-    share, worst = float((radii < 1).mean()), float(radii.max())
+    share, worst = (
+        float((radii < 1).mean()),
+        max(float(radii.max()), float(own.radii.max())),
+    )  # the box has its middle too
     draws = f"{len(radii)} draw{'s' * (len(radii) > 1)}"
     text = f"in {100 * share:.3g} % of {draws}; the worst mode is multiplied by {worst:.6g} per cycle"
     numbers = {"share": share, "radius": worst}
-    if share == 1:
+    if share == 1 and worst < 1:
         return Answer(BOX, Verdict.YES, text, "", numbers)
     change = "Lower the gain, or narrow the box of the parameters."
     if of_zero_dynamics(grid, worst):
         change = _OF_THE_PLANT
     elif own.radii.min() >= 1:
         change = "It does not converge along the reference either: see there."
+    elif share == 1:
+        change = "It does not converge at some points of the reference: see there."
     return Answer(BOX, Verdict.UNKNOWN, text, change, numbers)
 
 

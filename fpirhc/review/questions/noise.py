@@ -21,6 +21,7 @@ from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
+from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Points, points_of, spectrum_near, thinned, usable
@@ -30,7 +31,7 @@ from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.asked_loop import behind_noise
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.trials import Trials, harm_in
-from fpirhc.summary import line, number, table
+from fpirhc.summary import in_percent, line, number, table
 from fpirhc.task.problem import Problem
 
 RINGING = 6.0  # kappa: damping 0.2, between 4 and 8, beyond which tracking gains nothing
@@ -339,7 +340,13 @@ def chatter_small(case: Case) -> Answer | None:
     steps = dict(zip(problem.plant.inputs, map(float, rms), strict=True))
     lower, upper = problem.limits.input_bounds(problem.plant)
     share = float(np.max(rms / (upper - lower)))
-    text = "rms step per cycle from noise: " + ", ".join(f"{i} {v:.3g}" for i, v in steps.items())
+    units = dict(zip(problem.plant.inputs, problem.plant.input.units, strict=True))
+    text = "rms step per cycle from noise: " + ", ".join(f"{i} {v:.3g}{with_space(units[i])}" for i, v in steps.items())
+    text += (
+        f"; {in_percent(share)} of the range between limits, and less than {in_percent(SMALL)} is small"
+        if share > 0
+        else ""
+    )
     numbers = {f"step_{i}": v for i, v in steps.items()} | {"share_of_limits": share}
     if share < SMALL:
         return Answer(CHATTER, Verdict.YES, text, "", numbers)
