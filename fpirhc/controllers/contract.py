@@ -343,7 +343,11 @@ def late_deformation(deformation: Deformation, problem: Problem, least: float = 
     ]
     square = len(inputs) == len(problem.plant.controlled_names)
     late = [name for name in left_open if max(known[name]) >= least]
-    values = {n: tuple(known[n]) if square and len({*known[n]}) > 1 else max(known[n]) for n in late}
+    longest = [problem.dead_time.longest[name] / problem.period for name in inputs if name in problem.dead_time.longest]
+    each = {n: square and len(inputs) > 1 and bool(len({*known[n]}) > 1 or (longest and n == "cycles")) for n in late}
+    values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in late}
+    if "cycles" in values and longest and getattr(deformation, "longest", 0.0) is None:
+        values["longest"] = max(*longest, *known["cycles"])  # a dead time that is live has others in a run
     return replace(deformation, **values) if values else deformation
 
 

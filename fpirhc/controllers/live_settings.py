@@ -374,8 +374,8 @@ def _differences(before: object, after: object, path: str = "") -> Iterator[str]
     if before is after:
         return
     if before is None:
-        if isinstance(after, int | float) and not isinstance(after, bool):
-            yield path
+        entries = {f"{path}.{k}": one for k, one in enumerate(after)} if isinstance(after, tuple) else {path: after}
+        yield from (p for p, one in entries.items() if isinstance(one, int | float) and not isinstance(one, bool))
         return
     structure = {f.name for f in fields(after) if f.metadata.get("structure")} if is_dataclass(after) else set()
     for name in (n for n in names_in(after) if n not in structure):

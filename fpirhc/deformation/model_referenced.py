@@ -46,7 +46,7 @@ class ModelReferenced(Wrapper):
     lag: float | tuple[float, ...] | None = field(default=None, metadata={"of_problem": True})
     uncertainty: int | None = None
     pole: BelowOne | None = None
-    longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given", "structure": True})
 
     def __post_init__(self) -> None:
         check_longest("ModelReferenced", self.longest, self._cycles)
