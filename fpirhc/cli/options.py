@@ -39,7 +39,10 @@ def add_seed(parser: Parser, use: str) -> None:
 
 def add_set(parser: Parser, more: str) -> None:
     """--set PATH=NUMBER, again and again."""
-    text = "another number for a setting, such as deformation.gain=-1.2, limits.inputs.Q1=-50,20, exact.m1=1.4 or start.q1=2"
+    text = (
+        "another number for a setting, such as deformation.gain=-1.2, limits.inputs.Q1=-50,20, exact.m1=1.4 or start.q1=2; what a "
+        "controller has itself is its own, else the problem's"
+    )
     parser.add_argument(
         "--set", action="append", default=[], dest="settings", metavar="PATH=NUMBER", help=f"{text}{more}"
     )

@@ -37,6 +37,7 @@ from fpirhc.problem_files.settings import (
     as_declared,
     check_tuning,
     current_setting,
+    is_own,
     of_problem,
     with_numbers,
     with_settings,
@@ -167,7 +168,9 @@ def in_case(task: Task, name: str) -> Task:
 
 
 def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection[str] | None = None) -> Task:
-    """Return the task with other numbers: of the problem, at paths of a case, and of every named controller that has the setting.
+    """Return the task with other numbers: of every named controller that has the setting, and else of the problem.
+
+    A number that a controller and the problem have is the controller's own; for the others it is the problem's.
 
     Args:
         task: the task.
@@ -179,12 +182,13 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
         InvalidProblem: a number that does not fit the problem.
         InvalidValue: a number that a controller does not accept.
     """
-    own = {path: word for path in values if (word := of_problem(task.problem, path))}
-    problem, controllers = with_numbers(task.problem, {word: values[path] for path, word in own.items()}), {}
     chosen = {name: one for name, one in task.controllers.items() if not names or name in names}
-    lacking: dict[str, list[InvalidName]] = {path: [] for path in values if path not in own}
+    shared = {path for path in values if of_problem(task.problem, path)}
+    read = {path for path in shared if not chosen or not all(is_own(one, path) for one in chosen.values())}
+    problem, controllers = with_numbers(task.problem, {path: values[path] for path in values if path in read}), {}
+    lacking: dict[str, list[InvalidName]] = {path: [] for path in values if path not in shared}
     for name, controller in chosen.items():
-        has = {}
+        has = {path: values[path] for path in shared if is_own(controller, path)}
         for path, lacked in lacking.items():
             try:
                 current_setting(controller, path)

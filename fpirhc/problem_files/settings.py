@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
@@ -54,12 +54,32 @@ def of_problem(problem: Problem, path: str) -> str | None:
 
 
 def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:
-    """Return a problem with other numbers at paths of a case, see `Cases`.
+    """Return a problem with other numbers at paths of a case, see `Cases`, or as `of_problem` takes them.
 
     Raises:
-        InvalidProblem: a path or a number that does not fit, all together.
+        InvalidProblem: a path or a number that does not fit, all together, by the paths that were given.
     """
-    return Cases({"--set": dict(values)}).problem("--set", problem) if values else problem
+    written = {of_problem(problem, path) or path: path for path in values}
+    changes = {path: values[given] for path, given in written.items()}
+    return _Written({_SET: changes}, places=written).problem(_SET, problem) if values else problem
+
+
+_SET = "--set"
+
+
+@dataclass(frozen=True, eq=False)
+class _Written(Cases):
+    """One case of numbers that a user wrote in a command; `places` has the paths as they were written."""
+
+    _where: ClassVar[str] = _SET
+
+    def _place(self, name: str, path: str = "", *, head: bool = False) -> str:  # noqa: ARG002
+        return f"'{self.places[path]}'" if path else name
+
+
+def is_own(controller: Controller, path: str) -> bool:
+    """Whether a path begins with a field of the controller that it has: a number that problem and controller have is its own."""
+    return getattr(controller, path.partition(".")[0], None) is not None
 
 
 def as_declared(controller: Controller, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from types import MappingProxyType
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 
@@ -62,11 +62,13 @@ class Cases(Checked):
         InvalidProblem: all mistakes together: no case, a name that is no text, changes that are no mapping, a wrong group or seed.
     """
 
+    _where: ClassVar[str] = "cases"  # first words of a message
+
     changes: Mapping[str, Mapping[str, object]]
     places: Mapping[str, str] = field(default_factory=dict, kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
-        mistakes = Mistakes("cases")
+        mistakes = Mistakes(self._where)
         if not self.changes:
             mistakes.add('there is none; expected {"heavy": {"exact.mass": 2.0}}')
         for name, changes in self.changes.items():
@@ -197,7 +199,7 @@ class Cases(Checked):
         Raises:
             InvalidProblem: all mistakes together, each with its case and path, or its row and column.
         """
-        mistakes, unknown = Mistakes("cases"), set[str]()
+        mistakes, unknown = Mistakes(self._where), set[str]()
         for name in self.names if names is None else names:
             changes = self.changes[name]
             for path in (p for p in changes if p not in (*unknown, _GROUP, _SEED)):

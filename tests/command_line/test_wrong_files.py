@@ -449,6 +449,8 @@ export two_mass CTC --out o --cycles -3 => --cycles: expected a whole number of 
 export two_mass CTC --out o --to fmu --check => --check is there for c, cortex-m, not for fmu
 probe two_mass --cycles 3 => probe: 3 cycles are too few to tell a gain from noise; expected at least 40, 300 are usual
 run two_mass RHC+FPI --set deformation.gian=-1 => (Sigmoid) has no 'gian'. Did you mean 'gain'? Valid: gain, shift, scale.
+run two_mass RHC --set m1.exact=nan => --set: 'm1.exact': expected a finite number, got nan
+compare two_mass --set exact.m9=1 => --set: 'exact.m9': 'exact.NAME' has a parameter of what moves, and there is no 'm9'.
 run two_mass RHC --set deformation.gain=-1 =>
     setting 'deformation.gain': 'deformation' of the controller (Identity) has no 'gain'. ... It has no settings; the controller
     has settings in:

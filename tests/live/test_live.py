@@ -18,7 +18,7 @@ from fpirhc.cli.main import main
 from fpirhc.conformance.laws import check_live
 from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import CompileError, InvalidName, InvalidValue, NotContractive, NotSupported
-from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.problem_files.problem_file import load_problem, with_numbers_of_all
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.scenarios.bench import Bench, Conditions
@@ -26,6 +26,7 @@ from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.tuning.tune import tune
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.live import live_number
+from fpirhc.symbolic.paths import content_at
 from fpirhc.symbolic.program import generate
 
 TASK = load_problem("two_mass")
@@ -238,6 +239,17 @@ def check_numbers_of_the_problem(capsys):
     ):
         assert main(words) == 2
         assert why in capsys.readouterr().err
+
+
+def test_a_number_that_a_controller_has_itself_is_its_own_in_a_comparison():
+    """The others follow the problem's, as each would in a run; where all have their own the problem's stays."""
+    own = cast(Any, replace)(PLANNED, cost=PROBLEM.cost)
+    task = replace(TASK, controllers={"own": own, "shared": PLANNED, "torque": TORQUE})
+    path = "cost.states.q1"
+    both, one = with_numbers_of_all(task, {path: 7.0}), with_numbers_of_all(task, {path: 7.0}, ["own"])
+    assert [content_at(t.controllers["own"], path) for t in (both, one)] == [7.0, 7.0]
+    assert [content_at(t.problem, path) for t in (both, one)] == [7.0, content_at(PROBLEM, path)]
+    assert cast(Any, both.controllers["shared"]).cost is None
 
 
 def jumps(controller, numbers, signal):

@@ -109,14 +109,14 @@ def _simulated(
     """Problem and controller with these settings, and their run; live ones, which need no compiler, where they can be."""
     from fpirhc.controllers.live_settings import OF_PROBLEM, live_settings
     from fpirhc.errors import NotSupported
-    from fpirhc.problem_files.settings import as_declared, of_problem, with_numbers, with_settings
+    from fpirhc.problem_files.settings import as_declared, is_own, of_problem, with_numbers, with_settings
     from fpirhc.simulation.simulate import simulate
     from fpirhc.simulation.trials import with_recommended_gain
 
     run["setpoints"] = setpoints
-    own = {p: word for p in settings if (word := of_problem(problem, p)) and not _has(controller, p)}
-    data = {p: word for p, word in own.items() if word.partition(".")[0] not in OF_PROBLEM}
-    problem = with_numbers(problem, {word: settings[p] for p, word in data.items()})
+    own = {p: word for p in settings if (word := of_problem(problem, p)) and not is_own(controller, p)}
+    data = [p for p, word in own.items() if word.partition(".")[0] not in OF_PROBLEM]
+    problem = with_numbers(problem, {p: settings[p] for p in data})
     settings = {p: v for p, v in settings.items() if p not in data}
     if not settings:
         return problem, controller, simulate(problem, controller, **run)
@@ -126,16 +126,11 @@ def _simulated(
             changed, ready, _ = live_settings(problem, controller, list(settings)).changed(settings)
             return changed, ready, live
         except NotSupported:
-            changed = with_numbers(problem, {own[p]: v for p, v in settings.items() if p in own})
+            changed = with_numbers(problem, {p: v for p, v in settings.items() if p in own})
             rebuilt = with_settings(
                 controller, as_declared(controller, {p: v for p, v in settings.items() if p not in own})
             )
             return changed, rebuilt, simulate(changed, rebuilt, **run)
-
-
-def _has(controller: Controller, path: str) -> bool:
-    """Whether a path begins with a field of the controller that it has."""
-    return getattr(controller, path.partition(".")[0], None) is not None
 
 
 def _with_gains(controller: Controller, settings: Mapping[str, Any]) -> Controller:
