@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chains import chain, errors_after_request
-from reviewed import answer
+from reviewed import answer, mass, torque
 from test_review_laws import PERIOD, RATE, moving
 
 import fpirhc as fp
@@ -121,6 +121,17 @@ def test_the_gain_of_a_map_on_targets_is_limited_by_the_whole_loop(name):
 
     assert ripple(0.9) < 0.05
     assert ripple(1.15) > 0.5
+
+
+def test_a_gain_that_is_too_large_for_the_lightest_plant_of_the_box_is_unknown():
+    """It is good for the plant itself; half of the way to the limit of the box is advised, with its sign."""
+    problem, controller = mass(), torque(gain=-2.2)
+    one = answer(problem, controller, "gain admissible", mismatch=40.0)
+    advised = float(one.change.removeprefix("Use gain = ").removesuffix("."))
+    assert one.verdict == "unknown"
+    assert advised == pytest.approx(one.numbers["recommended"], rel=1e-3)
+    within = controller.with_deformation(replace(controller.deformation, gain=advised))  # type: ignore[type-var]
+    assert answer(problem, within, "gain admissible", mismatch=40.0).verdict == "yes"
 
 
 def test_an_error_of_the_start_is_no_harm():
