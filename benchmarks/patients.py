@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -26,7 +27,7 @@ def of_seed(
     cases = task.cases
     assert cases is not None
     with tempfile.TemporaryDirectory() as folder:
-        study = fp.compare_scenarios(task, cases=patterns, controllers=controllers, seed=seed, folder=folder)
+        study = fp.compare_scenarios(task, cases=patterns, controllers=controllers, seed=seed, folder=Path(folder))
     found = {}
     for controller, records in study.records.items():
         for group in dict.fromkeys(cases.group(r["name"]) for r in records):

@@ -45,6 +45,7 @@ sphinx_gallery_conf = {
     "filename_pattern": "/plot_",
     "download_all_examples": False,
     "show_memory": False,
+    "capture_repr": ("_repr_html_",),  # and not the names of matplotlib's objects
     "write_computation_times": False,  # its page would load scripts from elsewhere
     "abort_on_example_error": True,
     "only_warn_on_example_error": False,

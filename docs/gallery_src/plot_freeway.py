@@ -114,3 +114,44 @@ queue.set_xlabel("time [min]")
 # The iteration loses here. What is wrong in the model are speeds and the capacity of the
 # light; the balance of cars at the merge holds whatever they are. To let the density
 # follow the plan of a wrong model undoes what a new plan every minute corrects.
+
+# %%
+# With more cars at the ramp no metering keeps the queue. Speed limits over two segments
+# are a second kind of input, and traffic settles at the smaller of its own speed and the
+# limit. The table takes some minutes, so it is kept in the problem file, where a test
+# compares it with runs.
+
+coordinated = fp.load_problem("freeway_coordinated")
+about = coordinated.description
+print(
+    about[
+        about.index("                             time spent") : about.index(
+            "With metering alone"
+        )
+    ].rstrip()
+)
+
+# %%
+# The exact model calls the third segment's sign down before the queue is full: traffic
+# waits on the road, and the ramp empties into the gap.
+
+run = fp.simulate(
+    coordinated.problem,
+    coordinated.controllers["RHC exact model"],
+    seed=0,
+    compiled=False,
+)
+figure, (signs, rate, queue) = plt.subplots(
+    3, 1, sharex=True, figsize=(8, 6), layout="constrained"
+)
+for name in ("sign3", "sign4"):
+    signs.step(60 * run.time, run[f"command.{name}"], where="post", label=name)
+signs.plot(60 * run.time, run["plant_state.v3"], "k--", lw=1, label="speed, segment 3")
+rate.step(60 * run.time, run["command.r"], where="post")
+queue.plot(60 * run.time, run["plant_state.w2"])
+queue.axhline(100, color="k", ls="--", lw=1)
+signs.set_ylabel("speed [km/h]")
+signs.legend()
+rate.set_ylabel("metering rate")
+queue.set_ylabel("queue [veh]")
+queue.set_xlabel("time [min]")

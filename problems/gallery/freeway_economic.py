@@ -34,8 +34,8 @@ whatever they are. To let the density follow the plan of the wrong model is to u
 offset-free plan finds nothing to estimate, for the same reason. Both queues are too long: a wrong model has no plan that keeps a
 hard limit, and then the last plan is held.
 
-Speed limits on the third and the fourth segment, a second input with a minimum in the model, save nothing: the plan leaves the
-signs beyond what is driven, and the published coordinated run spends more time than the metered one too.
+Speed limits, a second kind of input with a minimum in the model, save nothing with these demands; `freeway_coordinated` has some
+with which they do.
 """
 
 from dataclasses import replace

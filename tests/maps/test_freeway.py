@@ -157,65 +157,68 @@ def test_an_economic_plan_is_the_published_run(which: str) -> None:
     assert run["plant_state.spent"][16] == pytest.approx(96.813, abs=0.011)
 
 
-FREE = 102.0  # km/h
+def test_a_sign_limits_the_speed_at_which_traffic_settles() -> None:
+    """One step of the map by hand: v moves towards 1.1 times what the sign shows where that is less, and nothing else changes."""
+    plant = over(task("freeway_coordinated").problem.plant, T)
+    state = np.array(task("freeway_coordinated").problem.start_state)
+    step = plant.equations.next
+    before = by_hand(state[:14], 0.4, tuple(plant.exact[-2:]))
+    for shown, slower in (((90.0, 90.0), (0.0, 0.0)), ((50.0, 90.0), (1.0, 0.0)), ((50.0, 40.0), (1.0, 1.0))):
+        after = np.ravel(step(state, [0.4, *shown], plant.exact, np.zeros(len(plant.names))).full())
+        limited = [
+            min(0.0, 1.1 * sign - 102 * np.exp(-((rho / 33.5) ** 1.867) / 1.867))
+            for sign, rho in zip(shown, state[2:4], strict=True)
+        ]
+        wanted = before.copy()
+        wanted[8:10] += T / (18 / 3600) * np.array(limited)
+        assert after[:14] == pytest.approx(wanted, rel=1e-13)
+        assert after[-2:] == pytest.approx(shown)
+        assert (np.array(limited) < 0).tolist() == (np.array(slower) > 0).tolist()
 
 
-def with_signs(lowest: float, highest: float, before: float = FREE) -> fp.Problem:
-    """The economic task with speed limits on the third and the fourth segment: traffic settles at min(V(rho), 1.1 sign).
-
-    What the signs show is a state, and an output, because a plant has as many outputs as inputs.
-    """
-    shipped = task("freeway_economic").problem
-    road = shipped.plant
-
-    def later(x, u, p):
-        assert road.next is not None
-        after = dict(road.next(x, u, p))
-        for i in (3, 4):
-            settled = p.v_free * ca.exp(-((x[f"rho{i}"] / p.rho_crit) ** p.a) / p.a)
-            after[f"v{i}"] += T / p.tau * (ca.fmin(settled, 1.1 * u.sign) - settled)
-        return {**after, "shown": u.sign}
-
-    def cost(v):
-        change = (v.input.r - v.input_before.r) ** 2 + ((v.input.sign - v.input_before.sign) / FREE) ** 2
-        return {"change": 0.4 / (6 * T) * change}
-
+def with_limits(lowest: float, highest: float) -> fp.Problem:
+    """The coordinated task whose signs have these limits."""
+    problem = task("freeway_coordinated").problem
     return replace(
-        shipped,
-        plant=fp.Plant.discrete(
-            states={**road.coordinates, "shown": "km/h"},
-            inputs={"r": "1", "sign": "km/h"},
-            next=later,
-            step=T,
-            outputs={**road.outputs, "shown": fp.Output("km/h", lambda x, _: x.shown)},
-            parameters=road.parameters,
-            time_unit="h",
+        problem,
+        limits=replace(
+            problem.limits, inputs={"r": (0.0, 1.0), "sign3": (lowest, highest), "sign4": (lowest, highest)}
         ),
-        start={**shipped.start, "shown": before},
-        input_before={"r": 1.0, "sign": before},
-        reference=fp.Trajectory(lambda t: {"density": 33.5 + 0 * t, "shown": FREE + 0 * t}),
-        limits=replace(shipped.limits, inputs={"r": (0.0, 1.0), "sign": (lowest, highest)}),
-        cost=fp.CustomCost(cost, terminal=lambda v: v.state.spent, rate=True),
-        judged=("density",),
     )
 
 
 @pytest.mark.slow
-def test_speed_limits_save_no_time_here() -> None:
-    """A plan that may use signs too, with their minimum in the model, leaves them beyond what is driven; held at 70 they cost time.
+def test_signs_save_no_time_with_the_demands_of_the_source() -> None:
+    """They stay beyond what is driven, and the rates are those of metering alone.
 
     In the source the coordinated run spends more time than the metered one as well, 102.077 after 101.977 veh h in 100 steps.
     """
-    known = task("freeway_economic").controllers["RHC exact model"]
-    free, slow = (
-        fp.simulate(problem, known, seed=0, compiled=False)
-        for problem in (with_signs(20.0, FREE), with_signs(70.0, 70.01, 70.0))
-    )
-    driven = np.maximum(free["plant_state.v3"], free["plant_state.v4"])
-    assert (1.1 * free["command.sign"] > driven).all()
-    assert (free["status"] == 0).all()
-    assert free["plant_state.spent"].max() == pytest.approx(216.448, abs=2e-3)
-    assert slow["plant_state.spent"].max() == pytest.approx(216.91, abs=0.02)
+    coordinated = task("freeway_coordinated")
+    problem = replace(coordinated.problem, signals=task("freeway_economic").problem.signals)
+    run = fp.simulate(problem, coordinated.controllers["RHC exact model"], seed=0, compiled=False)
+    driven = np.maximum(run["plant_state.v3"], run["plant_state.v4"])
+    assert (1.1 * run["command"][:, 1:].min(axis=1) > driven).all()
+    assert (run["status"] == 0).all()
+    assert run["plant_state.spent"].max() == pytest.approx(216.448, abs=2e-3)
+
+
+@pytest.mark.slow
+def test_signs_hold_the_queue_that_metering_alone_does_not() -> None:
+    """The second table of the coordinated task; its first row is that of IPOPT, which goes on from plans that keep no limit."""
+    coordinated = task("freeway_coordinated")
+    lines = coordinated.description.split("largest queue [veh]")[1].splitlines()[1:6]
+    table = {name: tuple(map(float, numbers)) for name, *numbers in (line.strip().rsplit(maxsplit=2) for line in lines)}
+    alone = fp.ExactModel(fp.RecedingHorizon(fp.Ipopt()))
+    runs = {"metering alone, by IPOPT": fp.simulate(with_limits(101.99, 102.0), alone, seed=0, compiled=False)}
+    names = [name for name in table if name in coordinated.controllers]
+    runs |= {n: fp.simulate(coordinated.problem, coordinated.controllers[n], seed=0, compiled=False) for n in names}
+    assert set(runs) == set(table)
+    for name, run in runs.items():
+        found = run["plant_state.spent"].max(), run["plant_state.w2"].max()
+        assert found == pytest.approx(table[name], abs=0.5), name
+    exact = runs["RHC exact model"]
+    assert exact["plant_state.w2"].max() <= 100 + 1e-6
+    assert exact["command.sign3"].min() == pytest.approx(20.0, abs=1e-3)
 
 
 @pytest.mark.slow

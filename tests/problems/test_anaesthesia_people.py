@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import patients
 import pytest
 from scipy.linalg import expm
 from scipy.signal import lsim
@@ -188,6 +189,53 @@ def test_the_induction_costs_the_slow_ones(tmp_path):
     found = figures(["all"], list(table), tmp_path, measure_from=5.0)
     for name, shares in table.items():
         np.testing.assert_allclose(shares[:, 0], [found[name][s][0] for s in SETS], atol=0.6, err_msg=name)
+
+
+def test_the_drawn_people_have_the_published_distribution():
+    """Variances of the logarithms within four standard errors of a sample of a hundred; medians of the curve at 35 years."""
+    cases = task("anaesthesia_drawn").cases
+    assert cases is not None
+    own = {
+        n: np.array([c[f"exact.{n}"] for c in cases.changes.values()])
+        for n in ("age", "weight", "C50", "ke0", "times_V1")
+    }
+    people = len(own["age"])
+    typical = {
+        "C50": 3.08 * np.exp(-0.00635 * (own["age"] - 35)),
+        "ke0": 0.146 * (own["weight"] / 70) ** -0.25,
+        "times_V1": np.ones(people),
+    }
+    for name, variance in (("C50", 0.242), ("ke0", 0.702), ("times_V1", 0.610)):
+        drawn = np.log(own[name] / typical[name])
+        assert drawn.var() == pytest.approx(variance, abs=4 * variance * (2 / people) ** 0.5), name
+        assert drawn.mean() == pytest.approx(0.0, abs=4 * (variance / people) ** 0.5), name
+
+
+def test_a_curve_may_be_steeper_beyond_its_middle():
+    """Eleveld's, with 1.47 below and 1.89 above C50: the bis at half and at twice of it."""
+    patient = written().patient
+    values = dict(zip(patient.parameters, patient.exact, strict=True))
+    values |= {"E0": 93.0, "Emax": 93.0, "C50": 3.0, "steepness": 1.47, "times_above": 1.89 / 1.47}
+    for reached, steepness in ((1.5, 1.47), (6.0, 1.89)):
+        state = [reached if e == "own_Ce" else 0.0 for e in patient.state.elements]
+        bis = patient.equations.output(state, [0.5], list(values.values()), np.zeros(len(patient.names)))
+        assert float(bis) == pytest.approx(93 - 93 / (1 + (3.0 / reached) ** steepness))
+
+
+@pytest.mark.slow
+def test_the_blind_test_is_as_described():
+    """With seed 0: each figure lies between the least and the most of the five seeds, to the digits of the table."""
+    of = task("anaesthesia_drawn")
+    lines = of.description.split("    five seeds ")[1].split("\n\n")[0].splitlines()[1:]
+    found = patients.of_seed(of, ["all"], list(of.controllers), 0)
+    assert len(lines) == len(of.controllers)
+    for line in lines:
+        name, worst, *ranges = [cell.strip() for cell in line.split("  ") if cell.strip()]
+        values = found["drawn", name]
+        assert values[0] == float(worst)
+        for cell, value in zip(ranges, values[1:], strict=True):
+            least, _, most = cell.partition(" to ")
+            assert float(least) - 0.06 <= value <= float(most) + 0.06, (name, cell)
 
 
 def test_the_monitor_is_its_transfer_function():
