@@ -25,8 +25,9 @@ them to `docs/rivals.json`; it is tuned on the run that it is judged by, with ex
 favour a large gain. "None holds it" means that even the best has more than ten times the largest error of the table. A row that is
 not there has a dash. An exact model that does not know a disturbance, or has one iteration per plan, is no bound. Within a tenth it
 is a draw.
-Problems that are judged by another figure than an error and have no baseline are not here: `anaesthesia_people`, `anaesthesia_drawn`,
-`anaesthesia_monitor`, `diabetes`, `diabetes_announced`, `diabetes_order_five` and `freeway_coordinated` have tables of their own.
+Problems that are judged by another figure than an error and have no baseline are not here: `anaesthesia_people`,
+`anaesthesia_drawn`, `anaesthesia_monitor`, `diabetes`, `diabetes_announced`, `diabetes_order_five` and `freeway_coordinated` have
+tables of their own.
 
 | problem | quantity | plain | with FPI | best rival | exact model | winner | why |
 |---|---|---|---|---|---|---|---|

@@ -25,10 +25,10 @@ Each is the least and the most of five seeds of the noise:
     cascade                            0      17.5 to 18.3  80.3 to 80.5  52 to 54
     cascade in mg/l                    0      14.9 to 15.7  81.7 to 82.0  47 to 51
 
-No controller passes. Each loses somebody altogether, and holds about half of the people for nine tenths of the time; of the measured
-ones it held nearly all. Of the two that draw there, the PID law is the safer one here: its lowest bis is 21 and not 15, and fewer
-people leave the range. The cascade in mg/l relies on the model's curve, and a person who needs half the concentration gives it twice
-the gain. Settings that were chosen on the measured people are not for such a spread.
+No controller passes. Each loses somebody altogether, and holds about half of the people for nine tenths of the time; of the
+measured ones it held nearly all. Of the two that draw there, the PID law is the safer one here: its lowest bis is 21 and not
+15, and fewer people leave the range. The cascade in mg/l relies on the model's curve, and a person who needs half the
+concentration gives it twice the gain. Settings that were chosen on the measured people are not for such a spread.
 
 For the patient of medians, as in `anaesthesia_people`:
 
