@@ -199,7 +199,7 @@ _REASONS = {
     "12.3": "declarations and assignments joined by commas",
     "13.3": "copies of generated code advance two pointers in one line",
     "13.4": "a number is assigned to several places",
-    "14.2": "the loop of the optimiser ends within",
+    "14.2": "the loops of the optimiser, and over missed cycles, end within",
     "14.4": "a pointer that may be null, or a comparison that is a number, is a condition",
     "15.5": "a function returns where it is done",
     "15.6": "a body of one line without braces",
@@ -207,6 +207,7 @@ _REASONS = {
     "17.7": "memcpy and memset return what nobody needs",
     "17.8": "an argument is advanced where it stands",
     "18.4": "places in the array of numbers are reached by addition",
+    "19.2": "the first byte of a number is read on an AVR",
     "20.7": "a macro of a type",
 }
 

@@ -39,7 +39,8 @@ def condensed(text: str) -> str:
     Args:
         text: generated C, whose caller passes rows for all that is read and written, and none for both.
     """
-    return _BODY.sub(lambda found: _function(found[1], found[3].splitlines()), text)
+    shorter = _BODY.sub(lambda found: _function(found[1], found[3].splitlines()), text)
+    return shorter.replace("#include <math.h>\n", "#include <math.h>\n#include <string.h>\n", 1)
 
 
 def _function(head: str, lines: Sequence[str]) -> str:
@@ -57,8 +58,7 @@ def _function(head: str, lines: Sequence[str]) -> str:
     return f"{_CHECKS}{tables}{head}{body}"
 
 
-_CHECKS = """#include <string.h>
-#ifndef BOUNDED
+_CHECKS = """#ifndef BOUNDED
 #ifdef __AVR__ /* the first byte says it, and numbers are compared by calls */
 static signed char every_bounded(const casadi_real* x, unsigned char n) {
   const unsigned char* byte = (const unsigned char*)x + 3;
