@@ -6,6 +6,7 @@ is entered once per chunk: for disturbances and noise, to check that all signals
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -182,7 +183,7 @@ def simulator(
         NotSupported: a setting that decides what the loop is made of, or that this loop needs as a number.
         CompileError: the compiler fails on a loop with live settings.
     """
-    return built(problem, controller, compiled, flags, live, {})
+    return built(problem, controller, compiled, flags, live)
 
 
 def built(
@@ -191,7 +192,7 @@ def built(
     compiled: bool | None,
     flags: Sequence[str],
     live: Sequence[str],
-    known: dict[object, Compiled],
+    known: dict[object, Compiled] | None = None,
 ) -> Simulator:
     """Return what `simulator` does; a loop whose code is `known` is not compiled again, and `known` gets that of every other one.
 
@@ -201,17 +202,23 @@ def built(
     ready = settings.controller
     loop = close_loop(problem, ready, settings if live else None)
     long = problem.cycles * (problem.horizon.stages if problem.horizon is not None else 1) > _SHORT_RUN
-    key = compiled or (compiled is None and long), loop.function.serialize()
-    if key not in known:
+    worth = compiled or (compiled is None and long)
+
+    def made() -> Compiled:
         backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
-        if key[0]:
+        if worth:
             backend = native(loop.function, flags, required=bool(live), calls=moving(problem).cycles_of_call)
         interpreted = moving(problem).cycles_interpreted
         function = backend.function if backend.compiled else chained(loop.function, interpreted, _CHAIN)
-        known[key] = Evaluator(function), backend.compiled, backend.reason
-    result = Simulator(problem, ready, loop, *known[key], settings)
-    if result.remembers:  # it is built anew for every run
-        del known[key]
+        return Evaluator(function), backend.compiled, backend.reason
+
+    if known is None:
+        return Simulator(problem, ready, loop, *made(), settings)
+    key = worth, hashlib.sha256(loop.function.serialize().encode()).digest()
+    code = known.get(key) or made()
+    result = Simulator(problem, ready, loop, *code, settings)
+    if not result.remembers:  # one that does is built anew for every run
+        known[key] = code
     return result
 
 
