@@ -19,6 +19,7 @@ from fpirhc.contraction.spectrum import Spectrum, assess_gain, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.deformation.base import Deformation, Iteration, against_wrappers
 from fpirhc.errors import NotContractive
+from fpirhc.plant.maps import against_parts
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.live import nominal
 from fpirhc.symbolic.queue import every
@@ -271,8 +272,4 @@ def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
             own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"
             yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
     parts = any(c % 1 for c in (*every(mirror.cycles), mirror.measurement))
-    if plant.step is not None and (any(every(mirror.lag)) or parts):
-        yield (
-            f"{type(deformation).__name__}: a map has no lag, and no dead time of parts of a cycle; write an actuator as a state "
-            "of the map, and dead times in whole cycles"
-        )
+    yield from against_parts(plant, type(deformation).__name__, lags=any(every(mirror.lag)), parts=parts)

@@ -30,8 +30,8 @@ from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
 from fpirhc.plant.integrators import spurious_growth
-from fpirhc.plant.maps import over
-from fpirhc.plant.motion import outside_of
+from fpirhc.plant.maps import by_single_steps, steps_in
+from fpirhc.plant.motion import outside_of, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
@@ -333,15 +333,15 @@ def _steps_inside(
 
     Where stages have several lengths, a shorter one stays at its end.
     """
-    if plant.step is None or not horizon.discretisation.steps_maps or not (limits.states or limits.paths):
+    if not horizon.discretisation.steps_maps or not (limits.states or limits.paths):
         return []
-    one, per_stage = over(plant, plant.step), round(horizon.step / plant.step)
+    one, per_stage = by_single_steps(plant), steps_in(plant, horizon.step)
     u, p, x, views = view.input.vector, data["parameters"], view.state.vector, []
-    for k in range(1, round(horizon.longest / plant.step)):
+    for k in range(1, steps_in(plant, horizon.longest)):
         later = one.equations.next(x, u, p, ca.SX.zeros(len(plant.names)))
         x = later if k < per_stage else ca.if_else(k < per_stage * data["length"], later, x)
         state = Named(plant.state.elements, x, "state")
-        views.append(replace(view, state=state, output=_outputs(plant, x, u, p), time=view.time + k * plant.step))
+        views.append(replace(view, state=state, output=_outputs(plant, x, u, p), time=view.time + k * sampling(one)))
     return views
 
 

@@ -215,6 +215,11 @@ def known_exactly(motion: _Motion) -> _Motion:
     return replace(motion, parameters=named)
 
 
+def with_outputs_of(motion: _Motion, model: Motion) -> _Motion:
+    """Return a motion with the outputs of a model; itself where it has the same."""
+    return motion if tuple(motion.outputs) == tuple(model.outputs) else replace(motion, outputs=model.outputs)
+
+
 def outside_names(motion: Motion) -> tuple[str, ...]:
     """Return the names of the parameters that are signals from outside."""
     return tuple(name for name, one in motion.parameters.items() if one.outside)

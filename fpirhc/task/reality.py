@@ -20,7 +20,7 @@ from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, input_reaches_at, relative_order
 from fpirhc.plant.integrators import Integrator, stiffness
 from fpirhc.plant.maps import check_time, over, unlike
-from fpirhc.plant.motion import followed_units, with_exact_parameters
+from fpirhc.plant.motion import followed_units, with_exact_parameters, with_outputs_of
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
 
@@ -307,7 +307,7 @@ class Reality(Checked):
             raise NotSupported(
                 f"the reality has {'; '.join(differences)}: it cannot be the exact model of this controller; leave ExactModel out"
             )
-        return plant if tuple(plant.outputs) == tuple(model.outputs) else replace(plant, outputs=model.outputs)
+        return with_outputs_of(plant, model)
 
     def _own(self, name: str, *, seen: bool) -> str:
         """Its coordinate or output for one of the model."""
