@@ -38,7 +38,7 @@ for name in ("PID", "RHC", "RHC+FPI", "RHC offset-free"):
     axis.plot(run["plant_state.x"], run["plant_state.y"], lw=1, label=name)
 axis.plot(run["reference.x"], run["reference.y"], "k--", lw=1, label="reference")
 axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-axis.legend(loc="upper right")
+axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
 
 # %%
 # Why: the iteration needs the acceleration. A fit to seven pictures gives it 2.5 cycles

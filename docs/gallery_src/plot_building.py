@@ -35,7 +35,7 @@ run = runs["RHC"]
 rooms.plot(run.time, run["reference.room"], "k--", lw=1, label="thermostat")
 signals = {n: one.values for n, one in problem.signals.items()}
 prices.plot(run.time, np.array([float(signals["price"](t)) for t in run.time]))
-rooms.set(ylabel="room [degC]", xlim=(72, 96), ylim=(16, 24))
+rooms.set(ylabel="room [degC]", xlim=(72, 96), ylim=(16, 27))
 rooms.legend(ncol=3)
 heats.set(ylabel="heat [kW]")
 prices.set(ylabel="price [EUR/kWh]", xlabel="time [h]")

@@ -7,6 +7,8 @@ growth, effect and clearance are wrong by a quarter, and from day 40 on the dose
 if it were 1 mg/kg a day larger. The unit of time is the day.
 """
 
+import textwrap
+
 import matplotlib.pyplot as plt
 
 import fpirhc as fp
@@ -51,7 +53,7 @@ for answer in fp.review(task.problem, gentle, mismatch=0.0, seed=0).controllers[
     "gentle"
 ]:
     if answer.verdict.value == "no":
-        print(answer.question, answer.evidence)
+        print(textwrap.fill(f"{answer.question} {answer.evidence}", 85))
 
 # %%
 # A model of third order has the vessels too, and every number of it is wrong. With twenty

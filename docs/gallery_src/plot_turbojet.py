@@ -31,6 +31,10 @@ names = ("RHC", "RHC+FPI, model-referenced", "RHC+FPI", "RHC offset-free")
 task, runs = results("turbojet", (*names, "RHC exact model"))
 thrust, loop = task.pictures
 thrust.draw(plt.figure(figsize=(8, 5), layout="constrained"), runs)
+
+# %%
+# Thrust over throttle: the wrong model reaches other values on the way up and down.
+
 loop.draw(
     plt.figure(figsize=(8, 3), layout="constrained"),
     {name: runs[name] for name in loop.controllers},
