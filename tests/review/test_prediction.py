@@ -18,6 +18,8 @@ from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.review.prediction import nominal_run, response_errors
 from fpirhc.review.response_prediction import majorant, tube
+from fpirhc.simulation.linearise.asked_loop import AskedLoop
+from fpirhc.simulation.model_as_plant import shortened
 
 SCALES = {"two_mass": 20.0, "mrac_pendulum": 50.0}  # m/s^2, rad/s^2; 50 for the others
 
@@ -55,6 +57,67 @@ def test_recursion_predicts_the_loop(which, form, gain):
     real = (respond(run["state"].T, run["command"].T, exact).full().T - run["desired"])[3000:]
     for size in (lambda e: np.abs(e).max(axis=0), lambda e: np.sqrt(np.mean(e**2, axis=0))):
         np.testing.assert_allclose(size(predicted), size(real), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "which"),
+    [("two_mass", "CTC+FPI (eq 3)"), ("two_mass", "RHC+FPI"), ("crane_slots", "RHC+FPI"), ("planar_arm", "CT+FPI")],
+)
+def test_recursion_is_the_loop_led_along_the_nominal_states(name, which):
+    """Commands of the loop itself, whose plant is put at the nominal state after every cycle, to rounding."""
+    task = fp.load_problem(name)
+    problem = replace(shortened(task.problem, 300), disturbances={}, sensing=fp.Sensing())
+    model = nominal_run(problem, task.controllers[which], compiled=False)
+    both = []
+    for exact in (problem.plant.exact, model.believed):
+        both.append(led_along(model, exact, "command"))
+        predicted = response_errors(model, exact=exact).command[: len(both[-1])]
+        np.testing.assert_allclose(predicted, both[-1], rtol=1e-9, atol=1e-9 * np.abs(both[-1]).max())
+    assert np.abs(both[0][:40] - both[1][:40]).max() > 1e-3 * np.abs(both[0]).max()  # not without any adaptation
+
+
+def led_along(model: Any, exact: np.ndarray, name: str) -> np.ndarray:
+    """A signal of the loop whose plant is put at the nominal state after every cycle, to where the loop has come to rest."""
+    loop = AskedLoop(model.problem, model.controller)
+    trace = loop.run(loop.start(exact=exact), model.cycles, model.states[1:]).trace
+    assert len(trace) > 40
+    return trace[:, loop.loop.trace.slice(name)]
+
+
+def test_led_map_answers_as_it_is_led():
+    """The response of a map is its next state, so that a loop led along states shows no response of the plant: see 0092."""
+    task = fp.load_problem("fishery")
+    model = nominal_run(task.problem, task.controllers["CTC+FPI"], compiled=False)
+    both = [led_along(model, exact, "realised") for exact in (task.problem.plant.exact, model.believed)]
+    np.testing.assert_allclose(both[0], both[1], rtol=1e-9)
+    errors = [response_errors(model, exact=exact).error for exact in (task.problem.plant.exact, model.believed)]
+    assert np.abs(errors[0]).max() > 1e6 * np.abs(errors[1]).max()
+
+
+def test_led_plant_shows_the_outputs_of_its_own_parameters():
+    """Which are not those of the nominal run, so that the loop led along its states wants other responses: see 0092."""
+    task = fp.load_problem("anaesthesia")
+    model = nominal_run(shortened(task.problem, 300), task.controllers["CTC+FPI"], compiled=False)
+    right = led_along(model, task.problem.plant.exact, "desired")
+    np.testing.assert_allclose(right, model.desired[: len(right)], rtol=1e-9, atol=1e-9)
+    null = led_along(model, model.believed, "desired")
+    assert np.abs(null - model.desired[: len(null)]).max() > np.abs(model.desired).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "which"), [("fishery", "CTC+FPI"), ("fishery", "RHC+FPI"), ("anaesthesia", "CTC+FPI")]
+)
+def test_recursion_predicts_what_no_led_loop_shows(name, which):
+    """A map, whose state is its response, and a plant of outputs: rms response error of the run within 5 %; see 0092."""
+    task = fp.load_problem(name)
+    problem, tested = replace(task.problem, disturbances={}, sensing=fp.Sensing()), task.controllers[which]
+    run, predicted = fp.simulate(problem, tested, seed=0), response_errors(nominal_run(problem, tested, compiled=False))
+    exact = np.tile(problem.plant.exact, (run.cycles, 1))
+    answers = problem.plant.equations.controlled_response.map(run.cycles)
+    real = answers(run["state"][: run.cycles].T, run["command"][: run.cycles].T, exact.T).full().T
+    error, first = real - run["desired"][: run.cycles], round(problem.measure_from / problem.period)
+    rms = [float(np.sqrt(np.mean(e[first:] ** 2))) for e in (predicted.error, error)]
+    assert rms[0] == pytest.approx(rms[1], rel=0.05)
 
 
 def test_recursion_is_the_formula_on_a_linear_plant():
