@@ -326,6 +326,45 @@ def _adjoint(ocp: OptimalControl, limits: Limited, p: Expansion, push: ca.MX) ->
     return in_reverse(stage.mapaccum("fpirhc_certified_stages", n)(p.tail, *turned)[1], n)
 
 
+def cannot_be_kept(ocp: OptimalControl, limits: Limited, p: Expansion, z: ca.MX, sure: float) -> ca.MX:
+    """Return whether multipliers prove that no inputs within their limits keep the hard limits of states, near this plan.
+
+    Along the model linearised at p the violations are linear in the inputs, and so is
+
+        sum z (violation) = sum -z d + sum lambda' gap + sum g' (u - U),   lambda = A' (lambda + push),   g = B' (lambda + push)
+
+    Where it is above zero even at its least in the box of the inputs, not all violations can be zero (Farkas' lemma). For a linear
+    model this is a proof; for others it holds where the linearisation does. Without a limit of an input nothing is proven.
+
+    Args:
+        sure: share of its summands by which the sum must be above zero.
+    """
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    counted = ca.logic_and(ca.logic_and(limits.present, limits.of_states), limits.hard)
+    y = ca.if_else(counted, ca.fmin(ca.fmax(z, 0), limits.rho), 0)
+    violated = -y * limits.distance(p)
+    shapes = ((ns, 1), (ns, ns), (ns, nu), (ns, 1), (ns, 1))
+    costate, a, b, more, gap = given = [ca.SX.sym(f"c{k}", *shape) for k, shape in enumerate(shapes)]
+    after = costate + more
+    apart, parts = after * gap, b * ca.repmat(after, 1, nu)
+    made = [
+        a.T @ after,
+        ca.sum1(parts).T,
+        ca.sum1(ca.fabs(parts)).T,
+        ca.vertcat(ca.sum1(apart), ca.sum1(ca.fabs(apart))),
+    ]
+    stage = ca.Function("fpirhc_farkas_stage", given, made)
+    gaps, pushed = p.next_states - p.states[:, 1:], limits.on_states(limits.both(-limits.sign * y))
+    turned = [in_reverse(v, n) for v in (p.a, p.b, pushed, gaps)]
+    _, slope, steep, jumps = stage.mapaccum("fpirhc_farkas_stages", n)(ca.MX.zeros(ns), *turned)
+    slope, steep = in_reverse(slope, n), in_reverse(steep, n)
+    low, high = (ca.repmat(v, 1, n) for v in limits.inputs())
+    least = slope * (ca.if_else(slope > 0, low, high) - p.inputs)
+    total = ca.sum1(ca.vec(violated)) + ca.sum1(ca.vec(least)) + ca.sum2(jumps[0, :])
+    size = ca.sum1(ca.vec(ca.fabs(violated))) + ca.sum1(ca.vec(steep * (high - low))) + ca.sum2(jumps[1, :])
+    return ca.logic_and(size <= FINITE, total > sure * size)
+
+
 def largest_gap(p: Expansion, scales: Scales) -> ca.MX:
     """Return the largest |F(X, U) - X+| in units of the states."""
     gaps = ca.fabs(p.next_states - p.states[:, 1:])

@@ -458,9 +458,11 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
     c.left = returned_left(&m, best);
     ok = c.error < FINITE;
   }
-  /* A call that ends at its most iterations may still get inside; one that has tried everything has not. */
+  /* A call that ends at its most iterations may still get inside, unless multipliers prove that it does not; one that has tried
+     everything has not. */
   if (is_done(&c)) status = ok && outside(&m.limits, best) > KEPT_SHARE ? INFEASIBLE : CONVERGED;
-  else status = c.violation > NEAR_LIMIT && m.stuck ? INFEASIBLE : NOT_CONVERGED;
+  else if (c.violation > NEAR_LIMIT && (m.stuck || cannot_be_kept(&m.limits, best, m.room->y.z))) status = INFEASIBLE;
+  else status = NOT_CONVERGED;
   status = empty ? INFEASIBLE : !ok ? NON_FINITE : status;
   if (res[0])
     for (i = 0; i < N * NU; ++i)

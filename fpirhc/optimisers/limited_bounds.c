@@ -111,6 +111,42 @@ static Certificate certified(const Limits* limits, const Point* p, casadi_real z
   return c;
 }
 
+/* Whether multipliers prove that no inputs within their limits keep the hard limits of states, along the model linearised at p: the
+   sum of z times the violations is linear in the inputs, and above zero where it is least (Farkas). */
+static int cannot_be_kept(const Limits* limits, const Point* p, casadi_real z[2][COUNT]) {
+  int side, i, r, k, j, l;
+  casadi_real push[COUNT], costate[NS], before[NS], sum = 0, size = 0;
+  for (k = 0; k < COUNT; ++k) push[k] = 0;
+  EACH_LIMIT(limits) {
+    casadi_real y = r < NU || hard[r - NU] == 0 ? 0 : between(z[side][k], 0, capacity(r));
+    casadi_real violated = -y * distance(limits, p, side, i, r);
+    push[k] -= SIGN(side) * y, sum += violated, size += fabs(violated);
+  }
+  for (j = 0; j < NS; ++j) costate[j] = 0;
+  for (i = N; i-- > 0;) {
+    for (j = 0; j < NB; ++j) costate[place[j]] += push[i * ROWS + NU + j];
+    for (j = 0; j < NS; ++j) {
+      casadi_real gap = costate[j] * (p->f[i * NS + j] - p->x[(i + 1) * NS + j]);
+      sum += gap, size += fabs(gap);
+    }
+    for (l = 0; l < NU; ++l) {
+      casadi_real slope = 0, steep = 0, low = limits->at[0][l], high = limits->at[1][l];
+      for (j = 0; j < NS; ++j) {
+        casadi_real part = p->b[(i * NU + l) * NS + j] * costate[j];
+        slope += part, steep += fabs(part);
+      }
+      sum += slope * ((slope > 0 ? low : high) - p->u[i * NU + l]);
+      size += steep * (high - low);
+    }
+    for (l = 0; l < NS; ++l) {
+      before[l] = 0;
+      for (j = 0; j < NS; ++j) before[l] += p->a[(i * NS + l) * NS + j] * costate[j];
+    }
+    for (j = 0; j < NS; ++j) costate[j] = before[j];
+  }
+  return size <= FINITE && sum > SURE * size; /* without a limit of an input nothing is proven */
+}
+
 /* The largest violation of a hard limit, as a share of its unit. */
 static casadi_real outside(const Limits* limits, const Point* p) {
   int side, i, r, k;

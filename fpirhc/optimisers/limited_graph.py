@@ -16,7 +16,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import Expansion, expand, expansion_shapes, sweep
 from fpirhc.optimisers import limited_settings as constants
 from fpirhc.optimisers.base import FEASIBLE, KEPT, clip, sane, stationarity
-from fpirhc.optimisers.bounds import BOUNDARY, Certified, Interior, certify, largest_gap
+from fpirhc.optimisers.bounds import BOUNDARY, Certified, Interior, cannot_be_kept, certify, largest_gap
 from fpirhc.optimisers.limited_phases import (
     AS_IS,
     BEGINS,
@@ -207,8 +207,9 @@ def _better_in_force(call: Call, s: State, memory: ca.MX, p: Expansion, usable: 
 
 def _status(call: Call, s: State, p: Expansion, c: Certified, ok: ca.MX) -> ca.MX:
     solved = ca.if_else(call.limits.outside(p) > KEPT, int(Status.INFEASIBLE), int(Status.OK))
-    # A call that ends at its most iterations may still get inside; one that has tried everything has not.
-    far = ca.logic_and(c.violation > FEASIBLE, s["stuck"])
+    # A call that ends at its most iterations may still get inside, unless multipliers prove that it does not; one that has tried
+    # everything has not.
+    far = ca.logic_and(c.violation > FEASIBLE, ca.logic_or(s["stuck"], _cannot_be_kept(call, p, s["z"])))
     unsolved = ca.if_else(far, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
     status = ca.if_else(ok, ca.if_else(call.is_done(c), solved, unsolved), int(Status.NON_FINITE))
     return ca.if_else(ca.mmax(call.lower - call.upper) > 0, int(Status.INFEASIBLE), status)
@@ -304,6 +305,10 @@ def _judge_pure(call: Call, s: State, p: Expansion, usable: ca.MX) -> State:
     better = ca.logic_and(halved, s["place_of"] == BEGINS)
     taken = choose(taken, better, {**taken, **as_best(taken)}, taken)
     return choose(s, ok, {**taken, **fixed(accepted=1)}, {**enter_interior(call, s), **fixed(accepted=0)})
+
+
+def _cannot_be_kept(call: Call, p: Expansion, z: ca.MX) -> ca.MX:
+    return cannot_be_kept(call.ocp, call.limits, p, z, constants.SURE)
 
 
 class _Direction:

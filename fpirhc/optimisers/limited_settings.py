@@ -19,6 +19,7 @@ MU_WARM, MU_MOST = 1e-4, 0.1  # barrier parameter of a remembered plan, and how 
 MU_END, MU_LEAST = 1e-5, 1e-15
 MU_ROUNDS = 8  # reductions after one accepted plan
 FILTER = 64  # pairs that the filter holds
+SURE = 1e-9  # of the summands: how far a sum must be above zero to be no rounding
 POOR = 0.1  # share of a step from a remembered plan below which its barrier is raised, at most so often in a call
 MOST_REWARMS = 3
 MOST_RAISES = 12  # of the Levenberg-Marquardt term before another first plan is tried
