@@ -1,6 +1,6 @@
 """What a probe proposes beside a grid of settings by hand: errors over those of the controller alone, on a run of another seed.
 
-.venv/bin/python benchmarks/probing.py                        # all plants, and a late link: five minutes
+.venv/bin/python benchmarks/probing.py                        # all plants, a late link, and bodies that the rule was not made on: six minutes
 .venv/bin/python benchmarks/probing.py two_mass quadrotor
 Option: --late CYCLES, a link before the plant that nobody told; for plants of other packages.
 
@@ -15,13 +15,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from unseen_bodies import BODIES, CONTROLLER
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
 from fpirhc.probing.probe import Trial, tried
 from fpirhc.problem_files.shipped import missing, shipped_groups
 
-# The rule was changed where its choices on the first and the last were poor.
+# The rule was changed where its choices on the first, on the last and on the late link were poor; that of unseen_bodies.py was run once.
 SHIPPED = ("two_mass", "two_link_arm", "van_der_pol")
 LATE = ("quadrotor", (1, 3, 5))  # cycles of its link
 GAINS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.25)
@@ -77,12 +78,16 @@ def main() -> None:
     parser.add_argument("--cycles", type=int, default=400)
     asked = parser.parse_args()
     outside = {name: path for name, path in shipped_groups()["plants of other packages"].items() if not missing(path)}
-    everything = [(name, 0) for name in (*outside, *SHIPPED)] + [(LATE[0], k) for k in LATE[1] if LATE[0] in outside]
+    everything = [(name, 0) for name in (*outside, *SHIPPED, *BODIES)]
+    everything += [(LATE[0], k) for k in LATE[1] if LATE[0] in outside]
     for name, cycles in [(name, asked.late) for name in asked.problems] or everything:
-        task = fp.load_problem(name)
-        problem = late(task.problem, cycles)
         title = f"{name}, {cycles} late" if cycles else name
-        alone = next(c for n, c in task.controllers.items() if n.startswith("RHC"))
+        if name in BODIES:
+            problem, alone = BODIES[name](), CONTROLLER
+        else:
+            task = fp.load_problem(name)
+            problem = late(task.problem, cycles)
+            alone = next(c for n, c in task.controllers.items() if n.startswith("RHC"))
         begun = time.process_time()
         found = fp.probe(problem, alone, cycles=asked.cycles, seed=3)
         took = time.process_time() - begun

@@ -127,11 +127,15 @@ def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> C
 
 def _answer(f: np.ndarray, m: np.ndarray, period: float, fits: list[_Fit], searched: tuple[int, float]) -> Channel:
     best, near = max(fits, key=lambda one: one.likelihood), _near(fits, _ENOUGH * _WIDER**2)
-    within = np.array([one.gains for one in _near(fits, _ENOUGH)])
+    nearest = _near(fits, _ENOUGH)
+    beside = [
+        max((one for one in fits if one.lag == tau), key=lambda one: one.likelihood) for tau in _around(fits, nearest)
+    ]
+    within = np.array([one.gains for one in (*nearest, *beside)])
     half = _WIDER * np.hypot(2 * best.deviation, 0.5 * np.ptp(within, axis=0))
     gains = tuple(Interval(float(g), float(g - h), float(g + h)) for g, h in zip(best.gains, half, strict=True))
     dead = Interval(best.dead, min(one.dead for one in near), max(one.dead for one in near))
-    lag = Interval(best.lag, min(one.lag for one in near), max(one.lag for one in near))
+    lag = Interval(best.lag, *_around(fits, near))
     differences = best.noise[1]
     root = abs(_whitener(sum(best.noise), best.ratio)[-1])
     noise = math.sqrt(best.innovation * root * (2 if differences else 1))
@@ -191,6 +195,13 @@ def _near(fits: Sequence[_Fit], distance: float) -> list[_Fit]:
     """The points whose 2 log L is that near to the best."""
     best = max(one.likelihood for one in fits)
     return [one for one in fits if 2 * (best - one.likelihood) < distance]
+
+
+def _around(fits: Sequence[_Fit], near: Sequence[_Fit]) -> tuple[float, float]:
+    """The searched lags just outside those that are near: the ends of an interval are before these."""
+    low, high = min(one.lag for one in near), max(one.lag for one in near)
+    below, above = (one.lag for one in fits if one.lag < low), (one.lag for one in fits if one.lag > high)
+    return max(below, default=low), min(above, default=high)
 
 
 @cache

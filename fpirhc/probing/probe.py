@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count, Seed
 from fpirhc.probing.identification import Estimates, Interval, identify
 from fpirhc.probing.recording import Record, excited, read_recording
-from fpirhc.probing.rule import DARING, Predicted, Rule, mean_ratio
+from fpirhc.probing.rule import DARING, Predicted, Rule, mean_ratio, steps_of
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
@@ -187,19 +187,19 @@ def probe(
 def _trials(
     problem: Problem, bare: Controller, rule: Rule, shortlist: dict[str, Predicted], notes: list[str], seed: int
 ) -> dict[str, Trial]:
-    """Trials of the shortlist, then of the shares beside the best one, which are added to it, as long as one is better."""
+    """Trials of the shortlist, then of the shares beside the best one, which are added to it, until there are none."""
     results: dict[str, Trial] = {}
-    new, walked = dict(shortlist), set()
+    new = dict(shortlist)
     while True:
-        outcomes = tried(problem, bare, {name: one.deformation for name, one in new.items()}, seed=seed) if new else {}
+        deformations = {name: one.deformation for name, one in new.items()}
+        outcomes = tried(problem, bare, deformations, seed=seed, allowed=rule.allowed) if new else {}
         notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
         results |= {name: one for name, one in outcomes.items() if isinstance(one, Trial)}
         name = best(results)
         if name is None:
             return results
-        beside = {} if name in walked else rule.beside(shortlist[name])
-        walked.add(name)
         known = [one.deformation for one in shortlist.values()]
+        beside = rule.beside(shortlist[name], shortlist.values())
         titled = {f"{name.partition(',')[0]}, share {share:g}": one for share, one in beside.items()}
         new = {title: one for title, one in titled.items() if one.deformation not in known}
         shortlist |= new
@@ -313,20 +313,27 @@ class Trial:
         error: rms error over that of the controller alone, in the mean over the coordinates.
         worst: of any coordinate.
         bears: False where a run with a larger gain, which a daring candidate has to bear, does not pass.
+        calm: whether the steps of its commands are within what is allowed.
     """
 
     error: float
     worst: float
     bears: bool = True
+    calm: bool = True
 
     @property
     def passes(self) -> bool:
-        """Whether it makes the error clearly less, and that of no coordinate more, and bears what it has to."""
-        return self.error <= _WORTH and self.worst <= _WORSE and self.bears
+        """Whether it makes the error clearly less, and that of no coordinate more, is calm, and bears what it has to."""
+        return self.error <= _WORTH and self.worst <= _WORSE and self.bears and self.calm
 
 
 def tried(
-    problem: Problem, controller: Controller, candidates: Mapping[str, Deformation], *, seed: int
+    problem: Problem,
+    controller: Controller,
+    candidates: Mapping[str, Deformation],
+    *,
+    seed: int,
+    allowed: Callable[[Run], np.ndarray] | None = None,
 ) -> dict[str, Trial | str]:
     """Return the trial of every candidate, beside one of the controller alone; of one that the loop refuses, the reason.
 
@@ -335,6 +342,7 @@ def tried(
         controller: with or without a deformation.
         candidates: by name.
         seed: of the runs.
+        allowed: function of the run of the controller alone -> largest rms step of every input; None: any.
     """
     short, bare, names = shortened(problem, LONGEST), without_deformation(controller), weighed(problem, controller)
 
@@ -347,7 +355,8 @@ def tried(
         except FpirhcError as error:
             return str(error)
         pair = errors_of(short, (alone, again), names)
-        return Trial(mean_ratio(short, alone, again, names), max(pair.ratio(n) for n in pair.without))
+        calm = allowed is None or bool((steps_of(again) <= allowed(alone)).all())
+        return Trial(mean_ratio(short, alone, again, names), max(pair.ratio(n) for n in pair.without), calm=calm)
 
     alone = run(bare)
     return {name: trial(deformation) for name, deformation in candidates.items()}

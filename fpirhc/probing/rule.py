@@ -149,7 +149,10 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
 
 
 DARING = ("daring", "prompt")
-"""Candidates that keep their margins at the estimate alone: trials have to show them. The second believes no lateness."""
+"""Candidates that keep their margins at the estimate alone, or begin with the least share: trials have to show them.
+
+The second believes no lateness. With the least share it is offered whatever the estimate says of it, and trials go on from there.
+"""
 
 SHARES = (0.05, 0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
 _RINGING = (4.0, 1.0)  # g / (1 - pole) of the filters
@@ -158,6 +161,7 @@ _FORMS = 2  # model-referenced ones that are searched in full, beside the plain 
 _LARGEST_PRODUCT = 1.99
 _STEPS, _OF_RANGE = 1.5, 0.02  # largest step of a command: times that of the controller alone, or of the input's range
 _NEAR, _WORTH = 1.1, 0.95  # errors that count as equal, and one that is worth an adaptation
+_FINE = 1.1  # ratio of two shares, between which no other is tried
 
 
 @dataclass(frozen=True)
@@ -212,6 +216,11 @@ class Setting:
         return replace(self, share=share, pole=max(1 - share * (1 - self.pole) / self.share, 0.0) if self.pole else 0.0)
 
     @property
+    def form(self) -> Setting:
+        """What it shares with those that differ in their share alone."""
+        return replace(self, share=0.0, pole=_rounded(self.share / (1 - self.pole)) if self.pole else 0.0)
+
+    @property
     def paths(self) -> tuple[str, str]:
         """Where gain and filter pole stand in a controller with this deformation."""
         wrapped = self.referenced or max(self.cycles) > 0
@@ -260,11 +269,13 @@ class Rule:
         self._given = problem
         self._margins = Margins(problem, self.bare, estimates)
         self._simulators: dict[Setting, Simulator] = {}
+        self._predictions: dict[Setting, Predicted] = {}
         noise = [one.noise for one in estimates.channels]
         middle = estimates.dead[1], estimates.lag[1]
         self.problem = estimated_problem(problem, estimates.gains, *middle, estimates.drift, noise)
         self._alone = simulator(self.problem, self.bare, compiled=False).run(seed=0)
-        self._room = self._allowed(chatter)
+        self._chatter = chatter
+        self._room = self.allowed(self._alone)
         self.stable = self._alone.stop is None
 
     def shortlist(self) -> dict[str, Predicted]:
@@ -300,7 +311,7 @@ class Rule:
             "long lag": self._long(),
             "bold": min(safe, key=lambda one: one.steps, default=None),
             DARING[0]: next(filter(self._daring, _few_filters(calm)), None),
-            DARING[1]: next(filter(self._daring, _few_filters(one for one in calm if one.setting.prompt)), None),
+            DARING[1]: next(filter(self._daring, _few_filters(one for one in calm if one.setting.prompt)), self._least),
         }
         different: dict[str, Predicted] = {}
         for name, candidate in chosen.items():
@@ -308,16 +319,26 @@ class Rule:
                 different[name] = candidate
         return different
 
-    def beside(self, one: Predicted) -> dict[float, Predicted]:
-        """Return by share the next smaller and the next larger share of the same form, safe where this one is."""
-        at = SHARES.index(one.setting.share)
-        others = (SHARES[k] for k in (at - 1, at + 1) if 0 <= k < len(SHARES))
-        neighbours = [self._predicted(one.setting.with_share(share)) for share in others]
+    @property
+    def _least(self) -> Predicted | None:
+        """Without lateness, with the least share."""
+        nothing = (0.0,) * len(self.estimates.channels)
+        one = self._predicted(Setting(True, SHARES[0], 0.0, nothing, nothing, 0.0))
+        return one if self._accepted(one) else None
+
+    def beside(self, one: Predicted, tried: Iterable[Predicted]) -> dict[float, Predicted]:
+        """Return by share the next smaller and the next larger share of the same form, safe and calm where this one is safe.
+
+        They are those of the list. Where the next larger one is tried already, it is their geometric mean, down to a ratio of 1.1:
+        an error falls with the share until the loop is lost, so the best one is near that limit.
+        """
+        known = {other.setting.share for other in tried if other.setting.form == one.setting.form}
+        neighbours = [self._predicted(one.setting.with_share(share)) for share in _between(one.setting.share, known)]
         safe = self._safe(one)
         return {
             other.setting.share: other
             for other in neighbours
-            if other.steps <= 1 and (self._safe(other) if safe else self._accepted(other))
+            if (other.steps <= 1 and self._safe(other) if safe else self._accepted(other))
         }
 
     def _daring(self, one: Predicted) -> bool:
@@ -370,6 +391,11 @@ class Rule:
         return one if self._safe(one) else None
 
     def _predicted(self, setting: Setting) -> Predicted:
+        if setting not in self._predictions:
+            self._predictions[setting] = self._prediction(setting)
+        return self._predictions[setting]
+
+    def _prediction(self, setting: Setting) -> Predicted:
         deformation = setting.deformation(self.estimates)
         nothing = Predicted(setting, deformation, math.inf, math.inf)
         try:
@@ -382,7 +408,7 @@ class Rule:
             setting,
             deformation,
             mean_ratio(self.problem, self._alone, run, self._names),
-            float((_steps(run) / self._room).max()),
+            float((steps_of(run) / self._room).max()),
         )
 
     def _run(self, setting: Setting) -> Run:
@@ -395,12 +421,12 @@ class Rule:
         numbers = {gain: setting.gain(self.estimates), pole: _rounded(setting.pole)}
         return self._simulators[form].run(seed=0, settings=numbers)
 
-    def _allowed(self, chatter: float | Mapping[str, float] | None) -> np.ndarray:
-        """Largest rms step of every input."""
-        plant = self._given.plant
+    def allowed(self, alone: Run) -> np.ndarray:
+        """Return the largest rms step of every input, beside a run of the controller alone."""
+        plant, chatter = self._given.plant, self._chatter
         lower, upper = self._given.limits.input_bounds(plant)
         width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-        usual = np.maximum(_STEPS * _steps(self._alone), _OF_RANGE * width)
+        usual = np.maximum(_STEPS * steps_of(alone), _OF_RANGE * width)
         if chatter is None:
             return np.asarray(np.maximum(usual, 1e-300))
         limits = chatter if isinstance(chatter, Mapping) else dict.fromkeys(plant.inputs, chatter)
@@ -430,8 +456,17 @@ def _few_filters(settings: Iterable[Predicted]) -> Iterator[Predicted]:
             yield one
 
 
-def _steps(run: Run) -> np.ndarray:
-    """Rms step of every command, the transient left out."""
+def _between(share: float, known: Iterable[float]) -> Iterator[float]:
+    """The shares that are next to this one and not known."""
+    smaller = max((other for other in {*SHARES, *known} if other < share), default=share)
+    larger = min((other for other in {*SHARES, *known} if other > share), default=share)
+    if larger in known and larger / share > _FINE:
+        larger = float(f"{math.sqrt(larger * share):.2g}")
+    yield from {smaller, larger} - {share, *known}
+
+
+def steps_of(run: Run) -> np.ndarray:
+    """Return the rms step of every command, the transient left out."""
     command = np.asarray(run["command"])
     return np.sqrt(np.mean(np.diff(command[len(command) // 10 :], axis=0) ** 2, axis=0))
 
