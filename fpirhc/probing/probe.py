@@ -187,9 +187,12 @@ def probe(
 def _trials(
     problem: Problem, bare: Controller, rule: Rule, shortlist: dict[str, Predicted], notes: list[str], seed: int
 ) -> dict[str, Trial]:
-    """Trials of the shortlist, then of the shares beside the best one, which are added to it, until there are none."""
+    """Trials of the shortlist, then of the shares beside the best one, which are added to it, until there are none.
+
+    The best one is run with other seeds too, and counts with its largest errors: what rings at times may have been lucky.
+    """
     results: dict[str, Trial] = {}
-    new = dict(shortlist)
+    new, again = dict(shortlist), set()
     while True:
         deformations = {name: one.deformation for name, one in new.items()}
         outcomes = tried(problem, bare, deformations, seed=seed, allowed=rule.allowed) if new else {}
@@ -200,21 +203,50 @@ def _trials(
             return results
         known = [one.deformation for one in shortlist.values()]
         beside = rule.beside(shortlist[name], shortlist.values())
-        titled = {f"{name.partition(',')[0]}, share {share:g}": one for share, one in beside.items()}
+        titled = {f"{name.partition(',')[0]}{_SHARE}{share:g}": one for share, one in beside.items()}
         new = {title: one for title, one in titled.items() if one.deformation not in known}
         shortlist |= new
-        if not new:
-            if not name.startswith(DARING) or _bears_more(problem, bare, shortlist[name].deformation, seed):
+        if not new and name not in again:
+            again.add(name)
+            results[name] = _with_other_seeds(problem, bare, rule, shortlist[name].deformation, results[name], seed)
+        elif not new:
+            if not _walked(name) or _bears_more(problem, bare, shortlist[name].deformation, results[name], seed):
                 return results
             notes.append(f"{name} is not kept: on the plant it does not bear {_MARGIN:g} times its gain")
             results[name] = replace(results[name], bears=False)
 
 
-def _bears_more(problem: Problem, bare: Controller, chosen: Deformation, seed: int) -> bool:
-    """Whether a trial with a larger gain passes."""
+def _with_other_seeds(
+    problem: Problem, bare: Controller, rule: Rule, chosen: Deformation, first: Trial, seed: int
+) -> Trial:
+    """The largest errors of a trial and of two with other seeds."""
+    trials = [first]
+    for other in range(seed + 1, seed + _SEEDS):
+        one = tried(problem, bare, {"": chosen}, seed=other, allowed=rule.allowed)[""]
+        if not isinstance(one, Trial) or one == first:  # nothing is random
+            break
+        trials.append(one)
+    error, worst = max(one.error for one in trials), max(one.worst for one in trials)
+    return replace(first, error=error, worst=worst, calm=all(one.calm for one in trials))
+
+
+def _walked(name: str) -> bool:
+    """Whether a candidate is there because of trials: prediction has not shown that it bears a larger gain."""
+    return name.startswith(DARING) or _SHARE in name
+
+
+def _bears_more(problem: Problem, bare: Controller, chosen: Deformation, own: Trial, seed: int) -> bool:
+    """Whether trials with a larger gain pass, and have no error that is much larger: else the limit is near."""
     louder = chosen.with_effective_gain(_MARGIN * chosen.effective_gain())
-    outcome = tried(problem, bare, {"": louder}, seed=seed)[""]
-    return isinstance(outcome, Trial) and outcome.passes
+    before: Trial | str = ""
+    for other in range(seed, seed + _SEEDS):
+        outcome = tried(problem, bare, {"": louder}, seed=other)[""]
+        if not isinstance(outcome, Trial) or not outcome.passes or outcome.error > _LARGER * own.error:
+            return False
+        if outcome == before:  # nothing is random
+            break
+        before = outcome
+    return True
 
 
 def _recorded(
@@ -301,7 +333,10 @@ def _interval(one: Interval) -> str:
 LONGEST = 2000  # cycles
 _WORSE = 1.03  # largest ratio of any coordinate's error to that of the controller alone
 _WORTH = 0.95
-_MARGIN = 1.4  # times its gain that a daring candidate has to bear in a trial
+_MARGIN = 1.4  # times its gain that a candidate which prediction has not shown to be safe has to bear in a trial
+_LARGER = 1.5  # ratio of its errors with that gain and with its own
+_SHARE = ", share "
+_SEEDS = 3  # of the trials of the best candidate
 _DARED = 0.9  # ratio of errors, from which a candidate that is stable at the estimate alone is kept
 
 
