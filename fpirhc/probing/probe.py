@@ -192,37 +192,42 @@ def _trials(
     The best one is run with other seeds too, and counts with its largest errors: what rings at times may have been lucky.
     """
     results: dict[str, Trial] = {}
-    new, again = dict(shortlist), set()
+    new, proven, again = dict(shortlist), set(), set()
     while True:
         deformations = {name: one.deformation for name, one in new.items()}
         outcomes = tried(problem, bare, deformations, seed=seed, allowed=rule.allowed) if new else {}
         notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
         results |= {name: one for name, one in outcomes.items() if isinstance(one, Trial)}
-        name = best(results)
+        name, new = best(results), {}
         if name is None:
             return results
+        chosen = shortlist[name]
+        if _walked(name) and name not in proven:  # before a larger share is tried
+            proven.add(name)
+            if not _bears_more(problem, bare, chosen.deformation, results[name], seed):
+                notes.append(f"{name} is not kept: on the plant it does not bear {_MARGIN:g} times its gain")
+                lost = [n for n in results if _walked(n) and shortlist[n].setting.is_larger(chosen.setting)]
+                results |= {n: replace(results[n], bears=False) for n in (name, *lost)}
+            continue
         known = [one.deformation for one in shortlist.values()]
-        beside = rule.beside(shortlist[name], shortlist.values())
+        beside = rule.beside(chosen, shortlist.values())
         titled = {f"{name.partition(',')[0]}{_SHARE}{share:g}": one for share, one in beside.items()}
         new = {title: one for title, one in titled.items() if one.deformation not in known}
         shortlist |= new
-        if not new and name not in again:
+        if not new and name in again:
+            return results
+        if not new:
             again.add(name)
-            results[name] = _with_other_seeds(problem, bare, rule, shortlist[name].deformation, results[name], seed)
-        elif not new:
-            if not _walked(name) or _bears_more(problem, bare, shortlist[name].deformation, results[name], seed):
-                return results
-            notes.append(f"{name} is not kept: on the plant it does not bear {_MARGIN:g} times its gain")
-            results[name] = replace(results[name], bears=False)
+            results[name] = _with_other_seeds(problem, bare, rule, {name: chosen.deformation}, results[name], seed)
 
 
 def _with_other_seeds(
-    problem: Problem, bare: Controller, rule: Rule, chosen: Deformation, first: Trial, seed: int
+    problem: Problem, bare: Controller, rule: Rule, chosen: Mapping[str, Deformation], first: Trial, seed: int
 ) -> Trial:
-    """The largest errors of a trial and of two with other seeds."""
+    """The largest errors of a trial of one candidate, and of two with other seeds."""
     trials = [first]
     for other in range(seed + 1, seed + _SEEDS):
-        one = tried(problem, bare, {"": chosen}, seed=other, allowed=rule.allowed)[""]
+        (one,) = tried(problem, bare, chosen, seed=other, allowed=rule.allowed).values()
         if not isinstance(one, Trial) or one == first:  # nothing is random
             break
         trials.append(one)

@@ -220,6 +220,10 @@ class Setting:
         """What it shares with those that differ in their share alone."""
         return replace(self, share=0.0, pole=_rounded(self.share / (1 - self.pole)) if self.pole else 0.0)
 
+    def is_larger(self, other: Setting) -> bool:
+        """Whether it differs from the other one by a larger share alone."""
+        return self.form == other.form and self.share > other.share
+
     @property
     def paths(self) -> tuple[str, str]:
         """Where gain and filter pole stand in a controller with this deformation."""
