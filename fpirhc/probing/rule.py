@@ -325,10 +325,10 @@ class Rule:
 
     @property
     def _least(self) -> Predicted | None:
-        """Without lateness, with the least share."""
+        """Without lateness, with the least share, unless it is known to be too loud."""
         nothing = (0.0,) * len(self.estimates.channels)
         one = self._predicted(Setting(True, SHARES[0], 0.0, nothing, nothing, 0.0))
-        return one if self._accepted(one) else None
+        return one if self._accepted(one) and not 1 < one.steps < math.inf else None
 
     def beside(self, one: Predicted, tried: Iterable[Predicted]) -> dict[float, Predicted]:
         """Return by share the next smaller and the next larger share of the same form, safe and calm where this one is safe.
