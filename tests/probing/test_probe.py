@@ -18,7 +18,7 @@ from fpirhc.probing import probe as probing
 from fpirhc.probing.identification import Channel, delayed, identify
 from fpirhc.probing.probe import Trial, best, tried
 from fpirhc.probing.recording import excited, sequence
-from fpirhc.probing.rule import Rule
+from fpirhc.probing.rule import Rule, _between
 
 KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (1.0, 0, 0.0, 0.05),
@@ -193,6 +193,33 @@ def test_a_daring_candidate_that_bears_no_more_gain_is_told_as_such(monkeypatch)
     assert "bore 1.4 times its gain" in found.why
     assert found.trials["daring"] == Trial(0.5, 1.0, bears=False)
     assert "daring is not kept: on the plant it does not bear 1.4 times its gain" in found.notes
+
+
+def test_shares_between_two_that_are_tried_are_finer_towards_the_larger_one():
+    """The next ones of the list first; then the geometric mean upwards, until two are a tenth apart."""
+    assert set(_between(0.25, {0.25})) == {0.16, 0.4}
+    assert set(_between(0.25, {0.16, 0.25, 0.4})) == {0.32}
+    assert set(_between(0.25, {0.16, 0.25, 0.32, 0.4})) == {0.28}
+    assert set(_between(0.25, {0.16, 0.25, 0.27})) == set()
+    assert set(_between(1.0, {0.65, 1.0})) == set()
+
+
+def test_a_lucky_trial_counts_with_its_worst_seed(monkeypatch):
+    """What rings with one seed and not with another: a choice by one trial would be the one that was lucky."""
+    shortlist = Rule.shortlist
+    monkeypatch.setattr(
+        Rule, "shortlist", lambda rule: dict(zip(("lucky", "steady"), shortlist(rule).values(), strict=False))
+    )
+    errors = {"lucky": {1: 0.1, 2: 0.1, 3: 0.8}, "steady": dict.fromkeys((1, 2, 3), 0.3)}
+    monkeypatch.setattr(Rule, "beside", lambda *_: {})
+    monkeypatch.setattr(
+        probing,
+        "tried",
+        lambda *given, seed, **_: {n: Trial(errors[n][seed], errors[n][seed] + seed / 100) for n in given[2]},
+    )
+    found = fp.probe(body_problem(1.0, 0, 0.0, 0.05), RHC, cycles=100)
+    assert found.why.startswith("steady")
+    assert found.trials["lucky"].error == 0.8
 
 
 def test_no_neighbour_of_the_choice_is_better():
