@@ -26,8 +26,7 @@ favour a large gain. "None holds it" means that even the best has more than ten 
 not there has a dash. An exact model that does not know a disturbance, or has one iteration per plan, is no bound. Within a tenth it
 is a draw.
 Problems that are judged by another figure than an error and have no baseline are not here: `anaesthesia_people`,
-`anaesthesia_drawn`, `anaesthesia_monitor`, `diabetes`, `diabetes_announced`, `diabetes_order_five` and `freeway_coordinated` have
-tables of their own.
+`anaesthesia_drawn`, `anaesthesia_monitor`, `diabetes`, `diabetes_announced` and `diabetes_order_five` have tables of their own.
 
 | problem | quantity | plain | with FPI | best rival | exact model | winner | why |
 |---|---|---|---|---|---|---|---|

@@ -22,7 +22,7 @@ from fpirhc.studies.comparison.entry import plan_every
 
 ROOT = Path(__file__).parents[2] / "problems"
 FILES = sorted([*ROOT.glob("*.py"), *(ROOT / "gallery").glob("*.py"), *(ROOT / "outside").glob("*.py")])
-LONG = ("diabetes", "diabetes_announced", "freeway_coordinated")  # runs without a baseline that take some seconds each
+LONG = ("diabetes", "diabetes_announced")  # runs without a baseline that take some seconds each
 HEAD = "rms error, seed 0"
 
 
