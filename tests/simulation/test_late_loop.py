@@ -53,6 +53,37 @@ def test_radius_and_response_are_those_of_all_eigenvalues(seed, size):
     assert short.opened(0)(frequencies) == pytest.approx(whole.opened(0)(frequencies), rel=1e-8)
 
 
+@pytest.mark.parametrize("count", range(1, 9))
+@pytest.mark.parametrize("angle", [0.0, 0.3])
+def test_poles_that_lie_together_near_the_unit_circle_are_all_counted(count, angle):
+    """So are those of a plant with several slow coordinates, or with several alike that swing, behind a long dead time."""
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    dynamics = 0.9995 * (np.kron(np.eye(count), turn) if angle else np.eye(count))
+    assert waiting(dynamics, 500).radius == pytest.approx(0.9995, abs=1e-8)
+
+
+@pytest.mark.parametrize("poles", [(1.0,), (1.0, 1.0), (-1.0, 0.2), (1.0, -1.0, 0.999)])
+def test_poles_on_the_unit_circle_do_not_decay(poles):
+    """An integrator puts det M = 0 on a point where turns are counted."""
+    assert waiting(np.diag(poles), 500).radius == pytest.approx(1.0, abs=2e-8)
+
+
+def test_lines_of_several_channels_turn_the_determinant_together():
+    """Twenty channels z = 0.9 z^-30 and more have the poles of one; written out, a channel has 30 states."""
+    count, cycles = 20, 30
+    late = tuple(Late(k, cycles, 0.9 * np.eye(count)[k], np.zeros(1)) for k in range(count))
+    loop = replace(waiting(np.zeros((count, count)), 1), late=late)
+    assert loop.radius == pytest.approx(0.9 ** (1 / (cycles + 1)), abs=1e-8)
+
+
+def waiting(dynamics: np.ndarray, cycles: int) -> LateLoop:
+    """A loop with these dynamics, and a delay line that acts on nothing."""
+    size = len(dynamics)
+    nothing = np.zeros((1, size))
+    cycle = LinearCycle(dynamics, np.ones((size, 1)), np.ones((1, size)), nothing)
+    return LateLoop((cycle,), nothing, nothing.T, PERIOD, (Late(0, cycles, np.zeros(size), np.zeros(1)),))
+
+
 def test_a_line_of_a_loop_is_found_in_its_memory():
     """Repetitive control with a period of 60 cycles: written out it has 60 states more."""
     task = fp.load_problem("mrac_pendulum")
@@ -63,9 +94,8 @@ def test_a_line_of_a_loop_is_found_in_its_memory():
     [line] = [np.flatnonzero([name in column for column in loop.loop.memory.columns]) for name in ("lessons",)]
     whole, short = loop.at(memory), loop.late_at(memory, [line])
     assert len(whole.dynamics) - len(short.cycles[0].dynamics) > 55
-    assert short.radius == pytest.approx(
-        whole.radius, abs=2e-5
-    )  # three poles of the law lie together, which rounding parts
+    rounding = 2e-5  # three poles of the law lie together, which rounding parts
+    assert short.radius == pytest.approx(whole.radius, abs=rounding)
     frequencies = np.pi / problem.period * np.linspace(0.0123, 0.987, 40)
     assert short.opened(0)(frequencies) == pytest.approx(whole.opened(0)(frequencies), rel=1e-4)
     with pytest.raises(NoAnswer, match="delay line of 59 cycles"):

@@ -5,7 +5,8 @@ cycles ago, and its poles are the zeros of
 
     det M(z),    M(z) = z I - F0 - sum_j f_j e_j' z^(-l_j).
 
-Their number outside a circle is n less the turns of det M along it, by the argument principle: far away det M(z) is z^n.
+Their number outside a circle is n less the turns of det M along it, by the argument principle: far away det M(z) is z^n. A pole on
+the circle counts as one outside.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from fpirhc.errors import NoAnswer
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 
 _TOGETHER = 4096  # matrices at once
-_PER_TURN = 8  # points of a circle for a turn of the longest line
+_PER_TURN = 8  # points of a circle for a turn of all lines together
 _LEAST = 512  # points of half a circle
-_SAFE = math.pi / 2  # turn between two points, from which there are more between them
+_SAFE = math.pi / 2  # change of log det M between two points, from which there are more between them and beside them
 _HALVINGS = 30
 _EDGE = 1e-8  # relative error of a radius
 _DEEPEST = 200.0  # -log of what the longest line makes of a decaying mode, beyond which numbers end
@@ -61,6 +62,11 @@ class LateLoop(LinearLoop):
     def longest(self) -> int:
         """Cycles of the longest delay."""
         return max((one.cycles for one in self.late), default=0)
+
+    @property
+    def _waiting(self) -> int:
+        """Cycles of all lines together, which det M turns by at most while z turns once."""
+        return sum({one.place: one.cycles for one in sorted(self.late, key=lambda one: one.cycles)}.values())
 
     @cached_property
     def radius(self) -> float:
@@ -128,28 +134,38 @@ class LateLoop(LinearLoop):
             matrices[:, :, later.place] -= later.dynamics * (points**-later.cycles)[:, None]
         return matrices
 
-    def _signs(self, points: np.ndarray) -> np.ndarray:
-        """The sign det M / |det M| at some points."""
-        return np.concatenate([np.linalg.slogdet(self._matrices(points[some]))[0] for some in _parts(len(points))])
+    def _determinants(self, points: np.ndarray) -> np.ndarray:
+        """The sign det M / |det M|, and log |det M|, at some points, shape (2, number)."""
+        return np.hstack([np.array(np.linalg.slogdet(self._matrices(points[some]))) for some in _parts(len(points))])
 
-    def _outside(self, logarithm: float) -> int:
-        """The number of poles outside the circle with this logarithm of its radius: n less the turns of det M along it."""
+    def _outside(self, logarithm: float) -> bool:
+        """Whether a pole lies on the circle with this logarithm of its radius, or outside: n less the turns of det M along it."""
         signs = self._half(logarithm)
+        if not signs.all():
+            return True
         turns = float(np.angle(signs[1:] / signs[:-1]).sum()) / math.pi  # of half a circle, the other one is its mirror
-        return len(self.cycles[0].dynamics) - round(turns)
+        return len(self.cycles[0].dynamics) != round(turns)
 
     def _half(self, logarithm: float) -> np.ndarray:
-        """Signs of det M at points of the upper half of a circle, close enough to count turns."""
-        angles = np.linspace(0.0, math.pi, max(_LEAST, _PER_TURN * self.longest // 2) + 1)
-        signs = self._signs(np.exp(logarithm + 1j * angles))
+        """Signs of det M at points of the upper half of a circle, close enough to count turns; a zero ends it.
+
+        Several poles together turn det M by a whole turn within a short way, which two signs do not show. Its size does, there or
+        in the next interval.
+        """
+        angles = np.linspace(0.0, math.pi, max(_LEAST, _PER_TURN * self._waiting // 2) + 1)
+        found = self._determinants(np.exp(logarithm + 1j * angles))
         for _ in range(_HALVINGS):
-            wide = np.flatnonzero(np.abs(np.angle(signs[1:] / signs[:-1])) > _SAFE)
+            if not found[0].all():
+                break
+            moved = np.hypot(np.angle(found[0, 1:] / found[0, :-1]), np.diff(found[1].real))
+            moved = np.pad(moved, 1)
+            wide = np.flatnonzero(np.maximum(np.maximum(moved[:-2], moved[2:]), moved[1:-1]) > _SAFE)
             if not wide.size:
                 break
             between = (angles[wide] + angles[wide + 1]) / 2
-            more = self._signs(np.exp(logarithm + 1j * between))
-            angles, signs = np.insert(angles, wide + 1, between), np.insert(signs, wide + 1, more)
-        return signs
+            more = self._determinants(np.exp(logarithm + 1j * between))
+            angles, found = np.insert(angles, wide + 1, between), np.insert(found, wide + 1, more, axis=1)
+        return np.asarray(found[0])
 
 
 def _parts(count: int) -> list[slice]:
