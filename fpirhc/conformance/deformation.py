@@ -184,9 +184,8 @@ def only_desired_is_fixed(trial: _Trial, generator: np.random.Generator) -> None
         moved = np.asarray(trial.scalar_function(request, responses, desired, trial.layout.start())[0].full())
         steps = moved - request[:, None]
         lengths = np.linalg.norm(steps, axis=0)
-        begin = int(
-            np.argmax(lengths > _SEEN * trial.amplitude)
-        )  # below it a step drowns in the rounding of the request
+        # A shorter step drowns in the rounding of the request.
+        begin = int(np.argmax(lengths > _SEEN * trial.amplitude))
         along = steps[:, begin] @ steps[:, begin:] / lengths[begin]
         lost = along <= _FADES * np.maximum.accumulate(lengths[begin:])
         where = sizes[begin + int(np.argmax(lost))]

@@ -285,6 +285,20 @@ def solution_stays(trial: Trial, generator: np.random.Generator) -> None:
     hold(later.status == Status.OK, f"from the shifted plan of the stage before its status is {later.status.name}")
 
 
+def near_plan_is_alike(trial: Trial, generator: np.random.Generator) -> None:
+    """`near_plan` has the same memory and stays at the same solution, so a linear loop may go on from a plan of the optimiser."""
+    task, state = trial.linear, generator.normal(size=2)
+    near = replace(task, optimiser=trial.optimiser.near_plan)
+    own, other = ([(s.name, s.elements, s.entry_kinds) for s in one.layout.signals] for one in (task, near))
+    hold(own == other, f"the memory of near_plan is {list(near.layout.names)}, its own is {list(task.layout.names)}")
+    solved = task.solved(state)
+    again = near.called(state, solved.memory)
+    change = float(np.abs(again.inputs - solved.inputs).max())
+    allowed = 2 * _SLACK * task.reach * trial.tolerance + 1e-9
+    hold(within(change, allowed), f"near_plan moves a solution by {change:.3g}, allowed is {allowed:.3g}")
+    hold(again.status == Status.OK, f"called at a solution the status of near_plan is {again.status.name}")
+
+
 LAWS = (
     frozen_value,
     remembers_a_plan,
@@ -300,4 +314,5 @@ LAWS = (
     nan_is_told,
     poisoned_memory_is_forgotten,
     solution_stays,
+    near_plan_is_alike,
 )

@@ -79,9 +79,8 @@ class FeedforwardOnly(Undeformed):
         def step(s: Signals) -> dict[str, Expression]:
             nominal = reference_state(plant, s.reference) if known else s.state
             command = inverse(nominal, s._reference_response, s.parameters)
-            finite = is_finite(
-                s.state
-            )  # a bad measurement changes no command here, and is a bad measurement all the same
+            # A bad measurement changes no command here, and is a bad measurement all the same.
+            finite = is_finite(s.state)
             return {
                 "nominal": s._reference_response,
                 "desired": s._reference_response,

@@ -25,9 +25,8 @@ from fpirhc.task.problem import Problem
 
 AGAIN = 100 * FINITE  # time of a cycle that is given once more: no number that fits, and no cycle that is missing
 BRIDGED = 50  # cycles: the longest gap that is bridged, where nobody states another
-MISSING = Signal(
-    "missing_cycles", start=(-1.0,)
-)  # in the memory: cycles since the last sample; -1 before the first one
+# In the memory: cycles since the last sample; -1 before the first one.
+MISSING = Signal("missing_cycles", start=(-1.0,))
 _STILL = Signal("still_settling")  # in the memory: cycles for which what was learned is held
 
 
@@ -395,9 +394,8 @@ class Gate:
         """(memory to keep, trace, command, whether the step is fine); scalar code is evaluated, and its results are selected."""
         inner, opaque, remembered = self.inner, self.inner.opaque, memory
         if "memory" not in self.trusted:
-            remembered = ca.if_else(
-                usable, memory, ca.DM(inner.memory.start()), opaque
-            )  # of a graph it is copied as a whole
+            # Of a graph it is copied as a whole.
+            remembered = ca.if_else(usable, memory, ca.DM(inner.memory.start()), opaque)
         memory_next, trace, command = inner.function.call([remembered, *sample], opaque, False)
         skipped = memory if opaque else self._waited(memory, sample, passes)
         after, fine = outcome(memory_next, skipped, command, trace, inner.trace, fits, opaque=opaque)

@@ -41,10 +41,9 @@ _ALWAYS_DATA = (
 _IN_TABLES = ("sensing", "disturbances")  # of what Python makes tables before a run
 _NUDGES, _SMALLEST = (0.07, 2.0), 1e-3  # shares by which a number is changed to see whether the loop depends on it
 _OF_INPUTS = "limits.inputs."
-_REACHES, _CLOSE = (
-    (1.0, 1e1, 1e2, 1e4, 1e8, 1e16, 1e32, 1e64, 1e128, 1e256),
-    1e-6,
-)  # of the search for bounds, in the number's size
+# Of the search for bounds, in the number's size.
+_REACHES = (1.0, 1e1, 1e2, 1e4, 1e8, 1e16, 1e32, 1e64, 1e128, 1e256)
+_CLOSE = 1e-6
 Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
 
 

@@ -60,7 +60,10 @@ class Optimiser(Checked, ABC):
 
     @property
     def near_plan(self) -> Optimiser:
-        """The optimiser as it improves a plan that it has solved and remembers, without what looks for other plans."""
+        """The optimiser as it improves a plan that it has solved and remembers, without what looks for other plans.
+
+        Its memory is laid out alike.
+        """
         return self
 
     def longer(self, times: int) -> Optimiser | None:

@@ -48,6 +48,10 @@ class Ladder(Optimiser):
     def logged(self) -> Mapping[str, str]:
         return {"second_plans": _COUNT}
 
+    @property
+    def near_plan(self) -> Optimiser:
+        return Ladder(self.first.near_plan, self.second.near_plan)
+
     def check(self, ocp: OptimalControl) -> None:
         self.first.check(ocp)
         self.second.check(ocp)

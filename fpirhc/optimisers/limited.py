@@ -90,9 +90,8 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings, iterations: str = ""
     texts.insert(1, linearise)
     sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
     constants = {**sizes, **_constants(settings, measures), "ITERATIONS": iterations or settings.iterations}
-    return Driver(
-        "\n".join(texts), leaves, constants, _room(ocp, measures), in_place=(4, 2), side_by_side=False
-    )  # the memory
+    memory = (4, 2)
+    return Driver("\n".join(texts), leaves, constants, _room(ocp, measures), in_place=memory, side_by_side=False)
 
 
 def _room(ocp: OptimalControl, measures: Scales) -> int:

@@ -25,10 +25,8 @@ MOST_REWARMS = 3
 MOST_RAISES = 12  # of the Levenberg-Marquardt term before another first plan is tried
 ROUNDING = 1e-12  # of the cost: smaller differences are rounding
 LEAST_DAMPING = 1e-7  # of the Levenberg-Marquardt term of descents, and of the fall that a plan of theirs must bring
-NEARLY, ABOVE = (
-    1.1,
-    2.0,
-)  # the price of gaps of a descent, in units of the largest costate: at least, and where it must rise
+# The price of gaps of a descent, in units of the largest costate: at least, and where it must rise.
+NEARLY, ABOVE = 1.1, 2.0
 ROLLED, REFERENCE = 1, 2  # first plans after the state held: the inputs rolled out, and the reference
 DESCENT, LAST_START = 3, 4  # and for descents, where all of these failed: the reference, and the state held
 

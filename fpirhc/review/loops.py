@@ -207,9 +207,8 @@ class Points:
         )
         times = grid.times[place] + grid.problem.period * np.arange(1, self._cycles + 1)
         led = grid.states_at(times) + (state - grid.states[place])
-        whole = np.full(
-            (self._cycles, asked.problem.real_plant.state.size), np.nan
-        )  # what the model lacks moves by itself
+        # What the model lacks moves by itself.
+        whole = np.full((self._cycles, asked.problem.real_plant.state.size), np.nan)
         whole[:, list(known.values())] = led[:, list(known)]
         return asked.quietest(asked.run(start, self._cycles, whole, self._fixed_point(state, command)))
 

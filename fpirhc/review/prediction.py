@@ -195,9 +195,8 @@ def _recursion(nominal: NominalRun, deformation: Deformation) -> tuple[Composite
     return step, Evaluator(step.function.mapaccum(f"{step.function.name()}_run", _CALL, {"base": 5}))
 
 
-_RECURSIONS: Latest[tuple[Composite, Evaluator]] = Latest(
-    8
-)  # with the exact parameters and with those of a right model
+# With the exact parameters and with those of a right model.
+_RECURSIONS: Latest[tuple[Composite, Evaluator]] = Latest(8)
 
 
 def _answer_block(plant: Plant) -> Block:

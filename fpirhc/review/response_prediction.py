@@ -234,9 +234,8 @@ def _impulses(loop: LinearLoop, gain: np.ndarray, shown: np.ndarray, cycles: int
     """|h_j| (j, ny, n): the motion of the outputs after a unit of the responses over one cycle."""
     if loop.radius >= 1:
         raise NoAnswer("no tube: the loop does not converge even with the right model")
-    sizes = np.abs(shown @ loop.impulses(np.linalg.inv(gain), cycles)).max(
-        axis=0
-    )  # of all cycles of a period in which the unit may come
+    # The largest of all cycles of a period in which the unit may come.
+    sizes = np.abs(shown @ loop.impulses(np.linalg.inv(gain), cycles)).max(axis=0)
     lasting = sizes.max(axis=(1, 2)) >= _GONE * sizes.max()
     return np.asarray(sizes[: int(np.flatnonzero(lasting).max(initial=0)) + len(loop.cycles)])
 

@@ -244,9 +244,8 @@ def _kept(size: int) -> ca.Function:
     new, old, good = ca.MX.sym("new", size), ca.MX.sym("old", size), ca.MX.sym("good")
     driver = Driver(_KEPT, {}, {"SIZE": size}, in_place=(0, 0))
     fine = _none_large(new)
-    kept = ca.if_else(
-        ca.logic_and(good, fine), new, old, True
-    )  # a short circuit copies; else every entry is selected by itself
+    # A short circuit copies; else every entry is selected by itself.
+    kept = ca.if_else(ca.logic_and(good, fine), new, old, True)
     return with_driver("fpirhc_kept", driver, lambda name: ca.Function(name, [new, old, good], [kept, fine]))
 
 

@@ -24,9 +24,8 @@ import numpy as np
 
 from fpirhc.errors import NotSupported
 
-_ROUNDING = 16 * float(
-    np.finfo(float).eps
-)  # of an operation with its coefficients, or of a function of the standard library
+# Of an operation with its coefficients, or of a function of the standard library.
+_ROUNDING = 16 * float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
 
 

@@ -34,11 +34,8 @@ PARAMETERS = {
     _APPROXIMATE: "what the controllers know",
     _KNOWN: "both: what moves has it, and the controllers know it",
 }
-_OWN = (
-    "plant",
-    "start",
-    "name",
-)  # fields of a problem that no path begins with: parameters and the start have words of their own
+# Fields of a problem that no path begins with: parameters and the start have words of their own.
+_OWN = ("plant", "start", "name")
 
 
 @dataclass(frozen=True, eq=False)

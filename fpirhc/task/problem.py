@@ -39,12 +39,8 @@ from fpirhc.task.reference import Reference
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _TRIED = 8  # states near the start, at which an input may have an effect that it lacks there
-_OF_EXACT = (
-    "truth",
-    "real_start",
-    "start_output",
-    "of_equations",
-)  # cached properties that depend on the exact parameters
+# Cached properties that depend on the exact parameters.
+_OF_EXACT = ("truth", "real_start", "start_output", "of_equations")
 _INSTANTS = 101  # at which signals from outside are tried before a run
 
 

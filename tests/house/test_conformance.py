@@ -191,6 +191,11 @@ class Dishonest(Optimiser):
     settings: list[float] | None = None
     within: Optimiser = SETTLED
 
+    @property
+    def near_plan(self):
+        changed = {"wider near a plan": fp.Ladder(self.within, self.within), "off near a plan": Dishonest("off")}
+        return changed.get(self.change, self)
+
     def memory(self, ocp):
         return self.within.memory(ocp)
 
@@ -239,6 +244,8 @@ class Dishonest(Optimiser):
         (Dishonest("never feasible"), optimiser_laws.infeasible_is_told),
         (Dishonest("hides NaN"), optimiser_laws.nan_is_told),
         (Dishonest("poisoned"), optimiser_laws.poisoned_memory_is_forgotten),
+        (Dishonest("wider near a plan"), optimiser_laws.near_plan_is_alike),
+        (Dishonest("off near a plan"), optimiser_laws.near_plan_is_alike),
     ],
     ids=lambda v: getattr(v, "change", None),
 )

@@ -123,9 +123,8 @@ def window_weights(plant: Plant, order: int, length: int, period: float) -> tupl
     outputs = math.factorial(order) * np.linalg.pinv(polynomials)[0]
     chain = step_of(plant, np.eye(order + 1, k=1), period)  # (y, y', ..., held input) one cycle later
     powers = [np.linalg.matrix_power(chain[:order, :order], k) for k in range(length)]
-    pulse = np.array(
-        [0.0, *((m @ chain[:order, order])[0] for m in powers)]
-    )  # y after a pulse of one cycle, by its age
+    # y after a pulse of one cycle, by its age.
+    pulse = np.array([0.0, *((m @ chain[:order, order])[0] for m in powers)])
     inputs = np.array([sum(outputs[j] * pulse[m - j + 1] for j in range(m + 1)) for m in range(length)])
     return outputs, inputs
 

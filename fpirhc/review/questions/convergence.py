@@ -246,10 +246,8 @@ def box_converges(case: Case) -> Answer:
         return Answer(BOX, Verdict.UNKNOWN, f"no linear loop: {own.reason}")
     # Without draws the box is a point: approximate and exact parameters are the same.
     radii = np.array([one.radius for one in loops_over_box(grid, case.controller, own) or own.loops])
-    share, worst = (
-        float((radii < 1).mean()),
-        max(float(radii.max()), float(own.radii.max())),
-    )  # the box has its middle too
+    share = float((radii < 1).mean())
+    worst = float(max(radii.max(), own.radii.max()))  # the box has its middle too
     draws = f"{len(radii)} draw{'s' * (len(radii) > 1)}"
     text = f"in {100 * share:.3g} % of {draws}; the worst mode is multiplied by {worst:.6g} per cycle"
     numbers = {"share": share, "radius": worst}

@@ -342,11 +342,8 @@ def chatter_small(case: Case) -> Answer | None:
     share = float(np.max(rms / (upper - lower)))
     units = dict(zip(problem.plant.inputs, problem.plant.input.units, strict=True))
     text = "rms step per cycle from noise: " + ", ".join(f"{i} {v:.3g}{with_space(units[i])}" for i, v in steps.items())
-    text += (
-        f"; {in_percent(share)} of the range between limits, and less than {in_percent(SMALL)} is small"
-        if share > 0
-        else ""
-    )
+    if share > 0:
+        text += f"; {in_percent(share)} of the range between limits, and less than {in_percent(SMALL)} is small"
     numbers = {f"step_{i}": v for i, v in steps.items()} | {"share_of_limits": share}
     if share < SMALL:
         return Answer(CHATTER, Verdict.YES, text, "", numbers)

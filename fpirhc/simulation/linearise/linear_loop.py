@@ -13,9 +13,8 @@ from functools import cached_property, reduce
 import numpy as np
 
 NEUTRAL = 1e-6  # distance of |pole| from 1, where a mode neither decays nor grows
-_MANY = (
-    60  # states, from which a triangle is quicker than a solution for every frequency, and the import of scipy.linalg
-)
+# States, from which a triangle and the import of scipy.linalg are quicker than a solution for every frequency.
+_MANY = 60
 _DOUBLINGS, _OVER = 16, 1e-12  # of a sum over periods, and what is left of a state where it is over
 _SHOWN = 1e-6  # share of a judged error in an eigenvector, in scales
 
@@ -122,10 +121,8 @@ class LinearLoop:
         left, right = c @ turn, turn.conj().T @ g
 
         def response(frequencies: np.ndarray) -> np.ndarray:
-            points, states = (
-                np.exp(1j * frequencies * self.period),
-                np.zeros((len(form), len(frequencies)), dtype=complex),
-            )
+            points = np.exp(1j * frequencies * self.period)
+            states = np.zeros((len(form), len(frequencies)), dtype=complex)
             for k in reversed(range(len(form))):
                 states[k] = (right[k] + form[k, k + 1 :] @ states[k + 1 :]) / (points - form[k, k])
             return np.asarray(-left @ states)
@@ -283,8 +280,7 @@ def _queued(one: LinearCycle, some: list[int], width: int) -> LinearCycle:
 
 def _seen(rows: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Largest share of a row, of length 1, in each vector."""
-    rows = rows / np.maximum(
-        np.abs(rows).max(axis=1, keepdims=True), 1e-300
-    )  # squares of a loop that runs away overflow
+    # Squares of a loop that runs away overflow.
+    rows = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True), 1e-300)
     lengths = np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     return np.asarray(np.abs((rows / lengths) @ vectors).max(axis=0))
