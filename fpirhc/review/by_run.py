@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.prediction import TRIED
 from fpirhc.review.question import SEE_CONVERGENCE, Case
 
 _LEAVE = "Lower the gain, use another form, or leave the deformation out."
 _FREE = "Run it where the commands are free."
+_ENDS = "Find out why the run ends early."
 
 
 def by_run(case: Case, question: str, reason: str) -> Answer:
@@ -35,5 +38,7 @@ def by_run(case: Case, question: str, reason: str) -> Answer:
         return Answer(question, Verdict.YES, text, "", numbers)
     if pair.fails and (whole or not learns):
         return Answer(question, Verdict.NO, text, SEE_CONVERGENCE if case.diverges else _LEAVE, numbers)
+    if not all(map(math.isfinite, pair.adapted.values())):
+        return Answer(question, Verdict.UNKNOWN, text, _ENDS, numbers)
     longer = "Compare it over several scenarios." if whole else "Run it for longer and compare."
     return Answer(question, Verdict.UNKNOWN, text, longer, numbers)

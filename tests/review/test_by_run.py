@@ -15,11 +15,11 @@ from fpirhc.simulation.trials import ErrorPair
 class Told:
     """What `by_run` asks of a case, with errors of 1 m without adaptation on a range of 10 m."""
 
-    def __init__(self, error: float, *, learns: bool, whole: bool, at_limit: float = 0.0) -> None:
+    def __init__(self, error: float, *, learns: bool, whole: bool, at_limit: float = 0.0, without: float = 1.0) -> None:
         self.problem = self.controller = self
         self.deformation, self.learns, self.diverges = None, learns, False
         self.cycles = TRIED if whole else TRIED + 1
-        self._pair = ErrorPair({"q": 1.0}, {"q": error}, {"q": 10.0}, {"q": "m"}, at_limit)
+        self._pair = ErrorPair({"q": without}, {"q": error}, {"q": 10.0}, {"q": "m"}, at_limit)
 
     def trial(self, _: object) -> tuple[ErrorPair, ErrorPair]:
         return self._pair, self._pair
@@ -48,3 +48,11 @@ def test_advice_fits_the_run():
     stuck = answer(0.9, at_limit=0.9)
     assert stuck.verdict == "unknown"
     assert "not informative" in stuck.evidence
+
+
+@pytest.mark.parametrize("without", [1.0, float("inf")])
+def test_a_run_that_ends_early_is_not_to_be_longer(without):
+    """Where both end there is no smaller error either; what learns may still learn, but not in a run that has ended."""
+    one = answer(float("inf"), without=without, learns=True)
+    assert one.verdict == "unknown"
+    assert one.change == "Find out why the run ends early."
