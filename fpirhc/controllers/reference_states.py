@@ -109,12 +109,19 @@ class Scale:
 def largest_response(problem: Problem) -> tuple[float, ...]:
     """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
 
-    It is rounded up to a power of two, so that most starts have one loop. It is infinite too where the states that belong to the
+    It is rounded up by less than a tenth, so that many starts have one loop. It is infinite too where the states that belong to the
     reference are not known before a run.
     """
     free = (float("inf"),) * len(problem.plant.controlled_names)
     largest = response_scale(problem).largest if problem.plant.equations.known_on_reference else free
-    return tuple(2.0 ** math.ceil(math.log2(value)) if math.isfinite(value) else value for value in largest)
+    return tuple(_rounded_up(value) if 0 < value < math.inf else value for value in largest)
+
+
+def _rounded_up(value: float) -> float:
+    return float(2.0 ** (math.ceil(_STEPS * math.log2(value)) / _STEPS))
+
+
+_STEPS = 8  # per doubling
 
 
 @lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison

@@ -124,7 +124,7 @@ def test_without_its_bound_the_law_does_not_return():
 
 
 def test_the_largest_response_is_that_of_the_limits():
-    """Q'' of either mass by its own force alone, and the model's coupling, at one place along the reference."""
+    """Q'' of either mass by its own force alone, and the model's coupling, at one place along the reference, rounded up."""
     largest = largest_response(PROBLEM)
     reference = PROBLEM.reference.function(PLANT)
     sizes = []
@@ -133,7 +133,7 @@ def test_the_largest_response_is_that_of_the_limits():
         corners = [(a, b) for a in PROBLEM.limits.inputs["Fa"] for b in PROBLEM.limits.inputs["Fb"]]
         sizes.append([np.asarray(PLANT.equations.controlled_response(x, u, PLANT.approximate).full()) for u in corners])
     # The two forces act on their own masses alone here, so the bound is attained to the spread of the samples.
-    assert np.abs(sizes).max(axis=(0, 1)).ravel() == pytest.approx(np.array(largest), rel=0.05)
+    assert np.abs(sizes).max(axis=(0, 1)).ravel() * 2 ** (1 / 16) == pytest.approx(np.array(largest), rel=0.05 + 1 / 16)
     assert (np.abs(sizes).max(axis=(0, 1)).ravel() <= np.array(largest) * (1 + 1e-9)).all()
     free = replace(PROBLEM, limits=fp.Limits(inputs={"Fa": (-30.0, 30.0)}))
     assert largest_response(free) == (np.inf, np.inf)
