@@ -153,24 +153,33 @@ class Lanes:
     def values(self, runs: Sequence[OneRun]) -> list[Values | None]:
         """Return the metrics of some runs; None for one that the ordinary loop has to run: it ends early, or nothing is summed up.
 
-        Every run has its own noise, that which the ordinary loop draws for its seed. Runs of one call have one duration.
+        Every run has its own noise, that which the ordinary loop draws for its seed. Runs of one call have one duration and one
+        first measured cycle.
         """
+        starts = [self._start_of(one.problem) for one in runs]
+        places = [k for k, start in enumerate(starts) if start is not None]
         first, kept = runs[0].problem, self._sums.kept.size
-        try:
-            begun = np.array([self._sums.start(one.problem) for one in runs])
-        except NoCode:
-            return [None] * len(runs)
         size = sum(table.shape[1] for table in run_tables(first, runs[0].seed, 1)) + kept
         most = max(self._library.lanes, _ROOM // (8 * first.cycles * max(size, 1)))
-        result: list[Values | None] = []
-        for at in range(0, len(runs), most):
-            some = runs[at : at + most]
+        result: list[Values | None] = [None] * len(runs)
+        for at in range(0, len(places), most):
+            now = places[at : at + most]
+            some = [runs[k] for k in now]
+            begun = np.array([starts[k] for k in now])
             reads = np.array([_tables(one.problem, one.seed) for one in some])
             memories = np.array([one.memory for one in some])
-            sums, bad, log = self._library.results(first, memories, begun[at : at + most], reads, kept)
-            found = self._sums.values(first, sums, log, some[0].seed)
-            result += [None if ended else value for ended, value in zip(bad, found, strict=True)]
+            sums, bad, log = self._library.results(first, memories, begun, reads, kept)
+            found = self._sums.values([one.problem for one in some], [one.seed for one in some], sums, log)
+            for k, ended, value in zip(now, bad, found, strict=True):
+                result[k] = None if ended else value
         return result
+
+    def _start_of(self, problem: Problem) -> np.ndarray | None:
+        """The first sums of a run; None where the problem does not say before a run what they need."""
+        try:
+            return self._sums.start(problem)
+        except NoCode:
+            return None
 
     def of_parameters(self, exact: np.ndarray, seed: int) -> tuple[dict[str, Mapping[str, np.ndarray]], np.ndarray]:
         """Return the metrics of plants with one noise, by name and element, and which ones the ordinary loop has to run.

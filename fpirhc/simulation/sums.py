@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -76,17 +76,23 @@ class Sums:
         after = ca.vertcat(*(ca.densify(one.step(part, cycle)) for one, part in parts))
         return ca.Function("fpirhc_sums", [memory, trace, when], [after, ca.densify(ca.vertcat(*kept, ca.SX(0, 1)))])
 
-    def values(self, problem: Problem, sums: np.ndarray, log: np.ndarray, seed: int) -> list[Values | None]:
-        """Return the metrics of some runs of one duration; None for one that left a range.
+    def values(
+        self, problems: Sequence[Problem], seeds: Sequence[int], sums: np.ndarray, log: np.ndarray
+    ) -> list[Values | None]:
+        """Return the metrics of some runs; None for one that left a range.
 
         Args:
-            problem: one of theirs.
+            problems: of the runs; all have one duration and one first measured cycle.
+            seeds: of their noise.
             sums: last memories, shape (runs, size).
             log: what was kept, shape (runs, cycles, kept.size).
-            seed: for the runs' names alone.
         """
-        columns, outside = self.columns(problem, sums)
-        return [None if outside[k] else self._row(k, problem, columns, log[k], seed) for k in range(len(sums))]
+        columns, outside = self.columns(problems[0], sums)
+        runs = [
+            Run(one.name, "", seed, one.period, self.kept, rows, None, True, {})
+            for one, seed, rows in zip(problems, seeds, log, strict=True)
+        ]
+        return [None if outside[k] else self._row(k, problems[k], columns, run) for k, run in enumerate(runs)]
 
     def columns(self, problem: Problem, sums: np.ndarray) -> tuple[dict[str, Mapping[str, np.ndarray]], np.ndarray]:
         """Return the metrics that are summed up, by name and element, shape (runs,) each; and which runs left a range."""
@@ -95,10 +101,8 @@ class Sums:
         pairs = zip(self._streamed, rest, strict=True)
         return {m.name: one.result(part, run) for (m, one), part in pairs}, outside[:, -1] != 0
 
-    def _row(
-        self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, np.ndarray]], log: np.ndarray, seed: int
-    ) -> Values:
-        run = Run(problem.name, "", seed, problem.period, self.kept, log, None, True, {})
+    def _row(self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, np.ndarray]], run: Run) -> Values:
+        """The metrics of the k-th run; `run` has what was kept of it."""
         of_logs = measure(problem, run, self._of_logs).values
         row: Values = {}
         for metric in self.metrics:

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.errors import NoCode
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.simulation.simulate import Simulator, built
 from fpirhc.studies.scenarios.bench import Bench, Conditions, ranges, relative_error
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
@@ -110,6 +112,60 @@ def test_a_metric_of_whole_runs_and_a_solver_are_told() -> None:
         bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
         assert list(bench.records([0, 1], name)) == [ordinary.record(k, name) for k in (0, 1)]
         assert why in bench.apart[name]
+
+
+def test_cases_of_one_loop_are_measured_each_by_its_own_problem() -> None:
+    """Cases differ in what only metrics know: from when they measure, and the numbers of the problem that a function reads."""
+    weight = fp.Metric(
+        "weight", lambda problem, run: problem.plant.parameters["m1"].exact * run["time"].item(-1), reads=("time",)
+    )
+    changes = {f"{k}": {"exact.m1": 1.0 + 0.01 * k, "measure_from": 0.5 + k % 2} for k in range(16)}
+    task = replace(short(TWO_MASS), metrics=(*TWO_MASS.metrics, weight), cases=fp.Cases(changes))
+    conditions = Conditions(0, COMPARING, 0.0, True, named=True)
+    bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
+    records = list(bench.records(range(16), "CTC"))
+    assert not bench.apart
+    for number in (0, 1, 14, 15):
+        assert_equal(records[number], ordinary.record(number, "CTC"), SMOOTH)
+
+
+def test_one_case_that_cannot_be_summed_up_leaves_the_others_alone() -> None:
+    """It runs as an ordinary run, and the records of the others are the same to the bit."""
+    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True), side_by_side=True)
+    together = list(bench.records(range(4), "CTC"))
+    lanes = next(iter(bench._lanes.values()))
+    plain, odd = lanes._sums.start, bench._scenario(2).problem
+
+    def start(problem: fp.Problem) -> np.ndarray:
+        if problem is odd:
+            raise NoCode("this problem does not say before a run what it needs")
+        return plain(problem)
+
+    object.__setattr__(lanes._sums, "start", start)
+    apart = list(bench.records(range(4), "CTC"))
+    assert [apart[k] for k in (0, 1, 3)] == [together[k] for k in (0, 1, 3)]
+    assert_equal(apart[2], together[2], ROUNDED)
+
+
+def test_a_loop_without_lanes_is_built_once_for_every_run_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A solver that starts at its last solution needs a new loop for every run, and no second one to ask for lanes."""
+    made: list[object] = []
+
+    def counted(*given: Any, **named: Any) -> Simulator:
+        made.append(given)
+        return built(*given, **named)
+
+    monkeypatch.setattr("fpirhc.studies.scenarios.bench.built", counted)
+    monkeypatch.setattr("fpirhc.simulation.simulate.Simulator.remembers", True)
+    own = replace(
+        short(TWO_MASS),
+        metrics=(fp.Metric("middle", lambda _, run: float(np.median(run["error.q1"]))), *TWO_MASS.metrics),
+    )
+    bench = Bench(own, Conditions(0, COMPARING, 5.0, True), side_by_side=True)
+    for block in bench.blocks("CTC", range(4)):
+        list(bench.records(block, "CTC"))
+    assert bench.apart
+    assert len(made) == 5  # one of them asked for lanes
 
 
 def test_what_a_figure_reads_is_kept() -> None:

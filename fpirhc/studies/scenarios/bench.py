@@ -26,6 +26,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import with_settings
 from fpirhc.simulation.lanes import Lanes, OneRun
 from fpirhc.simulation.metrics import Metric, Metrics, measure
+from fpirhc.simulation.metrics.base import first_measured
 from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import JUDGING, Compiled, Simulator, built, with_judgements
@@ -134,7 +135,8 @@ class Bench:
         self._simulators: dict[tuple[str, object], Simulator | FpirhcError] = {}
         self._shared: dict[tuple[str, object], Simulator | None] = {}
         self._known: dict[object, Compiled] = {}
-        self._lanes: dict[int, Lanes] = {}
+        self._lanes: dict[tuple[str, int], Lanes] = {}  # by controller and code
+        self._alone: set[tuple[str, object]] = set()  # controllers and builds without lanes
         self._last: dict[int, Scenario] = {}
 
     def records(
@@ -166,32 +168,41 @@ class Bench:
     def _groups(
         self, name: str, jobs: Sequence[tuple[int, Mapping[str, float] | None]]
     ) -> list[tuple[Lanes, list[_InLanes]]]:
-        """The lanes, and those jobs that may run in them: of one loop and one duration."""
-        groups: dict[tuple[int, int], tuple[Lanes, list[_InLanes]]] = {}
+        """The lanes, and those jobs that may run in them: of one loop, one duration and one first measured cycle."""
+        groups: dict[tuple[int, int, int], tuple[Lanes, list[_InLanes]]] = {}
         for place, (number, settings) in enumerate(jobs if self._side_by_side else ()):
             if not self._scenarios.has_many_alike(number):
                 continue
             scenario = self._scenario(number)
             with contextlib.suppress(FpirhcError):  # what is wrong is said by the record
-                lanes, ready = self._lanes_of(name, scenario)
-                if lanes.why:
-                    return []
+                found = self._lanes_of(name, scenario)
+                if found is None:
+                    continue
+                lanes, ready = found
                 problem, memory = ready.first_memory(scenario.problem, settings)
-                group = groups.setdefault((id(lanes), problem.cycles), (lanes, []))
+                key = id(lanes), problem.cycles, first_measured(problem)
+                group = groups.setdefault(key, (lanes, []))
                 group[1].append(_InLanes(place, scenario, OneRun(problem, memory, scenario.seed)))
         return list(groups.values())
 
-    def _lanes_of(self, name: str, scenario: Scenario) -> tuple[Lanes, Simulator]:
+    def _lanes_of(self, name: str, scenario: Scenario) -> tuple[Lanes, Simulator] | None:
+        """The lanes of a scenario's loop, and the loop; None where its runs are one after the other."""
+        key = name, scenario.build
+        if key in self._alone:
+            return None
         ready = self._simulator(name, scenario)
-        code = id(ready.evaluator)
+        code = name, id(ready.evaluator)
         if code not in self._lanes:
             shown = [one.title for one in self._pictures(name) if one.keeps]
             why = f"the picture '{shown[0]}' keeps something of every run" if shown else ""
             why = "the figure is of signals that judge a whole run" if self._judging else why
-            self._lanes[code] = lanes = Lanes(ready, self._task.metrics, why=why)
-            if lanes.why:
-                self.apart[name] = lanes.why
-        return self._lanes[code], ready
+            self._lanes[code] = Lanes(ready, self._task.metrics, why=why)
+        lanes = self._lanes[code]
+        if lanes.why:
+            self._alone.add(key)
+            self.apart[name] = lanes.why
+            return None
+        return lanes, ready
 
     def record(self, number: int, name: str, settings: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Return the result of one controller in one scenario, as plain data; a number that is not finite becomes None.
