@@ -106,7 +106,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
 
         pair = [name for name in task.headline or () if not controllers or name in controllers]
         write_lab(lab_of(task, options.problem, pair if len(pair) > 1 else (controllers or ())[:2]), folder / _LAB)
-    with progress_bars() as progress:
+    with progress_bars(as_json=options.json) as progress:
         comparison = compare(
             task,
             seed=options.seed,

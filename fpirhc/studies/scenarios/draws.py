@@ -170,7 +170,8 @@ class RandomScenarios(Scenarios):
         return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, problem, self._shared)
 
     def options(self, number: int) -> tuple[str, ...]:
-        return ("--scenario", str(number), "--mismatch", f"{self.percent:g}", "--seed", str(self.seed))
+        percent = np.format_float_positional(self.percent, trim="-")  # every digit, because draws depend on them
+        return ("--scenario", str(number), "--mismatch", percent, "--seed", str(self.seed))
 
     def automatic(self, controller: Controller) -> Controller:
         return resolved(self.of, controller) if self._draws_dead_times else controller
