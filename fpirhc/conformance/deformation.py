@@ -171,6 +171,10 @@ def secant_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
         )
 
 
+_SEEN = 1e-9  # of the amplitude: a shorter step drowns in the rounding of the request
+_FADES = 1e-6  # of the longest step that a smaller error causes
+
+
 def only_desired_is_fixed(trial: _Trial, generator: np.random.Generator) -> None:
     """A larger error of the same direction moves the request the same way, so no response but the desired one leaves it alone.
 
@@ -184,19 +188,17 @@ def only_desired_is_fixed(trial: _Trial, generator: np.random.Generator) -> None
         moved = np.asarray(trial.scalar_function(request, responses, desired, trial.layout.start())[0].full())
         steps = moved - request[:, None]
         lengths = np.linalg.norm(steps, axis=0)
-        # A shorter step drowns in the rounding of the request.
-        begin = int(np.argmax(lengths > _SEEN * trial.amplitude))
+        seen = np.flatnonzero(lengths > _SEEN * trial.amplitude)
+        hold(seen.size > 0, f"no error up to {sizes[-1]:.3g} moves the request")
+        begin = seen[0]
         along = steps[:, begin] @ steps[:, begin:] / lengths[begin]
-        lost = along <= _FADES * np.maximum.accumulate(lengths[begin:])
-        where = sizes[begin + int(np.argmax(lost))]
+        kept = along > _FADES * np.maximum.accumulate(lengths[begin:])
+        where = sizes[begin + int(np.argmin(kept))]
         hold(
-            not lost.any(),
+            bool(kept.all()),
             f"an error of {where:.3g} does not move the request the way a smaller one does, so a false fixed point is near: use a "
             "step that grows with the error or saturates",
         )
-
-
-_SEEN, _FADES = 1e-9, 1e-6  # of the amplitude; of the longest step that a smaller error causes
 
 
 def step_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
