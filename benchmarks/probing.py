@@ -72,9 +72,9 @@ def by_hand(lags: tuple[float, ...]) -> dict[str, Deformation]:
 
 
 def rms(trials: list[Trial | str]) -> Trial:
-    """Return the rms of the errors of trials with several seeds, and the largest of any coordinate."""
-    good = [one for one in trials if isinstance(one, Trial)]
-    return Trial(float(np.sqrt(np.mean([one.error**2 for one in good]))), max(one.worst for one in good))
+    """Return the rms of the errors of trials with several seeds, and the largest of any coordinate; a refusal is infinite."""
+    every = [one if isinstance(one, Trial) else Trial(np.inf, np.inf) for one in trials]
+    return Trial(float(np.sqrt(np.mean([one.error**2 for one in every]))), max(one.worst for one in every))
 
 
 def main() -> None:

@@ -35,11 +35,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table
 
 ROUNDS = 3
-RECORDS, SOME, MORE = (
-    25,
-    40,
-    80,
-)  # records that are timed; and how often they are read in the smaller and the larger file
+RECORDS = 25  # that are timed
+SOME, MORE = 40, 80  # times that they are read in the smaller and the larger file
 TURNS, BLOCK = 4, 64  # of scenarios side by side; the first one compiles
 STUDIES = (("two_mass", ("CTC", "CTC+FPI (eq 6)"), 2000), ("van_der_pol", ("RHC", "RHC+FPI", "RHC exact model"), 600))
 

@@ -10,10 +10,8 @@ ROW = re.compile(r"(\w+)\[(\d+)\]\Z")
 DIGITS = re.compile(r"-?(?:\d+\.\d*|\d+)(?:[eE][+-]?\d+)?\Z")
 CHOICE, NOT, AND, OR, SUM = "({}?{}:{})", "(!{})", "({}&&{})", "({}||{})", "({}+{})"
 COMPARED = {"({}<{})": float.__lt__, "({}<={})": float.__le__, "({}=={})": float.__eq__, "({}!={})": float.__ne__}
-BOUNDED, EVERY = (
-    "BOUNDED({})",
-    "every:",
-)  # whether a number is finite; whether all are, before the text that says it of their sum
+BOUNDED = "BOUNDED({})"  # whether a number is finite
+EVERY = "every:"  # whether all are, before the text that says it of their sum
 _FLAGS = (*COMPARED, NOT, AND, OR, BOUNDED)
 _MAGNITUDE, _LARGEST = "casadi_fabs({})", "(1.0 * FINITE)"
 _SMALL = 100  # whole numbers below it are kept in a byte

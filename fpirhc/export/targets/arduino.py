@@ -20,10 +20,8 @@ from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, sources
 
 _FLAGS = ("-std=gnu99", "-Os", "-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections", "-fstack-usage")
-_LARGE = (
-    "-Wl,--defsym=__DATA_REGION_LENGTH__=0xfe00",
-    "-Wl,--defsym=__TEXT_REGION_LENGTH__=0x800000",
-)  # so that all is counted
+# Regions so large that all is counted.
+_LARGE = ("-Wl,--defsym=__DATA_REGION_LENGTH__=0xfe00", "-Wl,--defsym=__TEXT_REGION_LENGTH__=0x800000")
 _ATANH = (
     "#include <math.h>\n#ifdef __AVR__\n#define atanh(x) (0.5f * log((1 + (x)) / (1 - (x)))) /* it has none */\n#endif"
 )

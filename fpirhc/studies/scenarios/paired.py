@@ -285,7 +285,7 @@ def median_interval(values: np.ndarray, seed: int) -> ConfidenceInterval:
         B. Efron, R. J. Tibshirani, An Introduction to the Bootstrap, Chapman and Hall, 1993, chapter 13.
     """
     if values.size > _MANY:
-        low, high = np.sort(values)[list(_ends_of_all_resamples(values.size))]
+        low, high = np.sort(values)[[*_ends_of_all_resamples(values.size)]]
         return ConfidenceInterval(float(middle(values)), float(low), float(high))
     random = np.random.default_rng(np.random.SeedSequence(seed))
     rows = max(1, _AT_ONCE // values.size)
@@ -304,7 +304,8 @@ def _ends_of_all_resamples(size: int) -> tuple[int, int]:
 
     shares = np.arange(1, size) / size
     at_most = np.asarray(bdtrc(math.ceil(size / 2) - 1, size, shares))
-    return tuple(int(np.searchsorted(at_most, level)) for level in ((1 - LEVEL) / 2, (1 + LEVEL) / 2))  # type: ignore[return-value]
+    low, high = np.searchsorted(at_most, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return int(low), int(high)
 
 
 def middle(values: np.ndarray) -> np.ndarray:
