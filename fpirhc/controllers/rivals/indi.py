@@ -16,7 +16,7 @@ from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.functions import cos, exp, sqrt
-from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.layout import Expression, Layout, discrete, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -55,7 +55,7 @@ class INDI(Undeformed):
         )
         both = (("filtered_command", plant.input), ("filtered_response", plant.response_signal("_")))
         pairs = [like(signal, name + late) for name, signal in both for late in ("", "_before")]
-        memory = Layout((*pairs, scalar("filter_begun"))) if self.frequency is not None else Layout()
+        memory = Layout((*pairs, discrete("filter_begun"))) if self.frequency is not None else Layout()
 
         def filtered(s: Signals) -> tuple[dict[str, Expression], dict[str, Expression]]:
             """Command and response behind the filter, which begins settled, and what it remembers."""

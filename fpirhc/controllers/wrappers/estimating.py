@@ -24,7 +24,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import GAP, Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.latest import Latest
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, discrete
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 
@@ -130,7 +130,7 @@ def _estimate_block(
     estimate = Signal("estimate", names, tuple(model.parameters[n].unit for n in names))
     memory = estimator.memory(modelled)
     correct, followed = estimator.step(modelled), estimator.following(modelled)
-    own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun"), *pairs.memory))
+    own = memory + Layout((like(estimate, "estimate_change"), discrete("estimate_begun"), *pairs.memory))
 
     def step(s: Signals) -> dict[str, Value]:
         s = pairs.moved(s) if lost else s

@@ -18,7 +18,7 @@ from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertai
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.functions import largest, stays
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
 from fpirhc.symbolic.queue import MOST, Cycles, Queue, every, longest_of, several
 
 __all__ = ["MOST", "Increment", "Paired"]
@@ -68,7 +68,7 @@ class _Queued(Wrapper):
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         queues = Signal("queue_requests", past), Signal("queue_desired", past), Signal("queue_now", elements)
-        return Layout((*queues, scalar("queue_filled"))) + self.map.memory(elements)
+        return Layout((*queues, discrete("queue_filled"))) + self.map.memory(elements)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

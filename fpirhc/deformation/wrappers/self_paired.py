@@ -14,7 +14,7 @@ import casadi as ca
 from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, memory_of_map
 from fpirhc.fields.kinds import Accuracy, whole
 from fpirhc.symbolic.expression import total
-from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
 
 _MOST = 200  # cycles: the estimate costs as many multiplications, twice, in every control cycle
 _PATIENCE = 100
@@ -75,7 +75,7 @@ class SelfPaired(Wrapper):
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(self.most + 1) for e in elements)
-        counts = (scalar("pair_filled"), scalar("pair_stood"), scalar("pair_candidate"))
+        counts = (discrete("pair_filled"), discrete("pair_stood"), discrete("pair_candidate"))
         own = Layout((Signal("pair_requests", past), scalar("pair_cycles", start=-1.0), *counts))
         return own + _estimate_memory(elements, self.most) + self.map.memory(elements)
 
