@@ -132,8 +132,8 @@ print(
 )
 
 # %%
-# The exact model calls the third segment's sign down before the queue is full: traffic
-# waits on the road, and the ramp empties into the gap.
+# With the exact model the plan lowers the third segment's sign before the queue is full:
+# traffic waits on the road, and the ramp empties into the gap.
 
 run = fp.simulate(
     coordinated.problem,

@@ -397,17 +397,15 @@ class _Runner:
         places = [p for p in np.ndindex(*self._grid.shape) if self._stands_for_others(p)]
         # Settings are the outer loop: what must be built anew is built once.
         places.sort(key=lambda p: tuple(self._settings(p).values()))
-        todo, done = [p for p in places if self._number(p) not in known], 0
-        while todo:
-            some, todo = todo[:_BLOCK], todo[_BLOCK:]
-            for new in self._records(some):
+        todo = [p for p in places if self._number(p) not in known]
+        if progress:
+            progress(self._name, len(known), len(places))
+        for at in range(0, len(todo), _BLOCK):
+            for new in self._records(todo[at : at + _BLOCK]):
                 known[new["cell"]] = new
                 self._ledger.append(new)
-                done = len(known)
                 if progress:
-                    progress(self._name, done, len(places))
-        if progress and not done:
-            progress(self._name, len(places), len(places))
+                    progress(self._name, len(known), len(places))
         values, outcomes = np.full(self._grid.shape, math.inf), np.empty(self._grid.shape, dtype=object)
         reasons: dict[str, str] = {}
         for place in np.ndindex(*self._grid.shape):

@@ -29,8 +29,8 @@ What counts, in half an hour:
 
 With metering alone no plan holds the queue, and the exact model does not help. With the signs the exact model does: in the
 fourteenth minute the third segment's sign goes down, to 20 km/h, and holds traffic back on the road, so that the ramp can empty
-into the gap. A wrong model calls its signs some minutes too late. The iteration loses, for the reason that `freeway_economic`
-states, and the offset-free plan finds nothing to estimate.
+into the gap. A plan with the wrong model lowers the signs some minutes too late. The iteration loses, for the reason that
+`freeway_economic` states, and the offset-free plan finds nothing to estimate.
 
 With the demands of the source, up to 1500 veh/h at the ramp, the signs stay beyond what is driven and save nothing. In the
 published run they stay there too, and it spends 0.1 veh h more than the metered one.

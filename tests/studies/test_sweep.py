@@ -42,7 +42,6 @@ def pump() -> fp.Problem:
 
 LAW = fp.ComputedTorque(fp.Exponential(rate=RATE, integral=False))
 ADAPTIVE = LAW.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.8)))
-
 PLAIN = LAW.with_deformation(fp.Affine(gain=-0.8))
 
 
