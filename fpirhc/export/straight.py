@@ -28,6 +28,8 @@ _OLD = re.compile(r"\ba\d+\b")
 _COPY = re.compile(r"( *)(\w+)\[(\d+)\] = (\w+)\[(\d+)\];\n\Z")
 _ELEMENTARY = re.compile(r"(?:exp|log|pow|sin|cos|tan|tanh|atanh|asin|acos|atan|sinh|cosh)\(")
 _DIVIDED = "({}/{})"
+_ORDERED = ("({}<{})", "({}<={})")  # a byte is below 2.5 where it is below 3; none is 2.5
+_LARGEST_WHOLE = 32767  # in an int of the smallest processors
 _COSTS = {"/": 2, "*": 1}  # operations that are worth a branch, by what stands between their operands
 _Names = dict[int, tuple[str, ...]]  # where a value can be read, the best place first
 _Sure = Mapping[int, bool]  # flags, and what they are in a block
@@ -326,10 +328,12 @@ class _Writer:
 
 
 def _whole(text: str, template: str, k: int) -> str:
-    """A number beside a whole one in a comparison, as a whole one."""
+    """A number beside a whole one in a comparison, as a whole one where the answers are the same."""
     if not DIGITS.match(text):
         return text
     value = float(text)
+    if abs(value) > _LARGEST_WHOLE or (value != int(value) and template not in _ORDERED):
+        return text
     up = (template == "({}<{})") == (k == 1)
     return str(int(-(-value // 1) if up else value // 1))
 

@@ -96,6 +96,22 @@ def test_condensed_code_is_what_was_written(seed, tmp_path):
             np.testing.assert_array_equal(here, there)
 
 
+@needs_compiler
+def test_whole_numbers_are_compared_with_every_other_number(tmp_path):
+    """A byte holds 12, 2 or 4: equal to 2, not to 2.5, and less than what no byte holds."""
+    x = ca.SX.sym("x", 2)
+    whole = ca.if_else(x[0] < 0, 12, ca.if_else(x[1] < 0, 2, 4))
+    answers: list[ca.SX] = []
+    for n in (2, 2.5, -2.5, 4, 1e300, -1e300):
+        answers += [whole == n, whole != n, whole < n, whole <= n, whole > n, whole >= n]
+    function = ca.Function("f", [x], [ca.densify(ca.vertcat(*answers))])
+    (text,), _ = c_of(function, "arm")
+    library = compiled(text, "whole", tmp_path)
+    for values in ([-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]):
+        (found,) = results(library, [np.array(values)], [len(answers)])
+        np.testing.assert_array_equal(found, function(values).full().ravel())
+
+
 def body_of(function: ca.Function) -> str:
     (text,), sizes = c_of(function, "arm")
     assert sizes["w"] == 1

@@ -109,9 +109,8 @@ def _view(comparison: ScenarioComparison) -> View:
         f"{comparison.count} {noun(comparison.named)} of seed {comparison.seed}{'' if comparison.named else drawn}, errors from "
         f"t = {comparison.measure_from:g} {comparison.time_unit} on."
     )
-    outcomes = [
-        one.outcome for one in comparison.summaries[1:]
-    ]  # the first sentences are about the rivals, in their order
+    # The first sentences are about the rivals, in their order.
+    outcomes = [one.outcome for one in comparison.summaries[1:]]
     return comparison.viewed(
         sentences=tuple(zip_longest(comparison.verdict, outcomes)),
         conditions=f"{conditions} {'' if comparison.figure.metric else _ERRORS}{_MEANING} {'' if comparison.tuning else _UNTUNED}",
