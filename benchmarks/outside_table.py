@@ -1,6 +1,6 @@
 """The plants of other packages, every controller: rms errors after the start, and the movement of the commands.
 
-.venv/bin/python benchmarks/outside_table.py          # a minute; a plant whose package is missing is left out with the reason
+.venv/bin/python benchmarks/outside_table.py     # fifteen seconds; a plant whose package is missing is left out with the reason
 """
 
 from __future__ import annotations

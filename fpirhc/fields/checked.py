@@ -316,6 +316,8 @@ def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
     if contract is None:
         alone = _WITH_UNIT.fullmatch(text) and expected.fits(0.1)
         return "write the number alone, in the unit that is expected" if alone else ""
+    if issubclass(contract, Path):
+        return f"write pathlib.Path({text!r})"
     loaded = getattr(contract, "_LOADED", "").format(repr(text))
     members = {_plain(name): member for name, member in _public(contract) if member is not contract or not loaded}
     close = get_close_matches(_plain(text), members, n=1, cutoff=0.5)
@@ -328,7 +330,8 @@ def _member(contract: type) -> str:
     """How a value of a public class is written, or which members a contract has; empty for classes of Python."""
     if inspect.isabstract(contract):
         return f"one of {', '.join(sorted(name for name, _ in _public(contract)))}"
-    if contract.__name__ not in getattr(import_module(contract.__module__.partition(".")[0]), "__all__", ()):
+    home, own = (name.partition(".")[0] for name in (contract.__module__, __name__))
+    if home != own or contract.__name__ not in import_module(own).__all__:
         return ""
     _, *first = inspect.signature(getattr(contract, "__init__")).parameters  # noqa: B009
     return f"write fp.{call_of(contract)}".replace("()", f"({first[0]}=...)" if first else "()")

@@ -59,6 +59,10 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: ANY.measure(PROBLEM, "run.npz"),
         "measure.run: expected a Run, got the text 'run.npz'; write fp.load_run('run.npz')",
     ),
+    "a text for a path": (
+        lambda: ANY.compare_scenarios(TASK, seed=0, folder="results"),
+        "compare_scenarios.folder: expected a Path, got the text 'results'; write pathlib.Path('results')",
+    ),
     "a stepper of a name": (
         lambda: ANY.Stepper(PROBLEM, "CTC"),
         "Stepper.controller: expected a Controller, got the text 'CTC'; write controllers['CTC'] of a loaded problem file",
