@@ -262,10 +262,8 @@ _LONG = (
     *("chain_of_masses", "puma560", "three_link_arm", "planar_arm", "two_link_arm", "van_der_pol", "leaking_tanks"),
     *("delayed_mass", "delayed_tanks"),  # the journey below reviews dead time
     *("noisy_motor", "anaesthesia", "freeway", "diabetes", "diabetes_announced"),  # others of their kind are quicker
-    *(
-        "freeway_economic",
-        "building",
-    ),  # they differentiate plans of 10 ms; anaesthesia_stimulated has signals and plans too
+    # They differentiate plans of 10 ms and more; anaesthesia_stimulated has signals and plans too.
+    *("freeway_economic", "freeway_coordinated", "building"),
     *("hodgkin_huxley_silent", "tumour_daily", "turbojet_slow"),  # the plants of others with another task
 )
 
