@@ -6,7 +6,6 @@ the processor, user and system, children included, and so do not depend on what 
 
 from __future__ import annotations
 
-import gc
 import os
 from collections.abc import Generator
 from pathlib import Path
@@ -38,12 +37,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     left_out = [item for item in items if _name(item) in listed]
     items[:] = [item for item in items if _name(item) not in listed]
     config.hook.pytest_deselected(items=left_out)
-
-
-def pytest_collection_finish() -> None:
-    """Keep the modules and items that stay to the end out of the search for garbage, which reads all of them every time."""
-    gc.collect()
-    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)

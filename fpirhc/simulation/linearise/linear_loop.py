@@ -109,7 +109,8 @@ class LinearLoop:
 
         def response(frequencies: np.ndarray) -> np.ndarray:
             points = np.exp(1j * frequencies * self.period)
-            return np.asarray(-(np.linalg.solve(points[:, None, None] * unit - closed, g[:, None])[:, :, 0] @ c))
+            right = np.broadcast_to(g[:, None], (len(points), len(g), 1))  # columns in NumPy 1 too
+            return np.asarray(-(np.linalg.solve(points[:, None, None] * unit - closed, right)[:, :, 0] @ c))
 
         return response
 
