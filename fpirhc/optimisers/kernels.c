@@ -33,14 +33,21 @@ INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
   return EITHER(above < high, above, high);
 }
 
-/* c (rows, columns) += a (rows, inner) b (inner, columns). Blocks of four rows are added up in registers. */
+/* c (rows, columns) += a (rows, inner) b (inner, columns). Blocks of eight and of four rows are added up in registers. */
 INLINE void multiply(Out restrict c, In restrict a, In restrict b, int rows, int inner, int columns) {
   int i, j, k, r;
   NOT_UNROLLED
   for (j = 0; j < columns; ++j) {
     Out column = c + j * rows;
     In factors = b + j * inner;
-    for (i = 0; i + 4 <= rows; i += 4) {
+    for (i = 0; i + 8 <= rows; i += 8) {
+      casadi_real sum[8];
+      for (r = 0; r < 8; ++r) sum[r] = column[i + r];
+      for (k = 0; k < inner; ++k)
+        for (r = 0; r < 8; ++r) sum[r] += factors[k] * a[k * rows + i + r];
+      for (r = 0; r < 8; ++r) column[i + r] = sum[r];
+    }
+    for (; i + 4 <= rows; i += 4) {
       casadi_real sum[4];
       for (r = 0; r < 4; ++r) sum[r] = column[i + r];
       for (k = 0; k < inner; ++k)
