@@ -24,10 +24,7 @@ def attempted(
     """Return what a function returns; None where it raises, with a sentence about it added to `broken`.
 
     Args:
-        what: the name of the result.
         compute: the function.
-        arguments, named: its arguments.
-        broken: sentences about what has broken so far.
     """
     try:
         with np.errstate(all="ignore"):  # numbers that overflow show in the result

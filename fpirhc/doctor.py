@@ -41,19 +41,12 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check.
+    """The result of one check."""
 
-    Args:
-        name: name of the check.
-        outcome: its outcome.
-        evidence: the facts in a sentence.
-        remedy: what to do; empty: nothing.
-    """
-
-    name: str
-    outcome: Outcome
-    evidence: str
-    remedy: str = ""
+    name: str  # name of the check
+    outcome: Outcome  # its outcome
+    evidence: str  # the facts in a sentence
+    remedy: str = ""  # what to do; empty: nothing
 
 
 _Check = Callable[[], tuple[Outcome, str, str]]
@@ -171,15 +164,10 @@ CHECKS: tuple[_Check, ...] = (solver_plugins, c_compiler, export_tools, cache, r
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The results of all checks.
+    """The results of all checks."""
 
-    Args:
-        versions: versions of fpirhc and of what its numbers depend on.
-        findings: findings in the order of the checks.
-    """
-
-    versions: dict[str, str]
-    findings: Sequence[Finding]
+    versions: dict[str, str]  # versions of fpirhc and of what its numbers depend on
+    findings: Sequence[Finding]  # findings in the order of the checks
 
     @property
     def outcome(self) -> Outcome:

@@ -26,15 +26,10 @@ GROUP = "fpirhc.members"  # entry points of other distributions; each names a mo
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """A contract and the packages of its members.
+    """A contract and the packages of its members."""
 
-    Args:
-        contract: "module:Class" of the contract.
-        packages: names of the packages that are searched, with everything below them.
-    """
-
-    contract: str
-    packages: tuple[str, ...]
+    contract: str  # "module:Class" of the contract
+    packages: tuple[str, ...]  # names of the packages that are searched, with everything below them
 
     @property
     def type(self) -> type:
@@ -119,7 +114,6 @@ def examples(family: str, inner: Any = None) -> tuple[Any, ...]:
     """Example values of every member of the family.
 
     Args:
-        family: a key of `FAMILIES`.
         inner: the value that wrappers are built around; None leaves wrappers out.
     """
     values: list[Any] = []

@@ -18,32 +18,20 @@ _LONGEST = 1e6  # from which a number is written with a power of ten
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a table.
+    """One column of a table."""
 
-    Args:
-        head: its heading.
-        short: its heading where there is little room; '': the same one; None: the column is not there.
-        left: whether its texts stand on the left.
-    """
-
-    head: str
-    short: str | None = ""
-    left: bool = False
+    head: str  # its heading
+    short: str | None = ""  # its heading where there is little room; '': the same one; None: the column is not there
+    left: bool = False  # whether its texts stand on the left
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a table.
+    """One row of a table."""
 
-    Args:
-        cells: a text for every column; '' where there is none.
-        style: of a terminal.
-        best: places of the columns in which it is the best.
-    """
-
-    cells: Sequence[str]
-    style: str = ""
-    best: frozenset[int] = frozenset()
+    cells: Sequence[str]  # a text for every column; '' where there is none
+    style: str = ""  # of a terminal
+    best: frozenset[int] = frozenset()  # places of the columns in which it is the best
 
 
 @dataclass(frozen=True)

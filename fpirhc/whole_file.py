@@ -13,11 +13,7 @@ def write_whole(content: str | bytes, path: Path, what: str) -> None:
 
     Args:
         content: text, written as UTF-8 with the line ends that it has, or bytes.
-        path: path of the file.
         what: what it is, for the error: "report".
-
-    Raises:
-        OutputError: the file cannot be written.
     """
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:

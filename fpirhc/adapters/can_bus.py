@@ -68,14 +68,7 @@ def can_body(
 
 
 class _Traffic:
-    """The newest messages of a bus.
-
-    Args:
-        can: the package.
-        bus: its bus.
-        sent: fields of the inputs.
-        read: fields of the measurements.
-    """
+    """The newest messages of a bus."""
 
     def __init__(self, can: Any, bus: Any, sent: list[Field], read: list[Field]) -> None:
         self._can, self._bus, self._sent, self._read = can, bus, sent, read

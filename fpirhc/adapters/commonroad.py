@@ -58,10 +58,6 @@ class _Car:
 
     Args:
         kind: "st" or "std".
-        speed: that is held, m/s.
-        vehicle: number of the parameters.
-        steps: in a cycle.
-        inputs: what the commands are.
     """
 
     def __init__(self, kind: str, speed: float, vehicle: int, steps: int, inputs: tuple[str, ...]) -> None:

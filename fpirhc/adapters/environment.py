@@ -70,13 +70,7 @@ def as_env(problem: Problem, *, reward: Reward | None = None, setpoints: Setpoin
 
 
 class _Play:
-    """One run of the loop, cycle by cycle, with the command of somebody else.
-
-    Args:
-        problem: the task.
-        reward: of the signals.
-        setpoints: of the run.
-    """
+    """One run of the loop, cycle by cycle, with the command of somebody else."""
 
     def __init__(self, problem: Problem, reward: Reward, setpoints: Setpoints | None) -> None:
         self._problem, self._reward, self._setpoints = problem, reward, setpoints

@@ -71,11 +71,7 @@ class _Body:
     """An instance of the FMU, made anew for every run.
 
     Args:
-        made: returns an instance with its parameters.
         third: whether it is of FMI 3.
-        period: of a step.
-        sent: references of the inputs.
-        read: references of what is measured.
     """
 
     def __init__(self, made: Callable[[], Any], third: bool, period: float, sent: list[int], read: list[int]) -> None:

@@ -56,7 +56,6 @@ class _Body:
     """The environment with the quantities that are read from its observations.
 
     Args:
-        env: the environment.
         measures: quantity -> place, or a function of the observation.
     """
 

@@ -75,14 +75,7 @@ def modbus_body(
 
 
 class _Unit:
-    """Registers of one device.
-
-    Args:
-        client: of the package.
-        unit: number of the device.
-        sent: registers of the inputs.
-        read: registers of the measurements.
-    """
+    """Registers of one device."""
 
     def __init__(self, client: Any, unit: int, sent: list[Register], read: list[Register]) -> None:
         self._client, self._unit, self._sent, self._read = client, unit, sent, read

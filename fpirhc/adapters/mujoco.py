@@ -67,10 +67,6 @@ class _Body:
     """Joints and motors at their places in MuJoCo's vectors.
 
     Args:
-        mujoco: the package.
-        model: MuJoCo's model.
-        steps: in a cycle.
-        motors: place of every input.
         places: quantity -> (order of the derivative, place).
         start: quantity -> value.
     """

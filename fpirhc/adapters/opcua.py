@@ -59,9 +59,6 @@ class _Session:
 
     Args:
         sync: the package's module.
-        address: of the server.
-        sent: nodes of the inputs.
-        read: nodes of the measurements.
     """
 
     def __init__(self, sync: Any, address: str, sent: list[str], read: list[str]) -> None:

@@ -111,11 +111,7 @@ def device(
 
 
 class _Standstill:
-    """For how long a counter has shown the same.
-
-    Args:
-        now: its clock.
-    """
+    """For how long a counter has shown the same."""
 
     def __init__(self, now: RealTime) -> None:
         self._now = now
@@ -137,9 +133,6 @@ class _Device:
     """A link in the rhythm of the cycles.
 
     Args:
-        link: to the device.
-        names: of what is measured.
-        setup: see `Setup`.
         counts: whether the link reads a counter first.
     """
 

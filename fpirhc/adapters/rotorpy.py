@@ -73,15 +73,7 @@ def _hovering(parameters: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 class _Quadrotor:
-    """The vehicle under the thrust that is asked for.
-
-    Args:
-        vehicle: of the package, with its load.
-        first: state at the start.
-        period: s.
-        order: places of the thrusts among the commands.
-        share: of the mass that is not load.
-    """
+    """The vehicle under the thrust that is asked for."""
 
     def __init__(self, vehicle: Any, first: _State, period: float, order: list[int], share: float) -> None:
         self._vehicle, self._first, self._period, self._order, self._share = vehicle, first, period, order, share

@@ -49,8 +49,6 @@ class _Twin:
     """The package's own model of the lab, led by simulated time.
 
     Args:
-        tclab: the package.
-        model: whose names are measured and sent.
         period: of a cycle, s.
     """
 

@@ -51,17 +51,11 @@ class Metric:
 
 @dataclass(frozen=True)
 class Expected:
-    """Expected results of one controller.
+    """Expected results of one controller."""
 
-    Args:
-        outcomes: classes of outcomes that are expected; without 'finished' nothing else is compared.
-        metrics: metrics by name.
-        not_compared: reasons why metrics are not compared, by name.
-    """
-
-    outcomes: tuple[str, ...]
-    metrics: Mapping[str, Metric]
-    not_compared: Mapping[str, str]
+    outcomes: tuple[str, ...]  # classes of outcomes that are expected; without 'finished' nothing else is compared
+    metrics: Mapping[str, Metric]  # metrics by name
+    not_compared: Mapping[str, str]  # reasons why metrics are not compared, by name
 
 
 def expected(
@@ -73,10 +67,7 @@ def expected(
     """Return the expectations from the results under every variant.
 
     Args:
-        variants: the variants, the nominal one first.
-        results: the results under these variants.
         period: control period, s.
-        metrics: metrics of the problem's runs; None: the shipped and the installed ones.
     """
     outcomes = tuple(dict.fromkeys(r.outcome for r in results))
     if outcomes != (FINISHED,):

@@ -26,28 +26,17 @@ _WIDTH = 118  # of a line that holds a whole object
 
 @dataclass(frozen=True)
 class Baseline:
-    """The expected results of a problem, and how they were measured.
+    """The expected results of a problem, and how they were measured."""
 
-    Args:
-        problem: name of the problem.
-        reason: why this baseline was accepted.
-        date: time of its acceptance, UTC.
-        seed: seed of the nominal run.
-        versions: versions of fpirhc and of what its numbers depend on.
-        varied: variants in words, by source.
-        settings: settings of the problem and its controllers.
-        controllers: expectations by controller.
-        renamed: new names by old names of the file; a file that is written has no old names.
-    """
-
-    problem: str
-    reason: str
-    date: str
-    seed: int
-    versions: Mapping[str, str]
-    varied: Mapping[str, Sequence[str]]
-    settings: Settings
-    controllers: Mapping[str, Expected]
+    problem: str  # name of the problem
+    reason: str  # why this baseline was accepted
+    date: str  # time of its acceptance, UTC
+    seed: int  # seed of the nominal run
+    versions: Mapping[str, str]  # versions of fpirhc and of what its numbers depend on
+    varied: Mapping[str, Sequence[str]]  # variants in words, by source
+    settings: Settings  # settings of the problem and its controllers
+    controllers: Mapping[str, Expected]  # expectations by controller
+    # new names by old names of the file; a file that is written has no old names
     renamed: Mapping[str, str] = field(default_factory=dict)
 
 

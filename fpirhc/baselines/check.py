@@ -43,16 +43,7 @@ _LARGEST = 20_000_000  # bytes; a baseline has some tens of thousands
 
 
 def read_baseline(path: Path, metrics: Sequence[run_metrics.Metric] | None = None) -> Baseline:
-    """Return the baseline in a file.
-
-    Args:
-        path: path of the file.
-        metrics: metrics of the problem's runs; None: names are not checked.
-
-    Raises:
-        BaselineError: the file is missing, damaged, edited by hand, of a newer format, of another problem, or compares
-            nothing.
-    """
+    """Return the baseline in a file."""
     try:
         if path.stat().st_size > _LARGEST:
             raise BaselineError(f"'{path.name}' is larger than {_LARGEST / 1e6:.0f} MB and no baseline; {_ACCEPT}")
@@ -327,19 +318,7 @@ def compose_baseline(
     seeds: int = 8,
     compiled: bool = True,
 ) -> Baseline:
-    """Return the baseline of the controllers that were measured.
-
-    Args:
-        task: the loaded problem file.
-        expectations: expectations by controller.
-        reason: why the new numbers are right.
-        seed: seed of the nominal run.
-        seeds: number of seeds for the bands.
-        compiled: whether runs use compiled C.
-
-    Raises:
-        BaselineError: the baseline would compare nothing.
-    """
+    """Return the baseline of the controllers that were measured."""
     if all(outcome.startswith(REFUSED) for one in expectations.values() for outcome in one.outcomes):
         raise BaselineError(
             f"no controller of '{task.name}' can run, so a baseline would hold nothing: see fpirhc compare"
@@ -359,11 +338,7 @@ def compose_baseline(
 
 
 def require_reason(reason: str) -> str:
-    """Return the reason on one line.
-
-    Raises:
-        InvalidValue: the reason is empty.
-    """
+    """Return the reason on one line."""
     line = " ".join(reason.split())
     if not line:
         raise InvalidValue("a baseline needs a reason: say why the new numbers are right, --reason 'horizon 20 -> 30'")
@@ -371,11 +346,7 @@ def require_reason(reason: str) -> str:
 
 
 def write_baseline(task: Task, baseline: Baseline, baselines: Path | None, working: Path) -> Path:
-    """Write a baseline and return its path.
-
-    Raises:
-        OutputError: the path is outside of the project of `working`, or cannot be written.
-    """
+    """Write a baseline and return its path."""
     path = baseline_path(task.path, baselines)
     check_inside(path, working)
     _write(baseline, path)
@@ -406,20 +377,9 @@ def accept(
     """Measure every controller under all variants, write the baseline, and return it with its path.
 
     Args:
-        task: the loaded problem file.
-        reason: why the new numbers are right.
-        seed: seed of the nominal run.
-        seeds: number of seeds for the bands.
         baselines: folder of the baselines; None: the one beside the problem file.
-        compiled: whether runs use compiled C.
-        processes: number of processes.
         working: a folder of the project, outside of which nothing is written; None: the current folder.
         progress: function of (problem, runs done, runs in all) that is called after every run.
-
-    Raises:
-        InvalidValue: no reason, or too few seeds.
-        BaselineError: the baseline would compare nothing.
-        OutputError: the file cannot be written, or lies outside of the project.
     """
     require_reason(reason)
     if seeds < 2 or seed < 0:
@@ -439,13 +399,7 @@ def write_merged(problem: Path, parts: Sequence[str], working: Path) -> Path:
     """Write the baseline of all parts, with those controllers of the earlier file that no part has.
 
     Args:
-        problem: path of the problem file.
-        parts: texts of baselines.
         working: a folder of the project, outside of which nothing is written.
-
-    Raises:
-        BaselineError: the problem's settings changed, and the file has controllers that were not measured.
-        OutputError: the file cannot be written.
     """
     path = baseline_path(problem)
     check_inside(path, working)

@@ -19,23 +19,14 @@ NOTABLE = 1e-3  # share of the old value from which a change is called better or
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison.
+    """One comparison."""
 
-    Args:
-        controller: name of the controller.
-        metric: name of the metric.
-        old: value of the baseline.
-        new: fresh value.
-        band: half-width of the band; None where the values must be equal.
-        verdict: `HOLDS`, `BETTER`, `WORSE`, `CHANGED`, `GONE` or `NEW`.
-    """
-
-    controller: str
-    metric: str
-    old: Number | None
-    new: Number | None
-    band: float | None
-    verdict: str
+    controller: str  # name of the controller
+    metric: str  # name of the metric
+    old: Number | None  # value of the baseline
+    new: Number | None  # fresh value
+    band: float | None  # half-width of the band; None where the values must be equal
+    verdict: str  # `HOLDS`, `BETTER`, `WORSE`, `CHANGED`, `GONE` or `NEW`
 
     @property
     def holds(self) -> bool:
@@ -64,15 +55,10 @@ def _is_number(value: Number | None) -> TypeGuard[float]:
 
 @dataclass(frozen=True)
 class Cause:
-    """A setting that is not that of the baseline, so that the baseline cannot judge what depends on it.
+    """A setting that is not that of the baseline, so that the baseline cannot judge what depends on it."""
 
-    Args:
-        controller: name of the controller that has it; '' for a setting of the problem, on which everything depends.
-        text: the setting, its old and its new value.
-    """
-
-    controller: str
-    text: str
+    controller: str  # name of the controller that has it; '' for a setting of the problem, on which everything depends
+    text: str  # the setting, its old and its new value
 
     def explains(self, row: Row) -> bool:
         """Whether a change of this row can be a consequence."""
@@ -81,29 +67,18 @@ class Cause:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The judgement of one problem.
+    """The judgement of one problem."""
 
-    Args:
-        problem: name of the problem.
-        rows: the comparisons.
-        unusable: reasons why nothing can be concluded from the baseline (missing, damaged, stale); empty for a usable one.
-        broken: reason why the problem itself could not be loaded; else empty.
-        reason: reason of the baseline.
-        date: date of the baseline.
-        notes: further sentences.
-        causes: settings that are not those of the baseline.
-        headline: name of the number by which the problem compares its controllers; '': the rms errors.
-    """
-
-    problem: str
-    rows: tuple[Row, ...] = ()
+    problem: str  # name of the problem
+    rows: tuple[Row, ...] = ()  # the comparisons
+    # reasons why nothing can be concluded from the baseline (missing, damaged, stale); empty for a usable one
     unusable: tuple[str, ...] = ()
-    broken: str = ""
-    reason: str = ""
-    date: str = ""
-    notes: tuple[str, ...] = ()
-    causes: tuple[Cause, ...] = ()
-    headline: str = ""
+    broken: str = ""  # reason why the problem itself could not be loaded; else empty
+    reason: str = ""  # reason of the baseline
+    date: str = ""  # date of the baseline
+    notes: tuple[str, ...] = ()  # further sentences
+    causes: tuple[Cause, ...] = ()  # settings that are not those of the baseline
+    headline: str = ""  # name of the number by which the problem compares its controllers; '': the rms errors
 
     @property
     def changed(self) -> tuple[Row, ...]:
@@ -125,10 +100,7 @@ def judge(
     """Compare the fresh results of a problem with its baseline.
 
     Args:
-        baseline: the baseline.
-        settings: settings of the problem as it is now.
         fresh: results under the nominal variant, of all controllers or of some.
-        metrics: metrics of the problem's runs; None: the shipped and the installed ones.
     """
     whole = set(fresh) == set(settings.controllers)
     names = dict.fromkeys([*fresh, *(baseline.controllers if whole else ())])
@@ -159,7 +131,6 @@ def ignoring(judgement: Judgement, share: float) -> Judgement:
     """Return the judgement in which changes smaller than a share of the old value hold; counts and words never do.
 
     Args:
-        judgement: the judgement.
         share: of the old value; 0 ignores nothing.
     """
     small = [r for r in judgement.changed if r.band is not None and r.change is not None and abs(r.change) < share]

@@ -32,30 +32,19 @@ _CONVERGED = 1e-8  # of the input's range: tolerance of open-loop plans
 
 @dataclass(frozen=True)
 class Measurement:
-    """The result of one run.
+    """The result of one run."""
 
-    Args:
-        outcome: class of its outcome.
-        why: reason for an outcome other than `FINISHED`.
-        numbers: its numbers by metric; NaN where there is none.
-    """
-
-    outcome: str
-    why: str
-    numbers: Mapping[str, Number]
+    outcome: str  # class of its outcome
+    why: str  # reason for an outcome other than `FINISHED`
+    numbers: Mapping[str, Number]  # its numbers by metric; NaN where there is none
 
 
 @dataclass(frozen=True)
 class Job:
-    """One controller under one variant.
+    """One controller under one variant."""
 
-    Args:
-        controller: name of the controller.
-        variant: the variant.
-    """
-
-    controller: str
-    variant: Variant
+    controller: str  # name of the controller
+    variant: Variant  # the variant
 
 
 def _no_run_has_it(problem: Problem, run: Run) -> None:
@@ -80,10 +69,6 @@ def metric_of(key: str, metrics: Sequence[run_metrics.Metric] | None = None) -> 
 
     Args:
         key: name of the number, 'metric.element'.
-        metrics: metrics of the problem's runs; None: the shipped and the installed ones.
-
-    Raises:
-        InvalidName: neither fpirhc nor the problem has such a metric.
     """
     entries = {**PLANS, **{m.name: m for m in (known_metrics() if metrics is None else metrics)}}
     name = key
@@ -185,25 +170,15 @@ _NUDGE = 1e-14  # some tens of rounding errors
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to run a problem that leaves its settings alone.
+    """One way to run a problem that leaves its settings alone."""
 
-    Args:
-        source: source of spread to which it belongs.
-        name: its name in words.
-        seed: seed of the run.
-        compiled: whether the run uses compiled C.
-        flags: flags of the compiler.
-        nudge: relative change of the first state and the exact parameters.
-        finer: factor of the number of integrator steps.
-    """
-
-    source: str
-    name: str
-    seed: int
-    compiled: bool
-    flags: tuple[str, ...] = ()
-    nudge: float = 0.0
-    finer: int = 1
+    source: str  # source of spread to which it belongs
+    name: str  # its name in words
+    seed: int  # seed of the run
+    compiled: bool  # whether the run uses compiled C
+    flags: tuple[str, ...] = ()  # flags of the compiler
+    nudge: float = 0.0  # relative change of the first state and the exact parameters
+    finer: int = 1  # factor of the number of integrator steps
 
     @property
     def plans(self) -> bool:

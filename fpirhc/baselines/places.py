@@ -26,9 +26,6 @@ def problems_here(folder: Path, baselines: Path | None = None) -> tuple[list[Pat
 
     The files are those of `folder/problems` and of the folders in it if there is such a folder, else of `folder` itself. A file
     that defines `problem` and `controllers` counts, and every name of a baseline, so that a problem that vanished is noticed.
-
-    Raises:
-        BaselineError: there is nothing to check, or an `unchecked.toml` is wrong.
     """
     place = folder / "problems" if (folder / "problems").is_dir() else folder
     places = [place, *(_inner(place) if place != folder else ())]
@@ -83,11 +80,7 @@ def _unchecked(path: Path) -> dict[str, str]:
 
 
 def check_inside(path: Path, working: Path) -> None:
-    """Raise unless `path` lies in the project: the nearest folder above `working` with .git or pyproject.toml, or `working`.
-
-    Raises:
-        OutputError: the path lies elsewhere, after links are resolved, or below a file.
-    """
+    """Raise unless `path` lies in the project: the nearest folder above `working` with .git or pyproject.toml, or `working`."""
     working = working.resolve()
     marks = (".git", "pyproject.toml")
     root = next((f for f in (working, *working.parents) if any((f / m).exists() for m in marks)), working)

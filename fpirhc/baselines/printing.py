@@ -30,8 +30,6 @@ def show_check(judgements: Sequence[Judgement], unchecked: Mapping[str, str], ev
     """Print a table and a sentence for every problem.
 
     Args:
-        judgements: of the problems.
-        unchecked: reasons why others are not checked, by name.
         every: whether to print every metric, and not only those that changed and the headline metric.
     """
     for one in judgements:
@@ -242,11 +240,7 @@ def sentence(row: Row) -> str:
 
 
 def check_replaceable(path: Path, mark: str) -> None:
-    """Raise unless `path` is free or holds an earlier report: a check overwrites nothing else.
-
-    Raises:
-        OutputError: the path holds something else, or its folder does not exist.
-    """
+    """Raise unless `path` is free or holds an earlier report: a check overwrites nothing else."""
     if not path.parent.is_dir():
         raise OutputError(f"cannot write to '{path}': there is no folder '{path.parent}'")
     try:

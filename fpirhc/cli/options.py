@@ -49,11 +49,7 @@ def add_set(parser: Parser, more: str) -> None:
 
 
 def numbers(settings: Sequence[str]) -> dict[str, float | tuple[float, ...]]:
-    """Return numbers by path from texts 'PATH=NUMBER', or 'PATH=LOWER,UPPER' for an interval.
-
-    Raises:
-        InvalidValue: a text of another form.
-    """
+    """Return numbers by path from texts 'PATH=NUMBER', or 'PATH=LOWER,UPPER' for an interval."""
     from fpirhc.errors import InvalidValue
 
     values: dict[str, float | tuple[float, ...]] = {}

@@ -28,20 +28,12 @@ def results_folder(wanted: str | None, *default: str) -> Path:
 
     Args:
         wanted: path of the folder; None: `results/DEFAULT...`.
-        default: parts of the default path.
-
-    Raises:
-        OutputError: the folder cannot be written.
     """
     return output_folder(Path(wanted) if wanted else Path("results", *default))
 
 
 def output_folder(folder: Path) -> Path:
-    """Create a folder for results before anything runs, so that a wrong path fails at once.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
+    """Create a folder for results before anything runs, so that a wrong path fails at once."""
     from fpirhc.errors import not_writable
 
     try:
@@ -55,11 +47,7 @@ def output_folder(folder: Path) -> Path:
 
 
 def publish(view: View, page: str, folder: Path, *, as_json: bool) -> None:
-    """Write the page of a study and its JSON object, and print the object, or the verdict and the tables.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    """Write the page of a study and its JSON object, and print the object, or the verdict and the tables."""
     from fpirhc.report.terminal import show
     from fpirhc.studies.view import to_json
     from fpirhc.whole_file import write_whole
@@ -74,11 +62,7 @@ def publish(view: View, page: str, folder: Path, *, as_json: bool) -> None:
 
 
 def table_writer(form: str | None) -> Callable[[DataFrame, Path], None]:
-    """Return a function that writes a table to a path whose suffix becomes that of the form; it writes nothing without a form.
-
-    Raises:
-        NotInstalled: pyarrow is missing, which is said before a study runs.
-    """
+    """Return a function that writes a table to a path whose suffix becomes that of the form; it writes nothing without a form."""
     from fpirhc.errors import NotInstalled
     from fpirhc.whole_file import write_whole
 

@@ -72,12 +72,7 @@ class Parser(argparse.ArgumentParser):
     """A parser whose error is one sentence with what was expected, the nearest valid name, and where the help is."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise the error.
-
-        Raises:
-            InvalidName: an unknown option or choice, or a word too many.
-            InvalidValue: every other mistake.
-        """
+        """Raise the error."""
         from fpirhc.errors import InvalidName, InvalidValue
 
         for pattern, tell in _MISTAKES.items():

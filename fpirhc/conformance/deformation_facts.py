@@ -29,16 +29,7 @@ _SAME = 1e-2  # relative
 
 
 def check_deformation_facts(deformation: Deformation, *, seed: int, amplitude: float = 1.0) -> None:
-    """Check the facts of a deformation; maps that pair with earlier requests keep these laws too.
-
-    Args:
-        deformation: the deformation.
-        seed: of all draws.
-        amplitude: size of typical responses in their unit.
-
-    Raises:
-        AssertionError: the first law that does not hold, in one sentence.
-    """
+    """Check the facts of a deformation; maps that pair with earlier requests keep these laws too."""
     keep(deformation, _Cycles(deformation, amplitude), LAWS, seed)
 
 

@@ -35,17 +35,11 @@ _EFFORT = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """An optimiser with the horizons of its laws.
+    """An optimiser with the horizons of its laws."""
 
-    Args:
-        optimiser: the optimiser.
-        tolerance: stationarity below which it calls a plan OK.
-        calls: calls within which it must solve a small problem.
-    """
-
-    optimiser: Optimiser
-    tolerance: float
-    calls: int
+    optimiser: Optimiser  # the optimiser
+    tolerance: float  # stationarity below which it calls a plan OK
+    calls: int  # calls within which it must solve a small problem
 
     @cached_property
     def linear(self) -> TrialHorizon:
@@ -73,21 +67,13 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class TrialPlan:
-    """The result of the last of some calls.
+    """The result of the last of some calls."""
 
-    Args:
-        state: first state.
-        inputs: inputs of the plan.
-        diagnostics: the five numbers of the optimiser.
-        memory: memory after the call.
-        calls: number of calls.
-    """
-
-    state: Array
-    inputs: Array
-    diagnostics: Array
-    memory: Array
-    calls: int
+    state: Array  # first state
+    inputs: Array  # inputs of the plan
+    diagnostics: Array  # the five numbers of the optimiser
+    memory: Array  # memory after the call
+    calls: int  # number of calls
 
     @property
     def cost(self) -> float:
@@ -107,19 +93,12 @@ class TrialPlan:
 
 @dataclass(frozen=True, eq=False)
 class TrialHorizon:
-    """One horizon with its data, the functions of an optimiser for it, and its solution by other means.
+    """One horizon with its data, the functions of an optimiser for it, and its solution by other means."""
 
-    Args:
-        optimiser: the optimiser.
-        calls: calls within which it must solve the horizon.
-        plant: the plant.
-        limits: the limits.
-    """
-
-    optimiser: Optimiser
-    calls: int
-    plant: Plant
-    limits: Limits
+    optimiser: Optimiser  # the optimiser
+    calls: int  # calls within which it must solve the horizon
+    plant: Plant  # the plant
+    limits: Limits  # the limits
 
     @cached_property
     def served(self) -> bool:

@@ -21,18 +21,7 @@ Law = Callable[[Any, np.random.Generator], None]
 
 
 def keep(subject: object, trial: Any, laws: Sequence[Law], seed: int) -> None:
-    """Try the laws one after the other, each with a generator of its own.
-
-    Args:
-        subject: the value that the laws are about.
-        trial: first argument of the laws.
-        laws: the laws.
-        seed: of the generators.
-
-    Raises:
-        AssertionError: the first law that is broken, with the class, the law's text, and the numbers.
-        FpirhcError: an error of the subject itself, which cannot be used at all.
-    """
+    """Try the laws one after the other, each with a generator of its own."""
     for law in laws:
         name = law.__name__.replace("_", " ")
         try:

@@ -66,21 +66,13 @@ def two_masses() -> Problem:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A controller on a problem.
+    """A controller on a problem."""
 
-    Args:
-        controller: the controller.
-        problem: the problem.
-        seed: of the noise.
-        left: share of the first error that may be left with the exact model.
-        compiled: whether compiled C is compared too.
-    """
-
-    controller: Controller
-    problem: Problem
-    seed: int
-    left: float
-    compiled: bool
+    controller: Controller  # the controller
+    problem: Problem  # the problem
+    seed: int  # of the noise
+    left: float  # share of the first error that may be left with the exact model
+    compiled: bool  # whether compiled C is compared too
 
     @cached_property
     def run(self) -> Run:
@@ -149,17 +141,11 @@ class Cycle:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A controller, without a gate before it, that is given the motion of a recorded run.
+    """A controller, without a gate before it, that is given the motion of a recorded run."""
 
-    Args:
-        problem: that the controller is composed for.
-        controller: the controller.
-        run: whose motion it is given.
-    """
-
-    problem: Problem
-    controller: Controller
-    run: Run
+    problem: Problem  # that the controller is composed for
+    controller: Controller  # the controller
+    run: Run  # whose motion it is given
 
     def cycles(self) -> Iterator[Cycle]:
         """Yield the first cycles of the run, each from the memory of the one before."""

@@ -233,21 +233,13 @@ LAWS = (
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Numbers of a cycle's evidence.
+    """Numbers of a cycle's evidence."""
 
-    Args:
-        measured: what the sensors show, in the order of the model's names.
-        state: true state, of which the observer is given what it calls known.
-        command: that acted.
-        moves: 1, or 0 where the sample still shows the start.
-        counts: 1, or 0 for a sample from before the run.
-    """
-
-    measured: Array
-    state: Array
-    command: Array
-    moves: float = 1.0
-    counts: float = 1.0
+    measured: Array  # what the sensors show, in the order of the model's names
+    state: Array  # true state, of which the observer is given what it calls known
+    command: Array  # that acted
+    moves: float = 1.0  # 1, or 0 where the sample still shows the start
+    counts: float = 1.0  # 1, or 0 for a sample from before the run
 
 
 @dataclass(frozen=True, eq=False)

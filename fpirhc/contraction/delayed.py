@@ -29,8 +29,6 @@ def limit_behind_weights(
     """Return the effective gain below which an iteration converges whose response has these weights of past requests.
 
     Args:
-        iteration: of the deformation: leak, and pole of the filter.
-        mirror: of the deformation: share of the model.
         weights: w_1, w_2, ... of past requests in the response, dead time included.
         pairing: age of the request that a response is paired with, cycles.
         eigenvalue: lambda of the response Jacobian; give -lambda for the limit of a negative gain.

@@ -28,9 +28,6 @@ def slowest_iteration(poles: int) -> float:
 
     Args:
         poles: N of the tracking law: n + 1 for relative order n with the integral, n without it.
-
-    Raises:
-        InvalidValue: fewer than one pole.
     """
     if poles < 1:
         raise InvalidValue(f"slowest_iteration(poles={poles!r}): expected at least one pole of the tracking law")

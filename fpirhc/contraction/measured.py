@@ -30,11 +30,7 @@ def identified_factor(
     Args:
         deformed: requests, shape (cycles, n).
         realised: responses, shape (cycles, n); row k is the response to the request issued in cycle k - 1.
-        effective_gain: a of the deformation, dimensionless.
         weights: W of the deformation, by rows; None: the one matrix.
-
-    Raises:
-        InvalidShape: the arrays differ in shape.
     """
     requests, responses = np.asarray(deformed, dtype=float), np.asarray(realised, dtype=float)
     if requests.shape != responses.shape or requests.ndim != 2:
@@ -68,11 +64,7 @@ def _without_trend(rows: Array) -> Array:
 
 
 def _sampled_jacobian(problem: Problem) -> ca.Function:
-    """Return the Function (reality's state, model's state, request, reality's parameters, model's parameters) -> J (n, n).
-
-    Raises:
-        NotInvertible: the inputs and the controlled coordinates differ in number.
-    """
+    """Return the Function (reality's state, model's state, request, reality's parameters, model's parameters) -> J (n, n)."""
     model, plant = problem.plant, problem.real_plant
     matrix = kind(model.equations.inverse_opaque or problem.real_integrator.opaque)
     x, state = matrix.sym("x", plant.state.size), matrix.sym("state", model.state.size)
@@ -98,9 +90,6 @@ def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tu
     """The divided differences y_{k+r} / T^r of a map's controlled quantities, as far as the command of cycle k changes them.
 
     Args:
-        problem: its model is a map.
-        advance: of the reality over a cycle.
-        after: its state one cycle after the command.
         held: commands of the cycles after it, parameters, no forcing.
     """
     model = problem.plant
@@ -130,7 +119,6 @@ def sampled_jacobians(
     """Return J of every row with the exact parameters of the reality, shape (rows, n, n).
 
     Args:
-        problem: with a reality.
         real: states of the reality, shape (rows, its nx).
         states: states of the model, shape (rows, nx).
         deformed: requests, shape (rows, n).

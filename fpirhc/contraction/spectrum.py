@@ -151,9 +151,7 @@ def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective
     finite nothing contracts, and the factor is 1.
 
     Args:
-        cycles: number of cycles of the run.
         jacobians_at: function of the numbers of some cycles -> their Jacobians, shape (cycles, n, n).
-        effective_gain: a of the deformation.
     """
     rows = _thinned(cycles)
     jacobians = jacobians_at(rows)
@@ -167,7 +165,6 @@ def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Arra
     """Return J of every row, shape (rows, n, n); not finite where the model's inverse is not.
 
     Args:
-        plant: whose response is differentiated.
         states: shape (rows, nx).
         deformed: requests, shape (rows, n).
         exact: parameters of the plant, one set per row, shape (rows, np).
@@ -240,9 +237,6 @@ def linear_limit(eigenvalues: Array) -> tuple[float, float]:
     """Return the open interval of effective gains with |1 - a lambda| < 1 for every eigenvalue.
 
     One end is 0, the other is min 2 Re(lambda) / |lambda|^2, with a minus sign where all real parts are negative.
-
-    Raises:
-        NotContractive: eigenvalues with real parts of both signs, or zero.
     """
     spectrum = Spectrum(eigenvalues)
     _require_one_sign(spectrum)
@@ -269,11 +263,7 @@ def sector_limit(deformation: Deformation, eigenvalues: Array) -> tuple[float, f
 
 
 def _require_one_sign(spectrum: Spectrum) -> None:
-    """Check that some gain converges.
-
-    Raises:
-        NotContractive: eigenvalues with real parts of both signs, or zero.
-    """
+    """Check that some gain converges."""
     if not spectrum.one_sign:
         raise NotContractive(
             "the response Jacobian has eigenvalues with real parts of both signs or zero (from "
@@ -290,30 +280,18 @@ class ContractionReport:
     Within the sector limit errors of any size converge. Between the two limits only small errors converge, and a large one may end
     in a bounded oscillation. Where no gain converges the limits are empty. These are limits of the map on a plant; those of the
     whole loop, and a recommended gain, are answers of a review.
-
-    Args:
-        predicted: max|1 - a lambda|, the factor of an error of the request per cycle.
-        effective_gain: a of the deformation.
-        gain_name: name of the gain that the user sets, the deformation's own gain.
-        linear_limit: interval of the effective gain in which small errors converge.
-        sector_limit: interval of the effective gain in which errors of any size converge.
-        own_linear_limit: the linear limit in the deformation's own gain.
-        own_sector_limit: the sector limit in the deformation's own gain.
-        contractive: whether the effective gain is within the linear limit.
-        within_sector: whether the effective gain is within the sector limit.
-        text: the verdict and the admissible gains, for a reader.
     """
 
-    predicted: float
-    effective_gain: float
-    gain_name: str
-    linear_limit: tuple[float, float]
-    sector_limit: tuple[float, float]
-    own_linear_limit: tuple[float, float]
-    own_sector_limit: tuple[float, float]
-    contractive: bool
-    within_sector: bool
-    text: str
+    predicted: float  # max|1 - a lambda|, the factor of an error of the request per cycle
+    effective_gain: float  # a of the deformation
+    gain_name: str  # name of the gain that the user sets, the deformation's own gain
+    linear_limit: tuple[float, float]  # interval of the effective gain in which small errors converge
+    sector_limit: tuple[float, float]  # interval of the effective gain in which errors of any size converge
+    own_linear_limit: tuple[float, float]  # the linear limit in the deformation's own gain
+    own_sector_limit: tuple[float, float]  # the sector limit in the deformation's own gain
+    contractive: bool  # whether the effective gain is within the linear limit
+    within_sector: bool  # whether the effective gain is within the sector limit
+    text: str  # the verdict and the admissible gains, for a reader
 
     def __repr__(self) -> str:
         return line(self, *(f"{name} {value}" for name, value in self._facts()))

@@ -164,8 +164,6 @@ def deform_block(
     remembers nothing of it, and the request stays as it was; the others come back by themselves.
 
     Args:
-        plant: whose responses are deformed.
-        deformation: the map.
         warm_up_cycles: number of cycles, counted by 'warm_up', after which a pair is valid: one, or more where the response is
             estimated from more samples.
         largest: response of every controlled coordinate that the limits of the inputs allow; empty: any.
@@ -302,9 +300,6 @@ def with_held_deformation(
     """Return the block deform with what becomes of it where samples may be lost.
 
     Args:
-        plant: whose responses are deformed.
-        deformation: the map of the block.
-        block: see `fpirhc.controllers.base.deform_block`.
         settles: whether responses are estimated.
         answered: number of cycles after which a response answers the last request; infinite where something is late.
     """

@@ -43,11 +43,7 @@ _REFUSES = ContextVar("fpirhc_refuses_gains", default=True)
 
 
 def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
-    """Raise if the deformation cannot converge from the start of the problem.
-
-    Raises:
-        NotContractive: the gain has the wrong sign, or no gain converges; the message names the admissible gains.
-    """
+    """Raise if the deformation cannot converge from the start of the problem."""
     gain = deformation.effective_gain()
     if gain == 0 or not _REFUSES.get():
         return
@@ -61,9 +57,6 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
 
     The dead time of the problem is added where all inputs have the same. Without estimator and filter dead time is not judged. A
     map that changes its gain on line begins where it likes, and so does `BeyondLimit`.
-
-    Raises:
-        NotContractive: the gain is too large; the message names the limit, the gain, and remedies.
     """
     gain, iteration, mirror = deformation.effective_gain(), deformation.iteration, deformation.mirror
     if gain == 0 or not iteration.limited or not iteration.constant or not _REFUSES.get():
@@ -203,11 +196,6 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
 
     Args:
         numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.
-
-    Raises:
-        FpirhcError: the controller's own check fails.
-        NotContractive: the gain of the deformation has the wrong sign, or is too large behind estimator and filter.
-        NotSupported: a form of the deformation that cannot be used here.
     """
     task, build = nominal(problem), nominal(controller)
     ready = _CHECKED.of((task, build), (numbers_only, _REFUSES.get()), lambda: _checked(task, build, numbers_only))
@@ -232,12 +220,7 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
 
 
 def check_form(problem: Problem, controller: Controller) -> None:
-    """Raise if the controller's deformation has a form that cannot be used.
-
-    Raises:
-        NotSupported: the number of dead times or lags differs from the plant's number of channels; a wrapper changes what a
-            model-referenced form inside it compares.
-    """
+    """Raise if the controller's deformation has a form that cannot be used."""
     refuse(_of_form(problem, nominal(controller.deformation)))
 
 

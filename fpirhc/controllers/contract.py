@@ -73,19 +73,14 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class PlantModel:
-    """What a controller knows of its plant.
+    """What a controller knows of its plant."""
 
-    Args:
-        plant: equations of the model.
-        signals: measured disturbances, with their preview.
-        exact: whether its parameters are the exact ones; such a controller is a bound to compare with.
-        given: values of parameters in place of the approximate ones, by name.
-    """
-
-    plant: Plant
-    signals: Mapping[str, Exogenous]
-    exact: bool = False
-    given: Mapping[str, float] = field(default_factory=dict)
+    plant: Plant  # equations of the model
+    signals: Mapping[str, Exogenous]  # measured disturbances, with their preview
+    exact: bool = False  # whether its parameters are the exact ones; such a controller is a bound to compare with
+    given: Mapping[str, float] = field(
+        default_factory=dict
+    )  # values of parameters in place of the approximate ones, by name
 
     def parameters(self, plant: Plant) -> np.ndarray:
         """Return the parameters with which the controller evaluates a plant, shape (np,)."""
@@ -96,31 +91,22 @@ class PlantModel:
 
 @dataclass(frozen=True)
 class Planner:
-    """How a controller plans over the problem's horizon.
+    """How a controller plans over the problem's horizon."""
 
-    Args:
-        optimiser: that finds the plan.
-        cost: of the plan; None: the problem's.
-        restarts: whether every plan starts from the measured state.
-        tracking: the law that keeps the plant on the planned motion between plans; None: the plan's first response is the desired
-            one.
-        margins: distances that plans keep from limits of states; None: those of the problem's horizon.
-        consistent: whether a plan on outputs starts at the state at which the model has the measured ones; None: where the response
-            is corrected.
-        adapts: whether a deformation corrects the response.
-        follows_model: whether a change of the model's parameters changes the command in every cycle, also between plans.
-        independent: whether a plan depends on the plans before it alone, whatever the plant does.
-    """
-
-    optimiser: Optimiser
-    cost: Cost | None
-    restarts: bool
+    optimiser: Optimiser  # that finds the plan
+    cost: Cost | None  # of the plan; None: the problem's
+    restarts: bool  # whether every plan starts from the measured state
+    # the law that keeps the plant on the planned motion between plans; None: the plan's first response is the desired one
     tracking: Tracking | None
+    # distances that plans keep from limits of states; None: those of the problem's horizon
     margins: Mapping[str, Sequence[float]] | None = None
+    # whether a plan on outputs starts at the state at which the model has the measured ones; None: where the response is
+    # corrected
     consistent: bool | None = False
-    adapts: bool = False
+    adapts: bool = False  # whether a deformation corrects the response
+    # whether a change of the model's parameters changes the command in every cycle, also between plans
     follows_model: bool = False
-    independent: bool = False
+    independent: bool = False  # whether a plan depends on the plans before it alone, whatever the plant does
 
     def corrects(self, plant: Plant) -> bool:
         """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""
@@ -152,11 +138,7 @@ class Planner:
         return costed if horizon is costed.horizon else replace(costed, horizon=horizon)
 
     def check_weights(self, problem: Problem) -> None:
-        """Raise where the weights of the cost are not valid; `derived` of the plan block checks its other numbers.
-
-        Raises:
-            InvalidProblem: a weight that is negative or not finite.
-        """
+        """Raise where the weights of the cost are not valid; `derived` of the plan block checks its other numbers."""
         cost = self.cost or problem.cost
         if cost is not None:
             cost.check(problem.plant)
@@ -352,11 +334,7 @@ def late_deformation(deformation: Deformation, problem: Problem, least: float = 
 
 
 def resolved(problem: Problem, controller: Controller) -> Controller:
-    """Return the controller with every automatic setting replaced by its value for this problem.
-
-    Raises:
-        InvalidValue: a setting cannot be chosen; the message names what to set.
-    """
+    """Return the controller with every automatic setting replaced by its value for this problem."""
     if controller.inner is not None:
         inner = resolved(controller.inner_problem(problem), controller.inner)
         controller = controller if inner is controller.inner else with_inner(controller, inner)
@@ -381,20 +359,12 @@ def with_setting(controller: _Own, name: str, value: object) -> _Own | None:
 
 
 def with_optimiser(controller: Controller, optimiser: Optimiser) -> Controller:
-    """Return the controller with another optimiser in its planner.
-
-    Raises:
-        NotSupported: it has no optimiser that can be replaced.
-    """
+    """Return the controller with another optimiser in its planner."""
     return _replaceable(controller, "optimiser", optimiser, "optimiser that can be replaced")
 
 
 def with_margins(controller: Controller, margins: Mapping[str, Sequence[float]]) -> Controller:
-    """Return the controller whose plans keep these distances from limits of states; see `Horizon`.
-
-    Raises:
-        NotSupported: it does not plan over the problem's horizon.
-    """
+    """Return the controller whose plans keep these distances from limits of states; see `Horizon`."""
     return _replaceable(controller, "margins", margins, "plan that could keep margins")
 
 
@@ -406,11 +376,7 @@ def _replaceable(controller: _Own, name: str, value: object, what: str) -> _Own:
 
 
 def refuse_without(controller: Controller, what: str) -> NoReturn:
-    """Raise, because the controller lacks what a question or a change is about.
-
-    Raises:
-        NotSupported: always, with what it lacks.
-    """
+    """Raise, because the controller lacks what a question or a change is about."""
     raise NotSupported(f"{type(innermost(controller)).__name__} has no {what}")
 
 
@@ -421,11 +387,7 @@ def given_response(problem: Problem, controller: Controller) -> Response | None:
 
 
 def require_controlled_response(problem: Problem, controller: Controller, refusal: str) -> None:
-    """Raise where a controller reads other responses than those of the plant's controlled quantities.
-
-    Raises:
-        NotSupported: with the refusal.
-    """
+    """Raise where a controller reads other responses than those of the plant's controlled quantities."""
     if controller.response(problem) is not None:
         raise NotSupported(refusal)
 
@@ -450,20 +412,12 @@ def name_in_task(controller: Controller) -> str:
 
 
 def without_deformation(controller: Controller) -> Controller:
-    """Return the controller of the same settings that does not adapt, beside which a comparison judges this one.
-
-    Raises:
-        NotSupported: it has a deformation that cannot be left out.
-    """
+    """Return the controller of the same settings that does not adapt, beside which a comparison judges this one."""
     return controller.with_deformation(Identity()) if controller.deformation.adapts else controller
 
 
 def refuse(reasons: Iterator[str]) -> None:
-    """Raise with the first reason, where there is one.
-
-    Raises:
-        NotSupported: with the reason.
-    """
+    """Raise with the first reason, where there is one."""
     for reason in reasons:
         raise NotSupported(reason)
 
@@ -473,9 +427,6 @@ def check_chains(problem: Problem, law: str) -> None:
 
     Args:
         law: what needs such a derivative, as the beginning of a sentence.
-
-    Raises:
-        NotSupported: with the law.
     """
     refuse(
         f"{law}, and the command moves '{name}' at once (order 0); use DisturbanceObserver"
@@ -489,9 +440,6 @@ def check_derivatives(problem: Problem, law: str) -> None:
 
     Args:
         law: what the law does with derivatives, as the beginning of a sentence.
-
-    Raises:
-        NotSupported: with the law.
     """
     what = rateless(problem.plant)
     if what:

@@ -98,7 +98,6 @@ def gap_of(problem: Problem, bridged: int) -> Gap:
 
     Args:
         problem: of the steps; where state and response are measured as they are, nothing settles.
-        bridged: number of missing cycles up to which a gap is bridged.
     """
     if not problem.sensing.estimates:
         return Gap(bridged, 0.0)
@@ -169,25 +168,15 @@ INNER = "controller_memory"  # in the memory: that of a graph as one signal
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """What a sample and the gate's memory say.
+    """What a sample and the gate's memory say."""
 
-    Args:
-        fits: whether the sample fits.
-        held: the last command.
-        stored: of the last good sample, which may be this one.
-        doubted: count of doubted samples of the next cycle.
-        counts: of gaps, by name; none where no sample can be lost.
-        told: what the step is told, by name.
-        passes: whether a cycle without a sample is one of a gap.
-    """
-
-    fits: ca.SX
-    held: ca.SX
-    stored: ca.SX
-    doubted: ca.SX
-    counts: Counts
-    told: Counts
-    passes: Expression
+    fits: ca.SX  # whether the sample fits
+    held: ca.SX  # the last command
+    stored: ca.SX  # of the last good sample, which may be this one
+    doubted: ca.SX  # count of doubted samples of the next cycle
+    counts: Counts  # of gaps, by name; none where no sample can be lost
+    told: Counts  # what the step is told, by name
+    passes: Expression  # whether a cycle without a sample is one of a gap
 
 
 def _scalar(name: str, symbols: Sequence[ca.SX], results: Sequence[Expression]) -> ca.Function:
@@ -196,25 +185,19 @@ def _scalar(name: str, symbols: Sequence[ca.SX], results: Sequence[Expression]) 
 
 @dataclass(frozen=True, eq=False)
 class Gate:
-    """The gate around a controller's step.
+    """The gate around a controller's step."""
 
-    Args:
-        problem: that the step is composed for.
-        inner: the step of a controller, with the output 'command'.
-        trusted: what is always good and not checked, such as the 'time' of a simulated clock, or the 'memory' that a loop keeps.
-        plausible: intervals (lower, upper) by column of the sample, "state.q1" or "realised.q1"; every finite number fits where
-            there is none.
-        max_age: s; where given, the step also reads 'taken', the time stamp of the sample, which must be later than the last one's,
-            not later than the time, and not older than this. None: time stamps are not looked at.
-        gap: counts missing cycles; None: no sample can be lost.
-    """
-
-    problem: Problem
-    inner: Composite
+    problem: Problem  # that the step is composed for
+    inner: Composite  # the step of a controller, with the output 'command'
+    # what is always good and not checked, such as the 'time' of a simulated clock, or the 'memory' that a loop keeps
     trusted: Sequence[str] = ()
+    # intervals (lower, upper) by column of the sample, "state.q1" or "realised.q1"; every finite number fits where there is
+    # none
     plausible: Mapping[str, Interval] = field(default_factory=dict)
+    # s; where given, the step also reads 'taken', the time stamp of the sample, which must be later than the last one's,
+    # not later than the time, and not older than this. None: time stamps are not looked at.
     max_age: float | None = None
-    gap: Gap | None = None
+    gap: Gap | None = None  # counts missing cycles; None: no sample can be lost
 
     @cached_property
     def reads(self) -> Layout:

@@ -49,21 +49,13 @@ Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interv
 
 @dataclass(frozen=True, eq=False)
 class LiveSettings:
-    """The live settings of one loop.
+    """The live settings of one loop."""
 
-    Args:
-        problem: the problem with the numbers of the build.
-        unresolved: the controller with automatic settings still open, with the numbers of the build.
-        controller: the same with its automatic settings chosen.
-        paths: of all live numbers, intervals as their ends.
-        automatic: paths of automatic settings, which follow from the others.
-    """
-
-    problem: Problem
-    unresolved: Controller
-    controller: Controller
-    paths: tuple[str, ...] = ()
-    automatic: tuple[str, ...] = ()
+    problem: Problem  # the problem with the numbers of the build
+    unresolved: Controller  # the controller with automatic settings still open, with the numbers of the build
+    controller: Controller  # the same with its automatic settings chosen
+    paths: tuple[str, ...] = ()  # of all live numbers, intervals as their ends
+    automatic: tuple[str, ...] = ()  # paths of automatic settings, which follow from the others
 
     @property
     def start(self) -> dict[str, float]:
@@ -102,11 +94,7 @@ class LiveSettings:
         return problem, controller
 
     def composed(self, compose: Callable[[Problem, Controller], Composite]) -> Composite:
-        """Return what `compose` makes of problem and controller with live numbers.
-
-        Raises:
-            NotSupported: a setting that is needed as a number while the loop is built, or that the loop does not use.
-        """
+        """Return what `compose` makes of problem and controller with live numbers."""
         problem, controller = self.planted()
         try:
             composite = compose(problem, controller)
@@ -173,10 +161,6 @@ class LiveSettings:
 
         Args:
             numbers: by path, a pair for an interval; settings that are not named have the numbers of the build.
-
-        Raises:
-            InvalidName: a setting that is not live.
-            InvalidValue: a number that the setting does not accept, or with which the loop does not contract.
         """
         values = {path: value for path, value in self.start.items() if path in self.paths}
         values |= self.flat(numbers)
@@ -221,12 +205,7 @@ class LiveSettings:
         return True
 
     def flat(self, numbers: Numbers) -> dict[str, float]:
-        """Return numbers by path, with the ends of intervals one by one.
-
-        Raises:
-            InvalidName: a setting that is not live; the nearest one is offered.
-            InvalidValue: no number, or no pair of numbers for an interval.
-        """
+        """Return numbers by path, with the ends of intervals one by one."""
         values: dict[str, float] = {}
         for path, value in numbers.items():
             ends = [p for p in self.paths if p in (path, f"{path}.0", f"{path}.1")]
@@ -266,13 +245,7 @@ class LiveSettings:
 
 
 def live_settings(problem: Problem, controller: Controller, paths: Sequence[str] = ()) -> LiveSettings:
-    """Return the live settings of a loop, with the controller resolved.
-
-    Raises:
-        InvalidName: no such setting; the nearest one is offered.
-        InvalidValue: no number stands at a path.
-        NotSupported: a setting that decides what the loop is made of.
-    """
+    """Return the live settings of a loop, with the controller resolved."""
     every = tuple(dict.fromkeys(end for path in paths for end in _ends(problem, controller, path)))
     of_problem = [path for path in every if _owner(problem, controller, path) is problem]
     problem, controller = opened(problem, of_problem), opened(controller, [p for p in every if p not in of_problem])
@@ -348,21 +321,13 @@ def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Con
 
 
 def _require_moving(path: str, composite: Composite) -> None:
-    """Raise for a parameter of what moves where nothing moves.
-
-    Raises:
-        NotSupported: a controller alone, as on a machine.
-    """
+    """Raise for a parameter of what moves where nothing moves."""
     if MOVING not in composite.memory:
         raise not_live([path], "nothing moves in a controller alone; change the machine", " here")
 
 
 def _refuse_lost(composite: Composite, paths: Sequence[str]) -> None:
-    """Raise where a Function holds the number NaN: CasADi makes it of a symbol that is turned into a number.
-
-    Raises:
-        NotSupported: some block has such a constant.
-    """
+    """Raise where a Function holds the number NaN: CasADi makes it of a symbol that is turned into a number."""
     for block in composite.blocks:
         if holds_nan(block.function):
             raise not_live(paths, f"block '{block.name}' turns one of them into a number, which is NaN", " together")

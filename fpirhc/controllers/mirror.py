@@ -49,17 +49,11 @@ def believed_path(problem: Problem, deformation: Deformation, owner: str = "mirr
 
 
 class Answers(NamedTuple):
-    """The responses that a model gives.
+    """The responses that a model gives."""
 
-    Args:
-        response: function of (state, input, parameters).
-        orders: of the responses, by name.
-        signal: that holds them.
-    """
-
-    response: Callable[[Expression, Expression, Expression], Expression]
-    orders: Mapping[str, int]
-    signal: Signal
+    response: Callable[[Expression, Expression, Expression], Expression]  # function of (state, input, parameters)
+    orders: Mapping[str, int]  # of the responses, by name
+    signal: Signal  # that holds them
 
 
 def _controlled(plant: Plant) -> Answers:
@@ -75,7 +69,6 @@ def instant_mirror(path: CommandPath, answers: Answers | None = None, *, lost: b
     modelled_k = y^_r(x_{k-r}, u_{k-r}), u the input that acted then according to the beliefs.
 
     Args:
-        path: of the commands to the model.
         answers: of the model; None: the controlled responses.
         lost: whether samples may be lost; the state of the last cycle is then on the line over the gap.
     """
@@ -225,8 +218,6 @@ def _seen(problem: Problem, names: Sequence[str], shifted: Sequence[str]) -> ca.
     """Function (state, command that acted, parameters, shift) -> what the sensors show without noise, rounded as they round.
 
     Args:
-        problem: with the model and the sensors.
-        names: of what they show.
         shifted: names of the quantities to which the entries of the shift are added.
     """
     (x, u, p), shift = problem.plant.symbols(), ca.SX.sym("shift", len(shifted))
@@ -240,9 +231,6 @@ def memory_moves(problem: Problem, names: Sequence[str]) -> list[ca.DM]:
     """Return the matrices that turn a move of the estimated state, or outputs, into moves of what the estimator remembers.
 
     What is remembered at a start is linear in the start; a cycle later the start would have been on the same path.
-
-    Args:
-        names: of what it measures.
     """
     motion = problem.plant.output
     ahead, size = drift(motion, problem.period), motion.size

@@ -37,14 +37,10 @@ MEASURED_TIME = "_measured_time"  # the time at which it is given, where a contr
 
 @dataclass(frozen=True, eq=False)
 class KnownSignals:
-    """What a model is told.
-
-    Args:
-        signals: from outside, by name.
-    """
+    """What a model is told."""
 
     plant: Plant
-    signals: Mapping[str, Exogenous]
+    signals: Mapping[str, Exogenous]  # from outside, by name
     period: float
 
     @property
@@ -106,25 +102,15 @@ class KnownSignals:
 
 @dataclass(frozen=True, eq=False)
 class CommandPath:
-    """What acted until a sample was taken.
+    """What acted until a sample was taken."""
 
-    Args:
-        problem: with the model.
-        owner: first part of the names of what is remembered.
-        last: signal of the command of the last cycle.
-        inputs: how many cycles commands are late.
-        measurement: cycles by which samples are late.
-        lag: time constant of the actuators, one for all or one for each.
-        counts: whether the first cycles differ from the others.
-    """
-
-    problem: Problem
-    owner: str
-    last: Signal
-    inputs: Queue
-    measurement: float = 0.0
-    lag: float | tuple[float, ...] = 0.0
-    counts: bool = True
+    problem: Problem  # with the model
+    owner: str  # first part of the names of what is remembered
+    last: Signal  # signal of the command of the last cycle
+    inputs: Queue  # how many cycles commands are late
+    measurement: float = 0.0  # cycles by which samples are late
+    lag: float | tuple[float, ...] = 0.0  # time constant of the actuators, one for all or one for each
+    counts: bool = True  # whether the first cycles differ from the others
 
     @property
     def late(self) -> int:

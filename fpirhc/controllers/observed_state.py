@@ -38,19 +38,12 @@ from fpirhc.task.problem import Problem, nominal_start
 
 @dataclass(frozen=True, eq=False)
 class Believing:
-    """The block that believes, and what it remembers.
+    """The block that believes, and what it remembers."""
 
-    Args:
-        problem: whose sensing has an observer.
-        raw: signal of the raw measurements.
-        shown: first state, or outputs, that the sensors see; the estimator begins there.
-        lost: whether samples may be lost.
-    """
-
-    problem: Problem
-    raw: Signal
-    shown: np.ndarray
-    lost: bool = False
+    problem: Problem  # whose sensing has an observer
+    raw: Signal  # signal of the raw measurements
+    shown: np.ndarray  # first state, or outputs, that the sensors see; the estimator begins there
+    lost: bool = False  # whether samples may be lost
 
     @property
     def block(self) -> Block:
@@ -201,17 +194,11 @@ _STAYS = 1e-9  # share of the fastest pole below which an error counts as stayin
 
 @dataclass(frozen=True)
 class UnobservableErrors:
-    """Errors of believed states that no measurement corrects.
+    """Errors of believed states that no measurement corrects."""
 
-    Args:
-        states: names of the states that have a part in them.
-        pole: largest real part of their poles along the reference, 1 / unit of time; negative: all decay.
-        decays: whether they decay by themselves.
-    """
-
-    states: tuple[str, ...]
-    pole: float
-    decays: bool
+    states: tuple[str, ...]  # names of the states that have a part in them
+    pole: float  # largest real part of their poles along the reference, 1 / unit of time; negative: all decay
+    decays: bool  # whether they decay by themselves
 
 
 @lru_cache(maxsize=8)  # several controllers are checked on one problem
@@ -235,11 +222,7 @@ def unobservable_errors(problem: Problem) -> UnobservableErrors:
 
 
 def check_observed(problem: Problem) -> None:
-    """Raise if errors are neither observed nor decay, and the observer cannot bear that.
-
-    Raises:
-        NoAnswer: with the states, and what would help.
-    """
+    """Raise if errors are neither observed nor decay, and the observer cannot bear that."""
     observer = problem.sensing.observer
     if observer is None or not observer.needs_detectability:
         return
@@ -254,12 +237,7 @@ def check_observed(problem: Problem) -> None:
 
 
 def check_believed(problem: Problem, controller: Controller) -> None:
-    """Raise if a controller cannot be given believed states, or the observer cannot be right.
-
-    Raises:
-        NotSupported: an adaptive controller whose response nobody measures; a model with other parameters than the problem's;
-            errors that are neither observed nor decay.
-    """
+    """Raise if a controller cannot be given believed states, or the observer cannot be right."""
     if problem.sensing.observer is not None:
         refuse(_against(problem, controller))
         check_observed(problem)

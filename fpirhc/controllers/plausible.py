@@ -40,9 +40,6 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
 
     Args:
         own: intervals by name, "q1", "q1'", or "q1''" for the response, that replace the automatic ones.
-
-    Raises:
-        InvalidProblem: a name that is unknown or not measured, or an interval that is none.
     """
     columns = _columns(problem)
     _check(own or {}, columns)
@@ -175,17 +172,12 @@ JUMPS = "jumps"  # in the memory: last believed responses, last doubted ones, us
 
 @dataclass(frozen=True, eq=False)
 class Jumps:
-    """The check of one signal.
-
-    Args:
-        places: of the responses in it that are checked.
-        scale: of these responses.
-    """
+    """The check of one signal."""
 
     problem: Problem
     signal: Signal
-    places: Sequence[int]
-    scale: Scale
+    places: Sequence[int]  # of the responses in it that are checked
+    scale: Scale  # of these responses
 
     @property
     def believed(self) -> Signal:
@@ -247,11 +239,7 @@ class Jumps:
 
 
 def response_jumps(problem: Problem, reads: Layout) -> Jumps | None:
-    """Return the check of the responses that a step reads, of those whose scale is known; None where there are none.
-
-    Args:
-        problem: the task, with the numbers of the build.
-    """
+    """Return the check of the responses that a step reads, of those whose scale is known; None where there are none."""
     raw, names = raw_signal(problem), response_names(problem.plant)
     signal = reads["realised"] if raw is None and "realised" in reads else raw
     if signal is None or (raw is None and signal.size != len(names)):

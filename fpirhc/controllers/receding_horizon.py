@@ -231,12 +231,7 @@ _PLANNED_BEFORE = "_planned_before"
 
 
 def _room(problem: Problem, replanning: Replanning) -> np.ndarray | None:
-    """What plans leave of the range of every input, shape (nu,); None: they have the range less the deformation of the last cycle.
-
-    Raises:
-        InvalidName: an input that the plant does not have.
-        InvalidProblem: a room that leaves nothing between two limits.
-    """
+    """What plans leave of the range of every input, shape (nu,); None: their range less the deformation of the last cycle."""
     if replanning.room is None:
         return None
     names = list(problem.plant.inputs)

@@ -91,15 +91,10 @@ _SAMPLES = 100  # instants at which the reference is looked at
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """How large responses are.
+    """How large responses are."""
 
-    Args:
-        largest: L of every controlled coordinate; infinite where an input has no finite limits.
-        slope: largest change of a response per change of an input, shape (n, nu).
-    """
-
-    largest: tuple[float, ...]
-    slope: np.ndarray
+    largest: tuple[float, ...]  # L of every controlled coordinate; infinite where an input has no finite limits
+    slope: np.ndarray  # largest change of a response per change of an input, shape (n, nu)
 
     def of(self, places: Sequence[int]) -> Scale:
         """Return the scale of some responses."""
@@ -180,11 +175,7 @@ def request_along_reference(problem: Problem, law: Tracking | None = None) -> Re
 
 
 def request_of_plans(problem: Problem) -> RequestChange:
-    """Return the jump of the model's response when the command jumps from limit to limit in one cycle.
-
-    Raises:
-        InvalidValue: some input has no finite limits, so the jump has no bound.
-    """
+    """Return the jump of the model's response when the command jumps from limit to limit in one cycle."""
     plant = problem.plant
     lower, upper = problem.limits.input_bounds(plant)
     if not np.all(np.isfinite(upper - lower)):

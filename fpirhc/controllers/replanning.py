@@ -253,7 +253,6 @@ def first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, da
     """Return the optimiser's memory before the run.
 
     Args:
-        problem: with numbers for its live settings.
         data_of: Function (time, parameters, live numbers) -> data of the horizon.
     """
     first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()

@@ -28,18 +28,12 @@ _NONE = 1e-9  # a fraction of a cycle below this counts as zero
 
 @dataclass(frozen=True, eq=False)
 class ResponsePairs:
-    """Pairs of a learner.
+    """Pairs of a learner."""
 
-    Args:
-        problem: with the plant that is measured.
-        dead_time: that is believed.
-        with_outputs: whether the measured outputs of that instant belong to a pair.
-        age: cycles by which the state is older; a map's response belongs to the state of the cycle before (`response_age`).
-    """
-
-    problem: Problem
-    dead_time: DeadTime
-    with_outputs: bool = False
+    problem: Problem  # with the plant that is measured
+    dead_time: DeadTime  # that is believed
+    with_outputs: bool = False  # whether the measured outputs of that instant belong to a pair
+    # cycles by which the state is older; a map's response belongs to the state of the cycle before (`response_age`)
     age: int = 0
 
     @property
@@ -103,12 +97,7 @@ class ResponsePairs:
         return command, remembered
 
     def pair(self, s: Signals, newest: Expression) -> tuple[Expression, Expression, dict[str, Expression]]:
-        """Return state and command of the response, and what is remembered.
-
-        Args:
-            s: signals of the cycle.
-            newest: command of the last cycle.
-        """
+        """Return state and command of the response, and what is remembered."""
         state = getattr(s, MEASURED if self.waiting else self.problem.plant.state.name)
         state, states = self._states.arrived(s, _STATES, state)
         command, commands = self._commands.arrived(s, _COMMANDS, newest)

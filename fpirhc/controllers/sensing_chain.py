@@ -40,9 +40,6 @@ def compose_with_sensing(problem: Problem, controller: Controller) -> Composite:
     """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
 
     Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.
-
-    Args:
-        problem: that the controller is composed for.
     """
     return _LATEST.of((problem, controller), (plans_are_compiled(),), lambda: _composed(problem, controller))
 
@@ -247,11 +244,7 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
 
 
 def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], list[Delay]]:
-    """The blocks of a controller and what they remember.
-
-    Raises:
-        InvalidProblem: it gives something else.
-    """
+    """The blocks of a controller and what they remember."""
     given: object = controller.blocks(problem)
     pair = given if isinstance(given, tuple) and len(given) == 2 else None
     kinds = (Block, Delay)
@@ -271,11 +264,6 @@ def compose_informed(
     """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
 
     Args:
-        problem: that the controller is composed for.
-        ready: the controller, checked.
-        reads: what the step reads.
-        blocks: of the step.
-        delays: what the step remembers of its signals.
         ahead: whether the time is the one at which the command will act.
     """
     model = ready.plant_model(problem)

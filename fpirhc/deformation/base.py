@@ -133,18 +133,14 @@ class Pairing:
 
 @dataclass(frozen=True)
 class RequestChange:
-    """How much the desired response of a controller changes, for maps whose automatic settings depend on it.
+    """How much the desired response of a controller changes, for maps whose automatic settings depend on it."""
 
-    Args:
-        change: largest change in one cycle, in units of the response.
-        sudden: whether the change is an occasional jump, which one step has to cover. Otherwise it goes on from cycle to cycle,
-            and the map needs room beyond it.
-        recovery: step per cycle with which the plain form comes back from the largest response error that is expected, in units
-            of the response (`fpirhc.contraction.large_errors`).
-    """
-
-    change: float
+    change: float  # largest change in one cycle, in units of the response
+    # whether the change is an occasional jump, which one step has to cover. Otherwise it goes on from cycle to cycle, and
+    # the map needs room beyond it.
     sudden: bool
+    # step per cycle with which the plain form comes back from the largest response error that is expected, in units of the
+    # response (`fpirhc.contraction.large_errors`)
     recovery: float = 0.0
 
 
@@ -281,11 +277,7 @@ class Deformation(Checked, ABC):
 
 
 def with_inner(wrapper: Wrapping, inner: object) -> Wrapping:
-    """Return a frozen dataclass with another value in the field that holds its `inner`.
-
-    Raises:
-        NotSupported: no field holds it.
-    """
+    """Return a frozen dataclass with another value in the field that holds its `inner`."""
     current = getattr(wrapper, "inner", None)
     names = [name for name, value in vars(wrapper).items() if value is current]
     changed = replaced(wrapper, names[0], inner) if names and current is not None else None

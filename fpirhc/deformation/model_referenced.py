@@ -126,11 +126,7 @@ class ModelReferenced(Wrapper):
 
 
 def require_map_of_plan(owner: str, deformation: Deformation) -> None:
-    """Check that a map may be given its own last request, as a plan has nothing else.
-
-    Raises:
-        NotSupported: a model-referenced form.
-    """
+    """Check that a map may be given its own last request, as a plan has nothing else."""
     deformation.mirror.require_last_request(
         f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a plan's "
         "gradient has no model beside it; use the map inside"

@@ -44,24 +44,12 @@ _BARE = (
 
 
 def shared_libraries(files: Mapping[str, str]) -> dict[str, bytes]:
-    """Return a shared library by platform, "x86_64-linux" and so on; nothing where there is no compiler.
-
-    Args:
-        files: C files and headers by name.
-
-    Raises:
-        CompileError: a compiler refuses them, with its message.
-    """
+    """Return a shared library by platform, "x86_64-linux" and so on; nothing where there is no compiler."""
     return {place: _compiled(files, command, place) for place, command in _compilers().items()}
 
 
 def program(sources: Sequence[Path], made: Path, *flags: str) -> None:
-    """Build a program of C files for this machine.
-
-    Raises:
-        NotInstalled: there is no compiler.
-        CompileError: it refuses the files.
-    """
+    """Build a program of C files for this machine."""
     command = [
         own_compiler(),
         "-std=c99",
@@ -77,11 +65,7 @@ def program(sources: Sequence[Path], made: Path, *flags: str) -> None:
 
 
 def own_compiler() -> str:
-    """Return the C compiler of this machine.
-
-    Raises:
-        NotInstalled: there is none.
-    """
+    """Return the C compiler of this machine."""
     own = find_compiler()
     if own is None:
         raise NotInstalled(
@@ -91,12 +75,7 @@ def own_compiler() -> str:
 
 
 def web_module(files: Mapping[str, str]) -> bytes:
-    """Return a WebAssembly module of C files, without imports.
-
-    Raises:
-        NotInstalled: ziglang is not installed.
-        CompileError: it refuses the files.
-    """
+    """Return a WebAssembly module of C files, without imports."""
     package("ziglang", "compiler", "the target wasm")
     # 256 kB hold the deepest plan; zig's own 16 MB are all that a page would ask for.
     flags = ("-mexec-model=reactor", "-Wl,-z,stack-size=262144", "-Wl,--no-entry")
@@ -104,17 +83,7 @@ def web_module(files: Mapping[str, str]) -> bytes:
 
 
 def arm_programs(files: Mapping[str, str], around: Mapping[str, str], script: str) -> dict[str, bytes]:
-    """Return a program and a library of C files by processor, "m7.elf", "m7.a" and so on; M7 computes in double, M4F in float.
-
-    Args:
-        files: C files and headers by name.
-        around: C files that are in the programs alone.
-        script: of the linker.
-
-    Raises:
-        NotInstalled: ziglang is not installed.
-        CompileError: it refuses the files.
-    """
+    """Return a program and a library of C files by processor, "m7.elf", "m7.a" and so on; M7 computes in double, M4F in float."""
     package("ziglang", "cortex", "the target cortex-m")
     made: dict[str, bytes] = {}
     with tempfile.TemporaryDirectory() as name:

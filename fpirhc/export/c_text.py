@@ -50,7 +50,6 @@ def portable(text: str, visible: str) -> str:
     """Return a C text with what its function `visible` needs, for every compiler of C99.
 
     Args:
-        text: generated C.
         visible: name of the only function that other files call; declarations of other files stay.
     """
     text = _TUNED.sub("", _PORTABLE.sub(r"\1", text))

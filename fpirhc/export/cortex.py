@@ -25,9 +25,6 @@ _ALLOCATED = 2  # flag of a section that lies in memory
 class Image:
     """A program for a Cortex-M as an ELF file.
 
-    Args:
-        path: of the file.
-
     Raises:
         InvalidValue: it is no 32-bit ELF file for ARM.
     """
@@ -58,9 +55,6 @@ class Board:
     """An image in a processor, with a console.
 
     Args:
-        image: the program.
-        source: bytes for it to read.
-        to: where its bytes go.
         counted: name of the function whose instructions are counted.
 
     Raises:

@@ -46,27 +46,18 @@ _LONGEST = 40  # characters of a name
 
 @dataclass(frozen=True, eq=False)
 class Device:
-    """A controller for a device.
+    """A controller for a device."""
 
-    Args:
-        name: prefix of everything in C.
-        title: of problem and controller.
-        problem: of the controller.
-        controller: as the problem file has it.
-        stepper: of the controller; compiled where there is a compiler, so that its numbers are those of C to the last bit.
-        cycles: number of cycles that are recorded for a replay.
-        libm: "system" or "own": exp, log, pow, sin, cos, tanh and atanh of the machine, or those with the same bits everywhere.
-        bare: whether the step is the controller's alone, without gate, watch and missed cycles.
-    """
-
-    name: str
-    title: str
-    problem: Problem
-    controller: Controller
+    name: str  # prefix of everything in C
+    title: str  # of problem and controller
+    problem: Problem  # of the controller
+    controller: Controller  # as the problem file has it
+    # of the controller; compiled where there is a compiler, so that its numbers are those of C to the last bit
     stepper: Stepper | BareStep
-    cycles: int
+    cycles: int  # number of cycles that are recorded for a replay
+    # "system" or "own": exp, log, pow, sin, cos, tanh and atanh of the machine, or those with the same bits everywhere
     libm: str = "system"
-    bare: bool = False
+    bare: bool = False  # whether the step is the controller's alone, without gate, watch and missed cycles
 
     @cached_property
     def inputs(self) -> Layout:
@@ -87,11 +78,7 @@ class Device:
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """Intervals of the live settings, by path.
-
-        Raises:
-            NotSupported: a number follows from a setting that must not stay as it was, and a device cannot compute it.
-        """
+        """Intervals of the live settings, by path."""
         outdated = [name for name, effect in self.stepper.outdated().items() if not effect]
         if outdated:
             raise NotSupported(
@@ -130,8 +117,6 @@ class BareStep:
     not made up for.
 
     Args:
-        problem: of the controller.
-        controller: to be composed.
         behind: the step of the same controller behind its gate; its data are taken.
     """
 
@@ -171,9 +156,6 @@ def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, i
     """Return the C files of a Function, whose name in C is NAME_raw, and the sizes of its work: arg, res, iw, w.
 
     Who calls it passes rows for all that it reads and writes.
-
-    Raises:
-        NotSupported: a part of it cannot be written as C.
     """
     texts, files = generate(function), []
     sizes = {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", texts[0])}
@@ -214,11 +196,7 @@ def identifiers(names: Sequence[str]) -> list[str]:
 
 
 def check_name(name: str) -> None:
-    """Raise for a name that C does not take as a prefix.
-
-    Raises:
-        InvalidName: it is none; one is offered.
-    """
+    """Raise for a name that C does not take as a prefix."""
     if re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) and name not in _C_WORDS | _FILES and len(name) <= _LONGEST:
         return
     offer = default_name(name)

@@ -63,38 +63,25 @@ STATUS = Variable("status", "", "output")  # a whole number
 
 @dataclass(frozen=True)
 class Interface:
-    """A version of FMI.
+    """A version of FMI."""
 
-    Args:
-        version: "2.0" or "3.0".
-        code: template of the functions that a master calls.
-        headers: files of the standard that it includes.
-        token: attribute that holds the unit's key.
-        step: attributes of the co-simulation that this version alone has, from the period.
-        add: puts a variable with its number into the list of variables.
-        structure: puts what is computed, as numbers of the variables, into the structure of the model.
-        build: says how the sources are built: changes the description, or returns files beside it.
-        folders: name of the folder of a platform's library, where this version has one.
-    """
-
-    version: str
-    code: str
-    headers: tuple[str, ...]
-    token: str
-    step: Callable[[str], Mapping[str, str]]
-    add: Callable[[ET.Element, int, Variable], None]
+    version: str  # "2.0" or "3.0"
+    code: str  # template of the functions that a master calls
+    headers: tuple[str, ...]  # files of the standard that it includes
+    token: str  # attribute that holds the unit's key
+    step: Callable[
+        [str], Mapping[str, str]
+    ]  # attributes of the co-simulation that this version alone has, from the period
+    add: Callable[[ET.Element, int, Variable], None]  # puts a variable with its number into the list of variables
+    # puts what is computed, as numbers of the variables, into the structure of the model
     structure: Callable[[ET.Element, list[int]], None]
+    # says how the sources are built: changes the description, or returns files beside it
     build: Callable[[ET.Element, str, list[str]], Mapping[str, ET.Element]]
-    folders: Mapping[str, str]
+    folders: Mapping[str, str]  # name of the folder of a platform's library, where this version has one
 
 
 def mock_up_unit(device: Device, interface: Interface) -> Mapping[str, str | bytes]:
-    """Return a unit as an archive, and a page that says what is in it.
-
-    Raises:
-        NotSupported: FMPy, which brings the headers of the standard, is not installed.
-        CompileError: a compiler refuses the sources.
-    """
+    """Return a unit as an archive, and a page that says what is in it."""
     folder = Path(package("fmpy", "fmu", "the target fmu").__file__).parent / "c-code"
     headers = {name: (folder / name).read_text(encoding="utf-8") for name in interface.headers}
     variables, own = _variables(device), sources(device)

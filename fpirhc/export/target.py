@@ -54,11 +54,7 @@ def targets() -> dict[str, Target]:
 
 
 def target_called(name: str) -> Target:
-    """Return a target.
-
-    Raises:
-        InvalidName: there is none of this name.
-    """
+    """Return a target."""
     if name not in targets():
         raise InvalidName(f"the target '{name}' is unknown.{nearest(name, list(targets()))}")
     return targets()[name]
@@ -78,19 +74,9 @@ def device_of(
     """Return a controller for a device.
 
     Args:
-        problem: of the controller.
-        controller: to be exported.
-        title: its name in the problem file.
         name: prefix of everything in C; None: made of the title.
-        live: paths of live settings.
-        cycles: to be recorded for a replay.
         libm: "system", or "own" for the same bits on every machine.
         bare: whether the step is to be the controller's alone, without gate, watch and missed cycles.
-
-    Raises:
-        InvalidName: no C name, or no setting.
-        InvalidValue: live settings of a bare step, which has constants.
-        NotSupported: a controller that needs a solver's own library, or settings that Python must follow up.
     """
     whole = f"{problem.name} {title}"
     chosen = default_name(whole) if name is None else name
@@ -109,11 +95,7 @@ def device_of(
 
 
 def write(device: Device, target: Target, folder: Path) -> list[Path]:
-    """Write the files of a target into a new or empty folder, and return their paths.
-
-    Raises:
-        OutputError: the folder is not empty, or cannot be written.
-    """
+    """Write the files of a target into a new or empty folder, and return their paths."""
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise OutputError(
@@ -132,12 +114,7 @@ def write(device: Device, target: Target, folder: Path) -> list[Path]:
 
 
 def processor_of(target: Target) -> Callable[[Path, str], Sequence[str]]:
-    """Return the function that gives a target's program.
-
-    Raises:
-        InvalidValue: it has none.
-        NotInstalled: it cannot be built here.
-    """
+    """Return the function that gives a target's program."""
     if target.processor is None:
         there = ", ".join(one.name for one in targets().values() if one.processor is not None)
         raise InvalidValue(f"--check is there for {there}, not for {target.name}")
@@ -150,11 +127,6 @@ def in_the_loop(device: Device, target: Target, folder: Path) -> tuple[int, floa
     """Return the cycles of a run with the exported program, and how far its commands are from those of this process.
 
     The difference is the largest one, relative to the largest command.
-
-    Raises:
-        NotSupported: the target has no such program, or the problem is none for it.
-        CompileError: the program cannot be built.
-        OutputError: it cannot be started.
     """
     outside = Processor(processor_of(target)(folder, device.name))
     run, other = (simulate(device.problem, one, seed=0) for one in (device.controller, outside))

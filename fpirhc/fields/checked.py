@@ -155,9 +155,6 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function with a check of its arguments: a decorator for the verbs of the library.
 
     An annotation whose name the module imports for type checkers only checks nothing.
-
-    Raises:
-        InvalidField: all wrong arguments together, when the function is called.
     """
 
     @wraps(function)
@@ -180,23 +177,14 @@ def checks_of(function: Callable[..., object]) -> _Arguments:
 
 @dataclass(frozen=True)
 class _Arguments:
-    """The arguments of a class or a function.
+    """The arguments of a class or a function."""
 
-    Args:
-        owner: what is called.
-        noun: what an argument of it is called, "field" or "argument".
-        positional: names of those that may be given by their place.
-        required: names of those without a default.
-        expected: what is expected of each, by name.
-        open: whether more arguments are taken than are named.
-    """
-
-    owner: type | Callable[..., object]
-    noun: str
-    positional: tuple[str, ...]
-    required: tuple[str, ...]
-    expected: Mapping[str, Expected]
-    open: bool
+    owner: type | Callable[..., object]  # what is called
+    noun: str  # what an argument of it is called, "field" or "argument"
+    positional: tuple[str, ...]  # names of those that may be given by their place
+    required: tuple[str, ...]  # names of those without a default
+    expected: Mapping[str, Expected]  # what is expected of each, by name
+    open: bool  # whether more arguments are taken than are named
 
     def mistakes(self, arguments: Sequence[object], named: Mapping[str, object]) -> Iterator[str]:
         """Yield every mistake of a call."""

@@ -67,21 +67,13 @@ def signature_of(function: Callable[..., object]) -> str:
 
 @dataclass(frozen=True)
 class Range:
-    """The interval of a number, with its words for a user.
+    """The interval of a number, with its words for a user."""
 
-    Args:
-        words: of the whole expectation: "a positive number".
-        low: least value.
-        high: largest value.
-        open_low: whether `low` itself is refused.
-        open_high: whether `high` itself is refused.
-    """
-
-    words: str
-    low: float = -math.inf
-    high: float = math.inf
-    open_low: bool = False
-    open_high: bool = False
+    words: str  # of the whole expectation: "a positive number"
+    low: float = -math.inf  # least value
+    high: float = math.inf  # largest value
+    open_low: bool = False  # whether `low` itself is refused
+    open_high: bool = False  # whether `high` itself is refused
 
     def holds(self, value: float) -> bool:
         """Whether the value lies in the range; NaN does not."""
@@ -161,11 +153,7 @@ Value = TypeVar("Value")
 
 
 def named_entries(what: str, entries: Mapping[str, Value]) -> Mapping[str, Value]:
-    """Return the entries as they are, by name; `what` names them: "settings".
-
-    Raises:
-        InvalidField: no mapping, or names that are no texts.
-    """
+    """Return the entries as they are, by name; `what` names them: "settings"."""
     if not isinstance(entries, Mapping):
         raise InvalidField([f"{what}: expected a mapping {{name: number}}, got {described(entries)}"])
     strange = [name for name in entries if not isinstance(name, str)]

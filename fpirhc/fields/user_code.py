@@ -26,11 +26,7 @@ Result = TypeVar("Result")
 
 
 def called(what: str, function: Callable[..., Result], *arguments: object) -> Result:
-    """Return what a user's function gives for symbols; `what` names it: "response".
-
-    Raises:
-        InvalidProblem: the function raises an error; its line is named.
-    """
+    """Return what a user's function gives for symbols; `what` names it: "response"."""
     try:
         with warnings.catch_warnings():
             # CasADi announces that its numpy functions will change their shape; scalars do not.
@@ -53,14 +49,9 @@ def scalar_expression(
     """Return a result of a user's function as one scalar expression.
 
     Args:
-        what: the name of the result.
-        value: the result.
         of: the user's function, whose source is searched for the cause of NaN.
         symbols: those that the result may hold; without them any.
         finite: whether NaN is refused. CasADi makes NaN of math.sin(symbol), and says nothing.
-
-    Raises:
-        InvalidProblem: it is none, it holds NaN, or it holds a symbol of the user's own, which has no value.
     """
     if not isinstance(value, ca.SX | ca.MX | ca.DM | int | float | np.number):
         raise InvalidProblem(f"{what} must be one scalar expression, got {described(value)}")
@@ -78,11 +69,7 @@ def scalar_expression(
 
 
 def named_results(what: str, result: object) -> Mapping[str, object]:
-    """Return the mapping that a user's function gives.
-
-    Raises:
-        InvalidProblem: it gives something else.
-    """
+    """Return the mapping that a user's function gives."""
     if not isinstance(result, Mapping):
         mend = "a function without `return` gives None" if result is None else "return {'name': expression, ...}"
         raise InvalidProblem(f"{what} must return {{name: expression}}, got {described(result)}; {mend}")

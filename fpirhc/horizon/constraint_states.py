@@ -24,18 +24,13 @@ _GAP = 1e-9  # half width of the bounds of a terminal equality
 
 @dataclass(frozen=True, eq=False)
 class ConstraintState:
-    """One further entry of the stage's state.
-
-    Args:
-        lower: bound; infinite where free.
-        upper: bound; infinite where free.
-    """
+    """One further entry of the stage's state."""
 
     name: str
     unit: str
     expression: Expression
-    lower: float
-    upper: float
+    lower: float  # bound; infinite where free
+    upper: float  # bound; infinite where free
 
 
 def limited(limits: Limits, plant: Plant, view: View, step: float) -> list[ConstraintState]:
@@ -52,10 +47,6 @@ def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> 
 
     Args:
         limits: of the problem; soft and priced ones, and those of a change of inputs, hold at the nodes alone.
-        plant: the map.
-        view: the stage after these steps.
-        seen: the state then, as it will be measured.
-        step: number of the steps, for the names.
     """
     nodes_alone, measured_view = limits.soft.keys() | limits.prices.keys(), replace(view, state=seen)
     states = [_entry_of(name, one, measured_view) for name, one in limits.boxes(plant).items()]
@@ -71,10 +62,6 @@ def ends(
     The bounds leave a small gap, because an interior-point solver counts a fixed variable as an equation.
 
     Args:
-        names: states that must meet the reference.
-        plant: the plant.
-        next_state: state after the stage.
-        target: reference after the stage.
         last: 1 in the last stage, 0 before.
     """
     places = {e: k for k, e in enumerate(plant.state.elements)}

@@ -27,44 +27,26 @@ from fpirhc.symbolic.live import DERIVED, computed_from, nominal
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Arguments of a stage's cost, with entries by name: view.state.q1, view.reference["q1'"], view.input.Q1.
+    """Arguments of a stage's cost, with entries by name: view.state.q1, view.reference["q1'"], view.input.Q1."""
 
-    Args:
-        state: the plant's state.
-        reference: nominal state; of a plant with outputs, the nominal outputs and their derivatives.
-        input: input of the stage.
-        input_before: input of the stage before; NaN unless the cost uses it.
-        feedforward: the model's input along the reference; NaN unless the cost uses it.
-        parameters: of the model.
-        time: in the problem's unit of time.
-        output: the model's outputs and their derivatives, view.output.bis; the state of a plant without outputs.
-        outside: signals from outside at this stage, as the controllers know them, view.outside.price.
-    """
-
-    state: Named
-    reference: Named
-    input: Named
-    input_before: Named
-    feedforward: Named
-    parameters: Named
-    time: Expression
-    output: Named
-    outside: Named
+    state: Named  # the plant's state
+    reference: Named  # nominal state; of a plant with outputs, the nominal outputs and their derivatives
+    input: Named  # input of the stage
+    input_before: Named  # input of the stage before; NaN unless the cost uses it
+    feedforward: Named  # the model's input along the reference; NaN unless the cost uses it
+    parameters: Named  # of the model
+    time: Expression  # in the problem's unit of time
+    output: Named  # the model's outputs and their derivatives, view.output.bis; the state of a plant without outputs
+    outside: Named  # signals from outside at this stage, as the controllers know them, view.outside.price
 
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """The model over one stage around the first reference point, s+ = A s + B u.
+    """The model over one stage around the first reference point, s+ = A s + B u."""
 
-    Args:
-        a: shape (nx, nx).
-        b: shape (nx, nu).
-        step: length of the stage, in the problem's unit of time.
-    """
-
-    a: np.ndarray
-    b: np.ndarray
-    step: float
+    a: np.ndarray  # shape (nx, nx)
+    b: np.ndarray  # shape (nx, nu)
+    step: float  # length of the stage, in the problem's unit of time
 
 
 class Terminal(Checked, ABC):

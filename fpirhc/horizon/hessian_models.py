@@ -83,38 +83,23 @@ INLINE int {name}(const casadi_real** arg, casadi_real** res, casadi_int* iw, ca
 
 
 class Graph(NamedTuple):
-    """What the chain rule runs over, after the eliminations that add no edge.
+    """What the chain rule runs over, after the eliminations that add no edge."""
 
-    Args:
-        slopes: for every place, its partial derivatives (of the symbols of m) by the place that they are of.
-        between: the places that are left between variables and results, in the order of the computation.
-        variables: number of variables, which have the first places.
-        results: the places of the results, one after another at the end.
-    """
-
-    slopes: _Edges
-    between: list[int]
-    variables: int
-    results: range
+    slopes: _Edges  # for every place, its partial derivatives (of the symbols of m) by the place that they are of
+    between: list[int]  # the places that are left between variables and results, in the order of the computation
+    variables: int  # number of variables, which have the first places
+    results: range  # the places of the results, one after another at the end
 
 
 @dataclass(frozen=True, eq=False)
 class ChainRule:
-    """The two parts of a derivative.
+    """The two parts of a derivative."""
 
-    Args:
-        partials: m, a column of expressions of the variables and parameters.
-        symbols: a column of as many symbols for m.
-        pulled: J' w of the symbols and of the symbols `weights`.
-        weights: w, as long as the results.
-        graph: from which J is made.
-    """
-
-    partials: ca.SX
-    symbols: ca.SX
-    pulled: ca.SX
-    weights: ca.SX
-    graph: Graph
+    partials: ca.SX  # m, a column of expressions of the variables and parameters
+    symbols: ca.SX  # a column of as many symbols for m
+    pulled: ca.SX  # J' w of the symbols and of the symbols `weights`
+    weights: ca.SX  # w, as long as the results
+    graph: Graph  # from which J is made
 
     @cached_property
     def jacobian(self) -> ca.SX:
@@ -132,13 +117,7 @@ class ChainRule:
 
 
 def chain_rule(results: ca.SX, variables: ca.SX, parameters: ca.SX) -> ChainRule:
-    """Return both parts of the derivative of a column of results.
-
-    Args:
-        results: a dense column of expressions.
-        variables: a column of symbols, by which they are differentiated.
-        parameters: a column of all other symbols.
-    """
+    """Return both parts of the derivative of a column of results."""
     function = ca.Function("fpirhc_values", [variables, parameters], [results], {"cse": True})
     weights = ca.SX.sym("w", results.numel())
     calls = any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
@@ -280,10 +259,8 @@ def tangent_code(rule: ChainRule, name: str, slopes: str, blocks: tuple[int, int
     the eliminations that add no edge.
 
     Args:
-        rule: both parts of the derivative.
         name: of the C function.
         slopes: name of the compiled `slopes_function`.
-        blocks: sizes of s and u.
     """
     graph, (ns, nu) = rule.graph, blocks
     width = -(-(ns + nu) // _WIDE) * _WIDE
@@ -472,11 +449,7 @@ def linearise_stage(ocp: OptimalControl) -> ca.Function:
 
 
 def stage_leaves(ocp: OptimalControl, names: tuple[str, ...]) -> tuple[_Parts, str]:
-    """Return what a driver in C calls and C code to stand before it, which together provide `linearise` and the parts named.
-
-    Args:
-        names: evaluate, pull.
-    """
+    """Return what a driver in C calls and C code to stand before it, which together provide `linearise` and the parts named."""
     parts = split_stage(ocp)
     leaves = {name: parts[name] for name in names}
     sizes = ocp.state.size, ocp.input.size

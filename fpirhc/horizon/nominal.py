@@ -29,11 +29,7 @@ _SMALL = 1e-2  # share of the largest gain before a run that is not finite
 
 
 def require_reference_of_states(plant: Plant, refusal: str) -> None:
-    """Raise with the refusal where the reference does not give the whole state.
-
-    Raises:
-        NotSupported: the plant has states that no output shows.
-    """
+    """Raise with the refusal where the reference does not give the whole state."""
     if not plant.equations.known_on_reference:
         raise NotSupported(refusal)
 
@@ -49,9 +45,6 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
 
     Args:
         outputs: the nominal outputs and their derivatives; of a plant without outputs its nominal state.
-
-    Raises:
-        NotSupported: the plant has states that no output shows.
     """
     hidden = [e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0]
     require_reference_of_states(
@@ -64,29 +57,14 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
 
 
 def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> Matrix:
-    """Return the input that the model needs along the reference, where every state follows from the outputs.
-
-    Args:
-        plant: the model.
-        outputs: see `reference_state`.
-        responses: nominal highest derivatives of the outputs.
-        p: parameters.
-
-    Raises:
-        NotSupported: see `reference_state`.
-    """
+    """Return the input that the model needs along the reference, where every state follows from the outputs."""
     follows = None if plant.equations.known_on_reference else followed_state(plant)
     state = reference_state(plant, outputs) if follows is None else follows(outputs, p)
     return plant.equations.inverse(state, nominal_responses(plant, outputs, responses), p)
 
 
 def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: float) -> Matrix:
-    """Return sum_{k<r} C(r, k) rate^(r-k) e^(k) of every controlled output, with which its error decays; 0 for order 0.
-
-    Args:
-        outputs: nominal outputs and derivatives.
-        rate: per unit of time.
-    """
+    """Return sum_{k<r} C(r, k) rate^(r-k) e^(k) of every controlled output, with which its error decays; 0 for order 0."""
     calm = ca.DM.zeros(len(plant.names))
     error = outputs - plant.equations.output(x, ca.DM.zeros(plant.input.size), p, calm)
     sums = []
@@ -108,8 +86,6 @@ def nominal_motion(
     """Return states (nx, m) and inputs (nu, m) of the approximate model on its outputs' reference, from the start.
 
     Args:
-        plant: the model.
-        reference: of its outputs.
         advance: Function (state, input, parameters) -> state at the next time.
         start: first state, shape (nx,).
         bounds: lower and upper bounds of the inputs, shape (nu,) each.
@@ -206,11 +182,7 @@ def nominal_run(
 
     Args:
         plant: the model, with outputs and as many inputs as controlled ones.
-        reference: of its outputs.
-        integrator: of the motion.
         start: first state, shape (nx,).
-        bounds: lower and upper bounds of the inputs.
-        times: length of a cycle, and number of cycles.
     """
     period, cycles = times[0], min(times[1], _CYCLES)
     x, u, p = plant.symbols()

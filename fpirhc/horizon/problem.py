@@ -187,23 +187,14 @@ class OptimalControl:
 
 @dataclass(frozen=True, eq=False)
 class _ReferenceExpansion:
-    """The quadratic model, stage by stage.
+    """The quadratic model, stage by stage."""
 
-    Args:
-        a: A, shape (N, ns, ns).
-        b: B, shape (N, ns, nu).
-        q: Q, shape (N, ns, ns).
-        s: S, shape (N, nu, ns).
-        r: R, shape (N, nu, nu).
-        final: Q of the end, shape (ns, ns).
-    """
-
-    a: np.ndarray
-    b: np.ndarray
-    q: np.ndarray
-    s: np.ndarray
-    r: np.ndarray
-    final: np.ndarray
+    a: np.ndarray  # A, shape (N, ns, ns)
+    b: np.ndarray  # B, shape (N, ns, nu)
+    q: np.ndarray  # Q, shape (N, ns, ns)
+    s: np.ndarray  # S, shape (N, nu, ns)
+    r: np.ndarray  # R, shape (N, nu, nu)
+    final: np.ndarray  # Q of the end, shape (ns, ns)
 
     def hessian_times(self, moves: np.ndarray) -> np.ndarray:
         """Return M U for U (N, nu), with M the Hessian of V with the dynamics linearised."""

@@ -196,8 +196,6 @@ def sweep(
     Newton's step of all first-order conditions at once. `ok` shows whether every Q_uu is positive definite.
 
     Args:
-        ocp: the problem.
-        hessian: second derivatives of the quadratic model.
         places: the limited states: rows of W and w after those of the inputs.
         scales: of the inputs (nu,) and of the states (ns,), multiplied by mu.
     """

@@ -157,7 +157,6 @@ def offset_limits(plant: Plant, horizon: Horizon, layout: Layout) -> ca.Function
     """Function (data, state from which the plan starts, measured state) -> data with the distance of the measured state.
 
     Args:
-        plant: the model.
         horizon: of the plan, with states whose limits hold for the measured one.
         layout: of one stage's data.
     """

@@ -57,18 +57,9 @@ def transcribe(
     """Return the standard form of one horizon; it is the same one for the same objects, and for plants with other exact parameters.
 
     Args:
-        plant: the model.
-        reference: of its states or outputs.
-        horizon: number and length of the stages.
-        cost: stage and terminal cost.
-        limits: of inputs, states, rates and paths.
-        signals: from outside, as `stage_data` takes them.
         start: first state, shape (nx,), from which states without a reference are simulated to expand the cost along the reference;
             None: zero.
         others: live settings by path that the optimiser reads from the data of the stages beside those of cost and limits.
-
-    Raises:
-        InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
     """
     same = plant.equations, reference, cost, limits, signals  # the approximate parameters are those of the equations
     first = None if start is None else np.asarray(start, dtype=float).tobytes()
@@ -403,11 +394,7 @@ def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca
 
 
 def _scalar_terms(expressions: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Terms as scalar expressions.
-
-    Raises:
-        InvalidProblem: all mistakes together.
-    """
+    """Terms as scalar expressions."""
     mistakes = Mistakes("cost")
     if not isinstance(expressions, Mapping) or not expressions:
         mistakes.add(f"the terms must be {{name: expression}} with at least one entry, got {expressions!r}")

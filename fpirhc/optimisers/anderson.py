@@ -38,10 +38,6 @@ def iterated(
     """Return the column x after a number of steps x <- function(x, *arguments).
 
     Args:
-        function: of a column and of `arguments`.
-        start: first x.
-        arguments: further arguments, constant.
-        iterations: number of steps.
         acceleration: None: plain steps.
     """
     x = ca.vec(start)

@@ -266,7 +266,6 @@ def improved(
     Args:
         state: the first state, shape (ns,).
         data: shape (ntheta, N + 1).
-        memory: from which the first call begins.
 
     Returns:
         Plan (nu, N), diagnostics with the iterations of all calls, memory, and the number of calls.

@@ -30,23 +30,14 @@ HAIR = 1e-8  # of the unit: how far inside the limits of inputs descents stay
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """Units of a problem.
+    """Units of a problem."""
 
-    Args:
-        inputs: shape (nu,).
-        states: shape (ns,).
-        cost: C.
-        bounded: places of the states that have a limit.
-        capacity: largest multipliers of the bounded states, in cost per unit.
-        hard: whether the limits of the bounded states have no price.
-    """
-
-    inputs: np.ndarray
-    states: np.ndarray
-    cost: float
-    bounded: tuple[int, ...]
-    capacity: np.ndarray
-    hard: np.ndarray
+    inputs: np.ndarray  # shape (nu,)
+    states: np.ndarray  # shape (ns,)
+    cost: float  # C
+    bounded: tuple[int, ...]  # places of the states that have a limit
+    capacity: np.ndarray  # largest multipliers of the bounded states, in cost per unit
+    hard: np.ndarray  # whether the limits of the bounded states have no price
 
     @property
     def rows(self) -> np.ndarray:

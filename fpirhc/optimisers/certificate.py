@@ -191,17 +191,11 @@ def _model(plan: Plan) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Active:
-    """Active limits of states.
+    """Active limits of states."""
 
-    Args:
-        rows: J, shape (count, N nu).
-        distances: of the states beyond their limits, positive where violated, shape (count,).
-        complementarity: largest product of a multiplier and the distance of its limit.
-    """
-
-    rows: np.ndarray
-    distances: np.ndarray
-    complementarity: float
+    rows: np.ndarray  # J, shape (count, N nu)
+    distances: np.ndarray  # of the states beyond their limits, positive where violated, shape (count,)
+    complementarity: float  # largest product of a multiplier and the distance of its limit
 
     @property
     def count(self) -> int:

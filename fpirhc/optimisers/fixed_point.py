@@ -215,7 +215,6 @@ def _of_two_starts(one: ca.Function, memory: Layout) -> ca.Function:
 
     Args:
         one: Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
-        memory: its layout.
     """
     arguments = [ca.MX.sym(one.name_in(k), *one.size_in(k)) for k in range(one.n_in())]
     warm = one(*arguments)

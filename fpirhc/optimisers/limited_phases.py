@@ -142,7 +142,6 @@ def begin_cold(call: Call, s: State, inputs: ca.MX | None) -> State:
     """Begin without a memory.
 
     Args:
-        call: the problem and its arguments.
         s: the state, with the number of the first guess in `start`.
         inputs: first inputs (nu, N); None: the feedforward. The states are held at s0, or follow the reference.
     """
@@ -236,7 +235,6 @@ def _lowered_barrier(call: Call, s: State, rest: ca.MX, products: tuple[ca.MX, c
     """Lower mu as long as its barrier problem is solved; the filter is emptied with every reduction.
 
     Args:
-        rest: scaled residual without complementarity.
         products: the least and the largest product of the complementarity.
     """
     (least, most), cost = products, call.scales.cost

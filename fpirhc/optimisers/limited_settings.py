@@ -33,23 +33,14 @@ DESCENT, LAST_START = 3, 4  # and for descents, where all of these failed: the r
 
 @dataclass(frozen=True)
 class LimitedSettings:
-    """Settings of one Function.
+    """Settings of one Function."""
 
-    Args:
-        tolerance: of the stationarity, in the unit of the inputs.
-        feasible: violation of a state bound, in its unit, below which a plan counts as converged.
-        map: the deformation of pure steps.
-        hessian: second derivatives of the quadratic model; None: exact.
-        damping: added to the curvature of the inputs, in units of it.
-        iterations: most iterations of one call.
-    """
-
-    tolerance: float
-    feasible: float
-    map: Deformation
-    hessian: HessianModel | None
-    damping: float
-    iterations: int
+    tolerance: float  # of the stationarity, in the unit of the inputs
+    feasible: float  # violation of a state bound, in its unit, below which a plan counts as converged
+    map: Deformation  # the deformation of pure steps
+    hessian: HessianModel | None  # second derivatives of the quadratic model; None: exact
+    damping: float  # added to the curvature of the inputs, in units of it
+    iterations: int  # most iterations of one call
 
     @property
     def plain_first(self) -> bool:

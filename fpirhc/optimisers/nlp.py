@@ -32,15 +32,11 @@ _OSQP_BOUNDED = 2000  # iterations that are a bound of time on a machine
 
 @dataclass(frozen=True)
 class MultipleShooting(Optimiser):
-    """What all solvers share: the program, the warm start, and the judgement.
-
-    Args:
-        tolerance: of the stationarity, in the unit of the inputs, below which a plan is converged.
-    """
+    """What all solvers share: the program, the warm start, and the judgement."""
 
     cannot_keep = ("prices",)
 
-    tolerance: Positive = 1e-3
+    tolerance: Positive = 1e-3  # of the stationarity, in the unit of the inputs, below which a plan is converged
 
     @property
     @abstractmethod

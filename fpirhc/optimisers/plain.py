@@ -32,23 +32,14 @@ _TEXTS = ("kernels", "fixed_point", "entry")
 
 @dataclass(frozen=True)
 class PlainSettings:
-    """Settings of one Function.
+    """Settings of one Function."""
 
-    Args:
-        tolerance: of the stationarity, in the unit of the inputs.
-        map: the deformation that makes the next plan.
-        hessian: second derivatives of the quadratic model.
-        damping: added to the curvature of the inputs, in units of it.
-        iterations: of one call that does not converge.
-        converging: whether a call goes on until the tolerance is met.
-    """
-
-    tolerance: Number
-    map: Deformation
-    hessian: HessianModel
-    damping: Number
-    iterations: int
-    converging: bool
+    tolerance: Number  # of the stationarity, in the unit of the inputs
+    map: Deformation  # the deformation that makes the next plan
+    hessian: HessianModel  # second derivatives of the quadratic model
+    damping: Number  # added to the curvature of the inputs, in units of it
+    iterations: int  # of one call that does not converge
+    converging: bool  # whether a call goes on until the tolerance is met
 
     @property
     def most(self) -> int:

@@ -199,22 +199,15 @@ def _shown(value: float | None, text: Callable[[float], str]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Breach:
-    """One side of one limit, and by how much the states s_0 ... s_N are beyond it.
-
-    Args:
-        side: 'above' or 'below'.
-        beyond: shape (N + 1,), zero where the limit is kept; s_0 of a written entry counts as kept.
-        equation: whether both sides are the same.
-        tolerated: violation that still counts as kept.
-    """
+    """One side of one limit, and by how much the states s_0 ... s_N are beyond it."""
 
     name: str
     unit: str
     limit: float
-    side: str
-    beyond: np.ndarray
-    equation: bool
-    tolerated: float
+    side: str  # 'above' or 'below'
+    beyond: np.ndarray  # shape (N + 1,), zero where the limit is kept; s_0 of a written entry counts as kept
+    equation: bool  # whether both sides are the same
+    tolerated: float  # violation that still counts as kept
 
     @property
     def stages(self) -> np.ndarray:

@@ -19,10 +19,7 @@ def plan_library(ocp: OptimalControl, name: str, driver: Driver, memory: int) ->
     """Return the compiled Function (s0, data, lower, upper, memory, last) -> (U, diagnostics, memory), or why there is none.
 
     Args:
-        ocp: the horizon.
         name: that the Function's name begins with.
-        driver: its body.
-        memory: numbers that are remembered.
     """
     results = [ca.MX.zeros(*size) for size in ((ocp.input.size, ocp.stages), (5, 1), (memory, 1))]
     return native(ca.Function(registered(name, driver), [*_arguments(ocp, memory), ca.MX.sym("last")], results))

@@ -76,14 +76,7 @@ def first_gamma(ocp: OptimalControl, data: ca.MX | None = None) -> float | ca.MX
 
 
 class Search:
-    """Builds the expressions of the iteration.
-
-    Args:
-        ocp: the problem.
-        hessian: second derivatives of the quadratic model.
-        map: the deformation that makes the next plan.
-        damping: added to the curvature of the inputs, in units of it.
-    """
+    """Builds the expressions of the iteration."""
 
     def __init__(self, ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: Number) -> None:
         self._ocp = ocp

@@ -97,9 +97,7 @@ def nominal_responses(
     """Return the nominal responses of the controlled quantities: highest derivatives, or the outputs of order 0 themselves.
 
     Args:
-        plant: the plant.
         outputs: nominal outputs and their derivatives, in the order of `Plant.output`; without outputs the state.
-        responses: nominal highest derivatives of the outputs.
         later: gives the outputs at the end of the cycle, where one is of order 0; None: `outputs`.
     """
     instant = [name for name, order in plant.response_orders.items() if not order]
@@ -135,13 +133,6 @@ def rateless(plant: Plant) -> str:
 
 
 def require_rates(plant: Plant, refusal: str) -> None:
-    """Raise where the states have no derivatives with respect to time.
-
-    Args:
-        refusal: the message: who needs them, and what to do.
-
-    Raises:
-        NotSupported: a map, with the refusal.
-    """
+    """Raise where the states have no derivatives with respect to time."""
     if plant.step is not None:
         raise NotSupported(refusal)

@@ -195,13 +195,7 @@ def one_step(plant: Plant, period: float) -> ca.Function:
 
 
 def motion_of(plant: Plant, integrator: Integrator, usual: Integrator) -> Integrator:
-    """Return what moves a plant: the integrator where it fits the plant, else the steps of a map, or the usual integrator.
-
-    Args:
-        plant: that moves.
-        integrator: of the problem, which may be that of another plant.
-        usual: for differential equations.
-    """
+    """Return what moves a plant: the integrator where it fits the plant, else the steps of a map, or the usual integrator."""
     is_map = plant.step is not None
     if integrator.steps_maps == is_map:
         return integrator
@@ -236,8 +230,6 @@ def stiffness(
     """Return a sentence that names the pole that the integrator makes grow, and what would do; empty where all is well.
 
     Args:
-        plant: the plant.
-        integrator: of its motion.
         period: control cycle, in the plant's unit of time.
         state: shape (nx,).
         command: shape (nu,).
@@ -269,8 +261,6 @@ def spurious_growth(
     """Return the largest factor by which steps along a trajectory make a mode of the model grow that decays, shape (N,); 1: none.
 
     Args:
-        plant: the model.
-        integrator: of its motion.
         period: of a step, in the plant's unit of time.
         states: shape (nx, N).
         commands: shape (nu, N).

@@ -25,11 +25,7 @@ def inverse_function(plant: Motion, response: ca.Function) -> ca.Function:
     """Return the Function (state, response of the controlled coordinates, parameters) -> input.
 
     Args:
-        plant: whose inverse it is.
         response: Function (state, input, parameters) -> response of the controlled coordinates or outputs.
-
-    Raises:
-        NotInvertible: the inputs and the controlled coordinates differ in number.
     """
     if len(plant.controlled_names) != len(plant.inputs):
         raise NotInvertible(f"{len(plant.controlled_names)} controlled coordinates need as many inputs")

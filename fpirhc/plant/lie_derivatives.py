@@ -24,11 +24,7 @@ Symbols = tuple[ca.SX, ca.SX, ca.SX, ca.SX]
 
 
 def output_expression(plant: Motion, name: str, x: Expression, u: Expression, p: Expression) -> Expression:
-    """Return h(x, u, p) of one output.
-
-    Raises:
-        InvalidProblem: the function fails, or does not return one scalar.
-    """
+    """Return h(x, u, p) of one output."""
     what, expression = f"outputs: '{name}'", plant.outputs[name].expression
     arguments = by_name(plant, x, p)
     arguments = arguments if takes(expression, len(arguments)) else arguments_of(plant, x, u, p)

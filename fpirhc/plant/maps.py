@@ -75,14 +75,7 @@ def check_map(plant: Motion, mistakes: Mistakes) -> None:
 
 
 def over(plant: _Motion, cycle: float) -> _Motion:
-    """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself.
-
-    Args:
-        plant: a map, or any other plant.
-
-    Raises:
-        InvalidValue: the cycle is no whole number of steps; the next ones are named.
-    """
+    """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself."""
     if plant.step is None:
         return plant
     ratio = cycle / plant.step
@@ -126,10 +119,7 @@ def check_time(plant: Motion, model: Motion, orders: Mapping[str, int], mistakes
     """Add to `mistakes` where one of model and reality steps and the other does not, and a response needs both alike.
 
     Args:
-        plant: the reality's.
-        model: of the problem.
         orders: of the model's outputs.
-        mistakes: of the problem.
         at_once: whether the command moves everything controlled at once, so that no derivative is looked for.
     """
     if not unlike(plant, model):
@@ -151,8 +141,6 @@ def shifted(plant: Motion, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX
     """Return the divided difference of an expression of the state over one control cycle.
 
     Args:
-        plant: a map.
-        value: expression of x, u, p and w.
         symbols: x, u, p and the forcing w; what the value has of u, p and w is held.
     """
     x, u, p, w = symbols
@@ -160,12 +148,7 @@ def shifted(plant: Motion, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX
 
 
 def decay_rates(modes: np.ndarray, cycle: float) -> np.ndarray:
-    """Return log|1 + T s| / T of eigenvalues s of a map's divided differences: negative where the mode decays, -inf where it ends.
-
-    Args:
-        modes: eigenvalues.
-        cycle: T.
-    """
+    """Return log|1 + T s| / T of eigenvalues s of a map's divided differences: negative where a mode decays, -inf where it ends."""
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
 
@@ -248,12 +231,7 @@ def check_modes(law: object, plant: Motion, gains: Sequence[float]) -> None:
     """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked.
 
     Args:
-        law: for the message.
-        plant: that it acts on.
         gains: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.
-
-    Raises:
-        InvalidValue: a pole z on or outside the unit circle.
     """
     if plant.step is None or not gains:
         return

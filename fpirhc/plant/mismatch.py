@@ -30,10 +30,6 @@ def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, f
 
     Args:
         mismatch: percent.
-
-    Raises:
-        InvalidValue: `mismatch` outside [0, 100), or negative where every parameter has a spread.
-        InvalidProblem: a range leaves a parameter's physical bounds; the message names the largest mismatch inside them.
     """
     check_mismatch(plant, mismatch)
     ranges = {name: _range(parameter, mismatch) for name, parameter in plant.parameters.items()}
@@ -50,11 +46,7 @@ def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, f
 
 
 def check_mismatch(plant: Parametric, mismatch: float) -> None:
-    """Raise if no range belongs to this mismatch.
-
-    Raises:
-        InvalidValue: see `exact_ranges`.
-    """
+    """Raise if no range belongs to this mismatch."""
     all_spread = bool(plant.parameters) and all(p.spread is not None or p.outside for p in plant.parameters.values())
     if not 0 <= mismatch < (math.inf if all_spread else 100):
         raise InvalidValue(

@@ -196,11 +196,7 @@ def sampling(motion: Motion) -> float:
 
 
 def with_exact_parameters(motion: _Motion, exact: np.ndarray) -> _Motion:
-    """Return the same with other exact parameters, shape (np,); both share the Functions derived from the symbols.
-
-    Raises:
-        InvalidProblem: a parameter that is not finite or outside its bounds.
-    """
+    """Return the same with other exact parameters, shape (np,); both share the Functions derived from the symbols."""
     parameters = with_exact_values(motion.parameters, exact)
     other = copy(motion)
     # No other cached property depends on the exact values.

@@ -79,11 +79,7 @@ def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) ->
 
 
 def with_exact_values(parameters: Mapping[str, Parameter], exact: Iterable[float]) -> dict[str, Parameter]:
-    """Return the parameters with other exact values, in their order.
-
-    Raises:
-        InvalidProblem: a value that is not finite or outside its bounds.
-    """
+    """Return the parameters with other exact values, in their order."""
     # A spread is around the value of the problem file, and not around another plant's.
     others = {
         name: copied(one, {"exact": float(value), "spread": None})

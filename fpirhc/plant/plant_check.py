@@ -215,7 +215,6 @@ def unsolved(plant: Motion, state: np.ndarray, command: np.ndarray, parameters: 
     """Return why the algebraic states cannot be computed at a point; empty where they can, and without any.
 
     Args:
-        plant: the plant.
         state: shape (nx,).
         command: shape (nu,).
         parameters: shape (np,).

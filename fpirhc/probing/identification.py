@@ -45,25 +45,15 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """What one response is made of.
+    """What one response is made of."""
 
-    Args:
-        gains: lambda_ij of every model response j.
-        dead_time: d, cycles.
-        lag: tau, in the problem's unit of time.
-        noise: rms of what is no response of the plant.
-        drift: what is, and the model does not have: w by cycle.
-        drifting: rms change of w per square root of the unit of time.
-        edge: what the record is too short to bound: "dead time", "lag", or nothing.
-    """
-
-    gains: tuple[Interval, ...]
-    dead_time: Interval
-    lag: Interval
-    noise: float
-    drift: np.ndarray = field(repr=False)
-    drifting: float = 0.0
-    edge: str = ""
+    gains: tuple[Interval, ...]  # lambda_ij of every model response j
+    dead_time: Interval  # d, cycles
+    lag: Interval  # tau, in the problem's unit of time
+    noise: float  # rms of what is no response of the plant
+    drift: np.ndarray = field(repr=False)  # what is, and the model does not have: w by cycle
+    drifting: float = 0.0  # rms change of w per square root of the unit of time
+    edge: str = ""  # what the record is too short to bound: "dead time", "lag", or nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +78,7 @@ def identify(
     Args:
         measured: f, shape (cycles, n).
         modelled: m of the same cycles, shape (cycles, n).
-        period: of the control cycle.
         usable: which cycles count; None: all.
-
-    Raises:
-        InvalidValue: fewer than 40 cycles, or a model response that does not move.
     """
     cycles = len(measured)
     if cycles < LEAST_CYCLES:

@@ -347,19 +347,12 @@ _DARED = 0.9  # ratio of errors, from which a candidate that is stable at the es
 
 @dataclass(frozen=True)
 class Trial:
-    """A run on the plant.
+    """A run on the plant."""
 
-    Args:
-        error: rms error over that of the controller alone, in the mean over the coordinates.
-        worst: of any coordinate.
-        bears: False where a run with a larger gain, which a daring candidate has to bear, does not pass.
-        calm: whether the steps of its commands are within what is allowed.
-    """
-
-    error: float
-    worst: float
-    bears: bool = True
-    calm: bool = True
+    error: float  # rms error over that of the controller alone, in the mean over the coordinates
+    worst: float  # of any coordinate
+    bears: bool = True  # False where a run with a larger gain, which a daring candidate has to bear, does not pass
+    calm: bool = True  # whether the steps of its commands are within what is allowed
 
     @property
     def passes(self) -> bool:
@@ -378,10 +371,6 @@ def tried(
     """Return the trial of every candidate, beside one of the controller alone; of one that the loop refuses, the reason.
 
     Args:
-        problem: of which the first 2000 cycles are run.
-        controller: with or without a deformation.
-        candidates: by name.
-        seed: of the runs.
         allowed: function of the run of the controller alone -> largest rms step of every input; None: any.
     """
     short, bare, names = shortened(problem, LONGEST), without_deformation(controller), weighed(problem, controller)

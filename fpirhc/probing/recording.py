@@ -35,17 +35,11 @@ _BEGUN = 3  # cycles after which a response is one of the run
 
 @dataclass(frozen=True)
 class Excitation(Deformation):
-    """r_k = d_k + A s_k with a random binary sequence s, independent in every channel.
+    """r_k = d_k + A s_k with a random binary sequence s, independent in every channel."""
 
-    Args:
-        amplitude: A of every channel, in the unit of the response; 0 only listens.
-        cycles: length of the sequence; after it the request is the desired response.
-        seed: of the sequence.
-    """
-
-    amplitude: tuple[float, ...]
-    cycles: int
-    seed: int = 0
+    amplitude: tuple[float, ...]  # A of every channel, in the unit of the response; 0 only listens
+    cycles: int  # length of the sequence; after it the request is the desired response
+    seed: int = 0  # of the sequence
 
     @property
     def iteration(self) -> Iteration:
@@ -96,23 +90,14 @@ class Excitation(Deformation):
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What was recorded.
+    """What was recorded."""
 
-    Args:
-        measured: responses, shape (cycles, n).
-        modelled: the model's responses to the commands that acted.
-        usable: which cycles count: those with an answer.
-        amplitude: of the excitation.
-        stop: why the run ended early; empty where it did not.
-        clipped: share of the cycles with a command at a limit.
-    """
-
-    measured: np.ndarray
-    modelled: np.ndarray
-    usable: np.ndarray
-    amplitude: tuple[float, ...] = ()
-    stop: str = ""
-    clipped: float = 0.0
+    measured: np.ndarray  # responses, shape (cycles, n)
+    modelled: np.ndarray  # the model's responses to the commands that acted
+    usable: np.ndarray  # which cycles count: those with an answer
+    amplitude: tuple[float, ...] = ()  # of the excitation
+    stop: str = ""  # why the run ended early; empty where it did not
+    clipped: float = 0.0  # share of the cycles with a command at a limit
 
 
 def sequence(cycles: int, channels: int, seed: int) -> np.ndarray:
@@ -135,12 +120,8 @@ def excited(
     """Return the record of a run under the controller without its deformation, excited.
 
     Args:
-        problem: whose plant is run.
-        controller: that keeps it safe.
-        cycles: length of the run.
         amplitude: in the unit of the response, by controlled coordinate or one for all; None: twice the noise of a silent run of
             the same length and a tenth of the deviation of its desired response.
-        seed: of the sequence and of the run.
     """
     names = problem.plant.controlled_names
     short, bare = replace(problem, duration=cycles * problem.period, measure_from=0.0), without_deformation(controller)
@@ -177,13 +158,6 @@ def read_recording(path: Path, problem: Problem) -> Record:
     Its columns are "time", every input by name (the command that is sent at this time;
     "input NAME" where a coordinate has the same name), the elements of the model's state, and the
     responses ("q1''"); a response without a column is the difference of its lower derivative over a cycle.
-
-    Args:
-        path: of the file.
-        problem: whose model and period it is of.
-
-    Raises:
-        InvalidValue: missing columns, other times than those of the period, entries that are no numbers; all mistakes together.
     """
     columns = columns_of(path)
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
@@ -228,11 +202,7 @@ def check_times(columns: Mapping[str, np.ndarray], problem: Problem, mistakes: M
 
 
 def columns_of(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV file by name; an empty entry is NaN.
-
-    Raises:
-        InvalidValue: it cannot be read, or is not made of numbers.
-    """
+    """Return the columns of a CSV file by name; an empty entry is NaN."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file)
@@ -265,21 +235,13 @@ _SENT = "_command_before"  # what a controller remembers of its last command
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """The commands of a controller over a recording.
+    """The commands of a controller over a recording."""
 
-    Args:
-        times: of the cycles, shape (cycles,).
-        inputs: names of the inputs.
-        commands: that the controller would have sent, shape (cycles, inputs).
-        recorded: commands in the recording; None: it has none.
-        statuses: number of cycles by status.
-    """
-
-    times: np.ndarray
-    inputs: tuple[str, ...]
-    commands: np.ndarray
-    recorded: np.ndarray | None
-    statuses: Mapping[str, int]
+    times: np.ndarray  # of the cycles, shape (cycles,)
+    inputs: tuple[str, ...]  # names of the inputs
+    commands: np.ndarray  # that the controller would have sent, shape (cycles, inputs)
+    recorded: np.ndarray | None  # commands in the recording; None: it has none
+    statuses: Mapping[str, int]  # number of cycles by status
 
     def differences(self) -> dict[str, tuple[float, float, float]]:
         """Return by input: the rms difference from the recorded command, the largest one, and its time; {} without a record."""
@@ -293,11 +255,7 @@ class Replay:
         }
 
     def write(self, path: Path) -> None:
-        """Write a table: time and the commands by input.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write a table: time and the commands by input."""
         try:
             with path.open("w", newline="", encoding="utf-8") as file:
                 table = csv.writer(file)
@@ -314,15 +272,6 @@ def replay(problem: Problem, controller: Controller, recording: Path) -> Replay:
     Columns of the CSV file are "time", what the problem's controller is given ("q1", "q1'", "q1''", or what its sensors show), and
     the inputs that were sent, where they are known. A response ("q1''") without a column is the difference of its lower
     derivative. An empty entry is a sample that was lost: the cycle is skipped, as it would have been.
-
-    Args:
-        problem: the task.
-        controller: any controller.
-        recording: path of the file.
-
-    Raises:
-        InvalidValue: a file that is no table of numbers.
-        InvalidProblem: missing columns, or times that are not a period apart; all together.
     """
     columns = columns_of(recording)
     stepper = Stepper(problem, controller, compiled=False)

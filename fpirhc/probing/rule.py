@@ -61,15 +61,9 @@ def estimated_problem(
     """Return the problem with the estimated plant as its reality.
 
     Args:
-        problem: whose model it is.
         gains: Lambda, shape (n, n).
-        cycles: dead time of every input.
-        lags: of every input.
         drift: w by cycle, shape (cycles, n), which ends with its last value; None: there is none.
         noise: rms of the measured response, by controlled coordinate; empty: there is none.
-
-    Raises:
-        NotSupported: a map, algebraic states, or outputs whose inverse is not known in symbols.
     """
     plant, signals = _plant(problem.plant, gains, drifts=drift is not None)
     own, period = problem.of_model, problem.period
@@ -260,11 +254,7 @@ class Rule:
         estimates: Estimates,
         chatter: float | Mapping[str, float] | None,
     ) -> None:
-        """Build the estimated plant and run the controller alone on it.
-
-        Raises:
-            FpirhcError: a plant without equations.
-        """
+        """Build the estimated plant and run the controller alone on it."""
         self.bare, self.estimates, self._names = (
             without_deformation(controller),
             estimates,

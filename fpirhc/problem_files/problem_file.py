@@ -156,12 +156,7 @@ def load_problem(name_or_path: str | Path) -> Task:
 
 
 def in_case(task: Task, name: str) -> Task:
-    """Return the task with the problem in one of its cases.
-
-    Raises:
-        InvalidName: there is no such case.
-        InvalidProblem: a change that the problem does not accept.
-    """
+    """Return the task with the problem in one of its cases."""
     if task.cases is None:
         raise InvalidName(f"problem '{task.name}' has no cases; add cases = fpirhc.Cases({{...}}) to its file")
     return replace(task, problem=task.cases.problem(name, task.problem))
@@ -173,14 +168,7 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
     A number that a controller and the problem have is the controller's own; for the others it is the problem's.
 
     Args:
-        task: the task.
-        values: by path.
         names: of controllers; None: all.
-
-    Raises:
-        InvalidName: a setting that none of these controllers has.
-        InvalidProblem: a number that does not fit the problem.
-        InvalidValue: a number that a controller does not accept.
     """
     chosen = {name: one for name, one in task.controllers.items() if not names or name in names}
     shared = {path for path in values if of_problem(task.problem, path)}
@@ -260,11 +248,7 @@ def _check_pictures(pictures: tuple[object, ...], controllers: Mapping[str, obje
 
 
 def _imported(path: Path) -> ModuleType:
-    """Return the module of a problem file.
-
-    Raises:
-        ProblemFileError: the file raises an error, or is not Python; every mistake has its line.
-    """
+    """Return the module of a problem file."""
     module = _empty(path)
     try:
         with _neighbours(path):
@@ -331,18 +315,12 @@ class _MistakesOfFile:
 
     The file's statements run once more, one by one. Of a statement that fails or needs what is missing, those calls of fpirhc still
     run that need nothing missing; of the others, the arguments that are there are checked.
-
-    Args:
-        path: of the file.
-        module: its module, without names of the file's own.
-        missing: names that are not defined, because what should define them failed.
-        said: line -> messages.
     """
 
-    path: Path
-    module: ModuleType
-    missing: set[str] = field(default_factory=set)
-    said: dict[int, list[str]] = field(default_factory=dict)
+    path: Path  # of the file
+    module: ModuleType  # its module, without names of the file's own
+    missing: set[str] = field(default_factory=set)  # names that are not defined, because what should define them failed
+    said: dict[int, list[str]] = field(default_factory=dict)  # line -> messages
 
     def text(self) -> str:
         """Return every mistake once, by line: "file.py, line 12: source", and the cause below it."""

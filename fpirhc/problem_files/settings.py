@@ -54,11 +54,7 @@ def of_problem(problem: Problem, path: str) -> str | None:
 
 
 def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:
-    """Return a problem with other numbers at paths of a case, see `Cases`, or as `of_problem` takes them.
-
-    Raises:
-        InvalidProblem: a path or a number that does not fit, all together, by the paths that were given.
-    """
+    """Return a problem with other numbers at paths of a case, see `Cases`, or as `of_problem` takes them."""
     written = {of_problem(problem, path) or path: path for path in values}
     changes = {path: values[given] for path, given in written.items()}
     return _Written({_SET: changes}, places=written).problem(_SET, problem) if values else problem
@@ -89,12 +85,7 @@ def as_declared(controller: Controller, values: Mapping[str, Any]) -> dict[str, 
 
 
 def current_setting(owner: Controller | Problem, path: str) -> float:
-    """Return the number at a path.
-
-    Raises:
-        InvalidName: no such setting; the nearest one is offered.
-        InvalidValue: the setting is not a number.
-    """
+    """Return the number at a path."""
     value = content_at(owner, path, "the problem" if isinstance(owner, Problem) else "the controller")
     if isinstance(value, bool) or not isinstance(value, int | float):
         hint = (
@@ -170,11 +161,7 @@ TuningSpans = Mapping[str, Span | LogSpan]
 
 
 def check_tuning(tuning: Any, controllers: Mapping[str, Controller]) -> None:
-    """Raise if a problem file's `tuning` is not {controller: {path: Span or LogSpan}} of controllers and settings that exist.
-
-    Raises:
-        InvalidProblem: all mistakes together, with the nearest valid names.
-    """
+    """Raise if a problem file's `tuning` is not {controller: {path: Span or LogSpan}} of controllers and settings that exist."""
     mistakes = Mistakes("tuning")
     if not isinstance(tuning, Mapping) or not all(isinstance(spans, Mapping) for spans in tuning.values()):
         mistakes.add("expected {'controller': {'deformation.gain': fpirhc.Span(low, high)}}")

@@ -64,11 +64,7 @@ def title_of(path: Path) -> str:
 
 
 def find_problem(name_or_path: str) -> Path:
-    """Return the path of a shipped problem or of a user's file.
-
-    Raises:
-        ProblemFileError: there is no such file or problem; the nearest shipped name is offered.
-    """
+    """Return the path of a shipped problem or of a user's file."""
     path = Path(name_or_path)
     shipped = {name: path for group in shipped_groups().values() for name, path in group.items()}
     if path.suffix == ".py" and path.is_file():

@@ -279,10 +279,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     page's own scripts alone, which are named by their hashes, and shows pictures that are inside the page.
 
     Args:
-        name: of the template.
-        view: what the page says.
         scripts: texts of the page's scripts, which run in this order after those of every page.
-        context: further values for the template.
     """
     from markupsafe import Markup
 

@@ -18,11 +18,6 @@ def by_run(case: Case, question: str, reason: str) -> Answer:
 
     A no is a clearly larger error. A controller that learns may still learn, so its short run is no reason for a no; that it does
     not pay is one only where the run is the whole one.
-
-    Args:
-        case: the controller.
-        question: in the words of a reader.
-        reason: why nothing else answers it.
     """
     trial = case.trial(case.controller.deformation)
     pair = None if isinstance(trial, str) else trial[0]

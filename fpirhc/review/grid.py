@@ -58,8 +58,6 @@ def inner_motion(
     """Return the motion of the inner states for every draw of the exact parameters.
 
     Args:
-        problem: the problem.
-        places: of the inner states, from `inner_places`.
         draws: parameters, shape (draws, np).
         times: increasing times from 0 on, shape (m,).
 
@@ -265,28 +263,19 @@ _FINE = 2001  # times of the plant's own inner states
 
 @dataclass(frozen=True, eq=False)
 class ReviewGrid:
-    """Points of the reference and draws of the parameters; build it with `review_grid`.
+    """Points of the reference and draws of the parameters; build it with `review_grid`."""
 
-    Args:
-        problem: the problem.
-        times: times of the points, shape (m,).
-        states: states of the reference, shape (m, nx); inner ones are simulated with the exact parameters, see `inner`.
-        responses: responses of the controlled coordinates that the reference needs, shape (m, n).
-        draws: exact parameters, shape (draws, np); the first row is the plant's own.
-        inner: places of the simulated states.
-        mismatch: range of the exact parameters and of the dead times, percent.
-        real: the problem with its reality, where it has one that is a plant; `problem` is then that of the model alone.
-        elsewhere: whether a run moves something else than the model's plant, so that its exact parameters move nothing.
-    """
-
-    problem: Problem
-    times: np.ndarray
+    problem: Problem  # the problem
+    times: np.ndarray  # times of the points, shape (m,)
+    # states of the reference, shape (m, nx); inner ones are simulated with the exact parameters, see `inner`
     states: np.ndarray
-    responses: np.ndarray
-    draws: np.ndarray
-    inner: tuple[int, ...] = ()
-    mismatch: float = 0.0
+    responses: np.ndarray  # responses of the controlled coordinates that the reference needs, shape (m, n)
+    draws: np.ndarray  # exact parameters, shape (draws, np); the first row is the plant's own
+    inner: tuple[int, ...] = ()  # places of the simulated states
+    mismatch: float = 0.0  # range of the exact parameters and of the dead times, percent
+    # the problem with its reality, where it has one that is a plant; `problem` is then that of the model alone
     real: Problem | None = None
+    # whether a run moves something else than the model's plant, so that its exact parameters move nothing
     elsewhere: bool = False
 
     @property
@@ -350,12 +339,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     """Return the points and draws of a review.
 
     Args:
-        problem: the problem.
         mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`.
-        seed: of the draws.
-
-    Raises:
-        NotInvertible: the inputs and the controlled coordinates differ in number.
     """
     elsewhere, known = problem.reality is not None, problem.of_equations
     real = known if known.reality else None

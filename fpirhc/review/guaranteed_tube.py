@@ -30,17 +30,11 @@ _LOST = 1e6  # bounds, as multiples of the run's own sizes, that will not close 
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """Where each coordinate and its derivatives stand in the state, and how they move over a cycle with a constant response.
+    """Where each coordinate and its derivatives stand in the state, and how they move over a cycle with a constant response."""
 
-    Args:
-        plant: the plant.
-        period: T of the control cycle.
-        law: that feeds the errors of the controlled coordinates back, without an integral.
-    """
-
-    plant: Plant
-    period: float
-    law: Tracking
+    plant: Plant  # the plant
+    period: float  # T of the control cycle
+    law: Tracking  # that feeds the errors of the controlled coordinates back, without an integral
 
     @cached_property
     def places(self) -> dict[str, list[int]]:
@@ -111,31 +105,18 @@ class Chains:
 
 @dataclass(frozen=True, eq=False)
 class Expressions:
-    """The functions of (x, w, p) whose ranges are needed; the command is the plant's inverse response of w.
+    """The functions of (x, w, p) whose ranges are needed; the command is the plant's inverse response of w."""
 
-    Args:
-        every: highest derivative of every coordinate (N,).
-        slopes: its derivative with respect to (x, w, p).
-        motion: x' (nx,).
-        rate: rate of `every` along the motion while the command is held (N,).
-        own: those of the controlled coordinates (n,).
-        model: rate of the model's response to the held command (n,).
-        drift: own - model (n,).
-        gain: J (n, n), column by column.
-        command: u (nu,).
-        realised: controlled response as a function of (x, u, p) (n,).
-    """
-
-    every: Enclosure
-    slopes: Enclosure
-    motion: Enclosure
-    rate: Enclosure
-    own: Enclosure
-    model: Enclosure
-    drift: Enclosure
-    gain: Enclosure
-    command: Enclosure
-    realised: Enclosure
+    every: Enclosure  # highest derivative of every coordinate (N,)
+    slopes: Enclosure  # its derivative with respect to (x, w, p)
+    motion: Enclosure  # x' (nx,)
+    rate: Enclosure  # rate of `every` along the motion while the command is held (N,)
+    own: Enclosure  # those of the controlled coordinates (n,)
+    model: Enclosure  # rate of the model's response to the held command (n,)
+    drift: Enclosure  # own - model (n,)
+    gain: Enclosure  # J (n, n), column by column
+    command: Enclosure  # u (nu,)
+    realised: Enclosure  # controlled response as a function of (x, u, p) (n,)
 
 
 def expressions(plant: Plant, believed: np.ndarray) -> Expressions:
@@ -144,7 +125,6 @@ def expressions(plant: Plant, believed: np.ndarray) -> Expressions:
     The inverse of mechanical systems has no division, so its bounds are the tighter ones.
 
     Args:
-        plant: the plant.
         believed: parameters of the model, shape (np,).
     """
     equations, names, controlled = plant.equations, plant.names, list(plant.controlled_names)
@@ -170,21 +150,13 @@ def expressions(plant: Plant, believed: np.ndarray) -> Expressions:
 
 @dataclass(frozen=True, eq=False)
 class Centre:
-    """The run of the plant in the middle of a box: numbers, of which nothing is assumed.
+    """The run of the plant in the middle of a box: numbers, of which nothing is assumed."""
 
-    Args:
-        states: x at the cycles, shape (nx, K + 1).
-        commands: u, shape (nu, K + 1).
-        desired: d, shape (n, K + 1).
-        lower: least parameters of the box, shape (np,).
-        upper: largest ones.
-    """
-
-    states: np.ndarray
-    commands: np.ndarray
-    desired: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
+    states: np.ndarray  # x at the cycles, shape (nx, K + 1)
+    commands: np.ndarray  # u, shape (nu, K + 1)
+    desired: np.ndarray  # d, shape (n, K + 1)
+    lower: np.ndarray  # least parameters of the box, shape (np,)
+    upper: np.ndarray  # largest ones
 
     @property
     def cycles(self) -> int:
@@ -255,21 +227,13 @@ class Tube:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What follows from assumed bounds, of one box of parameters around the run of its centre.
+    """What follows from assumed bounds, of one box of parameters around the run of its centre."""
 
-    Args:
-        expressions: of plant and model.
-        chains: of the plant with its law.
-        centre: the run.
-        believed: parameters of the model, shape (np,).
-        gain: a.
-    """
-
-    expressions: Expressions
-    chains: Chains
-    centre: Centre
-    believed: np.ndarray
-    gain: float
+    expressions: Expressions  # of plant and model
+    chains: Chains  # of the plant with its law
+    centre: Centre  # the run
+    believed: np.ndarray  # parameters of the model, shape (np,)
+    gain: float  # a
 
     def tube(self) -> Tube | str:
         """Return bounds that follow from themselves, or why none were found."""

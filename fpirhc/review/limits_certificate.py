@@ -30,31 +30,21 @@ _MORE = 1.1  # of what a limit is passed by, which is added to its margin
 
 @dataclass(frozen=True, eq=False)
 class LimitsCertificate:
-    """Whether the limits of inputs and the hard limits of states hold for every plant of the box; `fp.certify_limits` makes it.
+    """Whether the limits of inputs and the hard limits of states hold for every plant of the box; `fp.certify_limits` makes it."""
 
-    Args:
-        controller: for which this is said, with the margins of its plans.
-        failures: every inequality that fails, in words; empty where the certificate holds.
-        box: by parameter, the least and the largest exact value.
-        contraction: rho, the largest spectral radius of |I - a J|, of its bound entry by entry.
-        drift: L by controlled coordinate, the largest rate at which the responses of plant and model part.
-        error: e_bar by controlled coordinate, the largest response error of any plant.
-        tube: by state, the largest distance at a cycle of any plant from the run in the middle of its piece of the box.
-        lower: least states of any plant within every cycle, shape (cycles, nx).
-        upper: largest ones.
-        commands: by input, the least and the largest command of any plant.
-    """
-
-    controller: Controller
-    failures: tuple[str, ...]
-    box: Mapping[str, tuple[float, float]]
-    contraction: float
-    drift: Mapping[str, float]
-    error: Mapping[str, float]
+    controller: Controller  # for which this is said, with the margins of its plans
+    failures: tuple[str, ...]  # every inequality that fails, in words; empty where the certificate holds
+    box: Mapping[str, tuple[float, float]]  # by parameter, the least and the largest exact value
+    contraction: float  # rho, the largest spectral radius of |I - a J|, of its bound entry by entry
+    drift: Mapping[
+        str, float
+    ]  # L by controlled coordinate, the largest rate at which the responses of plant and model part
+    error: Mapping[str, float]  # e_bar by controlled coordinate, the largest response error of any plant
+    # by state, the largest distance at a cycle of any plant from the run in the middle of its piece of the box
     tube: Mapping[str, float]
-    lower: np.ndarray
-    upper: np.ndarray
-    commands: Mapping[str, tuple[float, float]]
+    lower: np.ndarray  # least states of any plant within every cycle, shape (cycles, nx)
+    upper: np.ndarray  # largest ones
+    commands: Mapping[str, tuple[float, float]]  # by input, the least and the largest command of any plant
 
     @property
     def holds(self) -> bool:
@@ -126,11 +116,7 @@ def _margins(problem: Problem, ready: Controller) -> dict[str, tuple[float, ...]
 
 
 def _covered_law(problem: Problem, ready: Controller) -> Tracking:
-    """Return the law of a controller that the theorem covers.
-
-    Raises:
-        NotSupported: everything that it does not cover.
-    """
+    """Return the law of a controller that the theorem covers."""
     check_prediction(problem, ready, "certificate")
     refuse(f"no certificate for {type(ready).__name__}: {reason}" for reason in _against(problem, ready))
     law = tracking_law(ready) if ready.planner is None else ready.planner.tracking

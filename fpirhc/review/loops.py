@@ -98,12 +98,7 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
 
 
 def loops_over_box(grid: ReviewGrid, controller: Controller, own: Loops) -> tuple[LinearLoop, ...]:
-    """Return loops of plants from the box of parameters, and with its shortest and its longest dead time.
-
-    Raises:
-        NotSupported: no linear loop.
-        FpirhcError: every error that the controller raises about the problem.
-    """
+    """Return loops of plants from the box of parameters, and with its shortest and its longest dead time."""
     drawn, every = points_of(grid, controller).drawn(own), max(1, len(own.places) // 2)
     late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, own.places[::every])]
     return (*drawn.values(), *late)
@@ -237,23 +232,13 @@ _LATEST: Latest[Points] = Latest(8)
 
 
 def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) -> list[LinearLoop]:
-    """Return the controller's linear loops with the exact parameters at some points of the reference.
-
-    Raises:
-        NotSupported: no linear loop.
-        FpirhcError: every error that the controller raises about the problem.
-    """
+    """Return the controller's linear loops with the exact parameters at some points of the reference."""
     points = points_of(grid, controller)
     return [points.at(k) for k in places]
 
 
 def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[LinearLoop]:
-    """Return the loops of plant = model without deformation at `count` points of the reference.
-
-    Raises:
-        NotSupported: no linear loop, or no point where the model's inverse is finite.
-        FpirhcError: every error that the controller raises.
-    """
+    """Return the loops of plant = model without deformation at `count` points of the reference."""
     points = points_of(grid, without_deformation(controller))
     return [
         points.ideal(k)
@@ -262,11 +247,7 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[Li
 
 
 def ideal_places(grid: ReviewGrid, believed: np.ndarray, count: int) -> list[int]:
-    """Return points of the reference at which a model with these parameters has a finite inverse.
-
-    Raises:
-        NotSupported: there is none.
-    """
+    """Return points of the reference at which a model with these parameters has a finite inverse."""
     return thinned(_finite(grid.needed(believed), "model's inverse"), count)
 
 
@@ -321,14 +302,7 @@ Pair: TypeAlias = tuple[LinearLoop, LinearLoop]
 
 
 class LoopsByGain:
-    """Loops of a map at its own gain and at a lower one, in the same coordinates.
-
-    Args:
-        points: of the loop.
-        own: points and draws that are looked at.
-        gain: effective gain of the map.
-        cycles: of the run.
-    """
+    """Loops of a map at its own gain and at a lower one, in the same coordinates."""
 
     def __init__(self, points: Points, own: Loops, gain: float, cycles: int) -> None:
         self._points, self._own, self.gains = points, own, (_LOWER * gain, gain)
@@ -398,10 +372,8 @@ def eigenvalues_near(
     """Return eigenvalues of J W, shape (samples, n); samples that are not finite are left out.
 
     Args:
-        grid: points of the reference.
         believed: parameters of the model, shape (np,).
         draws: the first draws of the grid, shape (draws, np); as many are used as the number of samples allows.
-        iteration: of the deformation, whose W it is.
         near: whether to sample near the reference too, and not only on it at r*.
     """
     states, requests = _near(grid, believed) if near else (grid.states, grid.requests(believed))
@@ -421,11 +393,7 @@ def eigenvalues_near(
 def spectrum_near(
     grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, iteration: Iteration, *, near: bool
 ) -> Spectrum:
-    """Return `eigenvalues_near` as a spectrum.
-
-    Raises:
-        InvalidValue: none is finite.
-    """
+    """Return `eigenvalues_near` as a spectrum."""
     return Spectrum(eigenvalues_near(grid, believed, draws, iteration, near=near))
 
 
@@ -469,8 +437,6 @@ def largest_product(problem: Problem, deformation: Deformation, eigenvalues: np.
     k where the dead times differ. The model-referenced form has another limit for every eigenvalue.
 
     Args:
-        problem: the problem.
-        deformation: the deformation.
         eigenvalues: of the response Jacobian, for the model-referenced form; their smallest and largest sizes count.
     """
     pairing = deformation.iteration.pairing

@@ -39,21 +39,13 @@ _CALL = 25  # cycles of the recursion in one call
 
 @dataclass(frozen=True, eq=False)
 class NominalRun:
-    """The model's own run, along which responses are predicted; build it with `nominal_run`.
+    """The model's own run, along which responses are predicted; build it with `nominal_run`."""
 
-    Args:
-        problem: the problem.
-        controller: the controller, with its deformation.
-        states: states of the run, shape (cycles + 1, nx).
-        desired: desired responses, shape (cycles, n).
-        believed: parameters of the model, shape (np,).
-    """
-
-    problem: Problem
-    controller: Controller
-    states: np.ndarray
-    desired: np.ndarray
-    believed: np.ndarray
+    problem: Problem  # the problem
+    controller: Controller  # the controller, with its deformation
+    states: np.ndarray  # states of the run, shape (cycles + 1, nx)
+    desired: np.ndarray  # desired responses, shape (cycles, n)
+    believed: np.ndarray  # parameters of the model, shape (np,)
 
     @property
     def cycles(self) -> int:
@@ -90,27 +82,15 @@ def _own_plant(plant: Plant, parameters: np.ndarray) -> Plant:
 
 @dataclass(frozen=True, eq=False)
 class ResponseErrors:
-    """Predictions of the recursion along a nominal run, in units of the response.
+    """Predictions of the recursion along a nominal run, in units of the response."""
 
-    Args:
-        error: response errors e_k just after each update, shape (cycles, n).
-        force: w_k, which acts on the deviation over each cycle, shape (cycles, n).
-        command: u_k, shape (cycles, nu).
-    """
-
-    error: np.ndarray
-    force: np.ndarray
-    command: np.ndarray
+    error: np.ndarray  # response errors e_k just after each update, shape (cycles, n)
+    force: np.ndarray  # w_k, which acts on the deviation over each cycle, shape (cycles, n)
+    command: np.ndarray  # u_k, shape (cycles, nu)
 
 
 def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = True) -> NominalRun:
-    """Return the run of the controller without its deformation on its own model, without disturbances and noise.
-
-    Raises:
-        NotSupported: a reality, dead time, estimated responses, a controller that does not track or plan with one model, a model
-            that does not stay finite.
-        FpirhcError: every error that the controller raises about the problem.
-    """
+    """Return the run of the controller without its deformation on its own model, without disturbances and noise."""
 
     def run() -> Run:
         own = _own_plant(problem.plant, controller.plant_model(problem).parameters(problem.plant))
@@ -121,11 +101,7 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
 
 
 def nominal_of(problem: Problem, controller: Controller, run: Callable[[], Run]) -> NominalRun:
-    """Return the nominal run from the run of the controller on its model, which is made where there is a prediction.
-
-    Raises:
-        NotSupported, FpirhcError: see `nominal_run`.
-    """
+    """Return the nominal run from the run of the controller on its model, which is made where there is a prediction."""
     check_prediction(problem, controller)
     ready = resolved(problem, controller)
     ready.check(problem)
@@ -142,7 +118,6 @@ def response_errors(
     """Return the response errors that the recursion predicts.
 
     Args:
-        nominal: the nominal run.
         deformation: the deformation; None: the controller's; Identity() is no adaptation.
         exact: exact parameters, shape (np,); None: the plant's; the believed ones give the null run.
     """
@@ -246,11 +221,7 @@ _EXACT: Latest[Plant] = Latest(8)
 
 
 def check_prediction(problem: Problem, controller: Controller, what: str = "prediction") -> None:
-    """Raise where the response does not belong to the last request of one model and one map.
-
-    Raises:
-        NotSupported: see `nominal_run`.
-    """
+    """Raise where the response does not belong to the last request of one model and one map."""
     refuse(_against(problem, controller, what))
 
 
@@ -286,12 +257,9 @@ class NominalRuns:
     """Runs of a problem's models without adaptation, each made when it is first asked for.
 
     Controllers that differ in their deformation alone share one.
-
-    Args:
-        problem: the problem; its runs are shortened to at most `CYCLES` cycles.
     """
 
-    problem: Problem
+    problem: Problem  # the problem; its runs are shortened to at most `CYCLES` cycles
     _known: dict[Hashable, object] = field(default_factory=dict, init=False)
 
     def of(self, controller: Controller) -> NominalRun | str:
@@ -309,21 +277,12 @@ class NominalRuns:
         return ModelAsPlant(_quiet(shortened(self.problem, CYCLES)), seed=0)
 
     def bare(self, controller: Controller) -> Run:
-        """Return the run of the controller without its deformation on its model.
-
-        Raises:
-            FpirhcError: every error that the controller raises about the problem.
-        """
+        """Return the run of the controller without its deformation on its model."""
         bare = without_deformation(resolved(self.problem, controller))
         return self.model.run(self._loop(bare), self.model.of(bare))
 
     def null(self, controller: Controller) -> ErrorPair:
-        """Return the errors of the controller on its own model, with and without adaptation, over at most `CYCLES` cycles.
-
-        Raises:
-            NotSupported: a controller without a deformation.
-            FpirhcError: every error that the controller raises about the problem.
-        """
+        """Return the errors of the controller on its own model, with and without adaptation, over at most `CYCLES` cycles."""
         ready = resolved(self.problem, controller)
         return errors_of(*self.model.pair((self._loop(without_deformation(ready)), self._loop(ready))))
 
@@ -332,15 +291,7 @@ class NominalRuns:
         return self._once(name, lambda: loop_of(_quiet(self.problem), controller))
 
     def trials(self, problem: Problem, controller: Controller) -> Trials:
-        """Return runs of deformations beside the controller without its own, of at most `TRIED` cycles each.
-
-        Args:
-            problem: of the review, with its reality.
-            controller: resolved.
-
-        Raises:
-            FpirhcError: every error that the controller raises about the problem.
-        """
+        """Return runs of deformations beside the controller without its own, of at most `TRIED` cycles each."""
         bare = without_deformation(controller)
         return self._once(("trials", identity(bare)), lambda: Trials(problem, bare, cycles=TRIED, goes_on=True))
 

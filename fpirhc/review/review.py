@@ -48,12 +48,7 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
 
 
 def predict(problem: Problem, controller: Controller) -> Answer:
-    """Return the verdict alone: whether the deformation of a controller converges on the plant with its exact parameters.
-
-    Raises:
-        NotInvertible: see `review`.
-        FpirhcError: every error that the controller raises about the problem.
-    """
+    """Return the verdict alone: whether the deformation of a controller converges on the plant with its exact parameters."""
     controller = with_lateness(problem, controller)
     grid = review_grid(behind_stated_lag(problem), 0.0, 0)
     grid = replace(grid, draws=grid.draws[:1])  # the box does not matter

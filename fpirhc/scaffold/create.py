@@ -20,12 +20,7 @@ _FALLBACK = "my_plant"
 
 
 def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
-    """Write NAME.py and test_NAME.py into the folder, which is created where it is missing, and return their paths.
-
-    Raises:
-        InvalidName: a name that is no plain identifier or that another module has; the message offers a usable one.
-        OutputError: one of the files exists already (nothing is written then), or the folder cannot be written to.
-    """
+    """Write NAME.py and test_NAME.py into the folder, which is created where it is missing, and return their paths."""
     check_name(name)
     baseline = baseline_path(folder / f"{name}.py")
     if baseline.exists() or baseline.is_symlink():
@@ -59,11 +54,7 @@ def first_baseline(problem_file: Path) -> Path:
 
 
 def check_name(name: str) -> None:
-    """Raise unless a problem can have this name.
-
-    Raises:
-        InvalidName: a name that cannot be used; the message offers another one.
-    """
+    """Raise unless a problem can have this name."""
     usable = _usable(name)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise InvalidName(

@@ -199,24 +199,17 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Data of an observer in one cycle.
+    """Data of an observer in one cycle."""
 
-    Args:
-        measured: what the sensors show, by name of the quantity.
-        known: state elements that follow from these alone: measured, or derivatives of measured coordinates.
-        command: it acted until the sample was taken.
-        parameters: of the model.
-        moves: share of a cycle by which the sample is later than the last one: 1, or 0 for a sample that still shows the start.
-            Where samples are late by a fraction of a cycle, the first one that moves shows a mean with the start, and so a share.
-        counts: 1 where the sample was taken in this run, and is not the start again that fills a dead time.
-    """
-
-    measured: Mapping[str, Expression]
+    measured: Mapping[str, Expression]  # what the sensors show, by name of the quantity
+    # state elements that follow from these alone: measured, or derivatives of measured coordinates
     known: Mapping[str, Expression]
-    command: Expression
-    parameters: Expression
+    command: Expression  # it acted until the sample was taken
+    parameters: Expression  # of the model
+    # share of a cycle by which the sample is later than the last one: 1, or 0 for a sample that still shows the start.
+    # Where samples are late by a fraction of a cycle, the first one that moves shows a mean with the start, and so a share.
     moves: Expression
-    counts: Expression
+    counts: Expression  # 1 where the sample was taken in this run, and is not the start again that fills a dead time
 
 
 Predict: TypeAlias = Callable[[Evidence, Remembered], Expression]
@@ -298,11 +291,6 @@ def name_mistakes(
 
     Args:
         owner: the observer's class.
-        plant: the model.
-        shown: names of what sensors show.
-        measured: quantities with the noise of their sensors.
-        noise: coordinates with their noise.
-        start: states with the deviation of their first value.
     """
     mistakes, every = Mistakes(owner), quantities(plant)
     mistakes.unknown("measured: quantity", measured, every)

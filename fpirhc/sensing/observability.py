@@ -41,8 +41,6 @@ def slowest(
     """Return the largest real part of the poles with which these errors move, in 1 / unit of time; negative: all decay.
 
     Args:
-        slopes: Jacobians of the rates.
-        basis: of the errors.
         growth: of poles; of a map's divided differences it is not the real part (`fpirhc.plant.maps.decay_rates`).
     """
     if not basis.shape[1]:

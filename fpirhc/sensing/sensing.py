@@ -60,11 +60,7 @@ def uncovered(
     followed in place of the true one.
 
     Args:
-        plant: that is measured.
-        estimator: of state, or outputs, and response.
         named: names of the measured quantities where a user names them.
-        measured: names of all measured quantities.
-        observer: how other states are believed.
     """
     missing = [n for n in estimator.measures(plant) if n not in measured]
     if named is not None and not measured:

@@ -21,31 +21,20 @@ Changes = Mapping[float, Numbers]  # by time, s
 
 @dataclass(frozen=True, eq=False)
 class InForce:
-    """The settings of one run.
+    """The settings of one run."""
 
-    Args:
-        problem: the problem with the numbers at the start.
-        controller: the controller with them.
-        numbers: of all live settings at the start, by path.
-        patches: (first cycle, places in the memory, values) of every change, in the order of time.
-        record: what was in force when, as plain data: [time in s, {path: number}], ...
-        later: (first cycle, problem) of every change, for the tables of the run.
-    """
-
-    problem: Problem
-    controller: Controller
-    numbers: Mapping[str, float]
+    problem: Problem  # the problem with the numbers at the start
+    controller: Controller  # the controller with them
+    numbers: Mapping[str, float]  # of all live settings at the start, by path
+    # (first cycle, places in the memory, values) of every change, in the order of time
     patches: Sequence[tuple[int, np.ndarray, np.ndarray]]
+    # what was in force when, as plain data: [time in s, {path: number}],
     record: Sequence[tuple[float, Mapping[str, float]]]
-    later: Sequence[tuple[int, Problem]] = ()
+    later: Sequence[tuple[int, Problem]] = ()  # (first cycle, problem) of every change, for the tables of the run
 
 
 def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes) -> InForce:
-    """Return the settings of a run, checked before it starts.
-
-    Raises:
-        InvalidName, InvalidValue: a setting that is not live, or a number that it does not accept; a time outside the run.
-    """
+    """Return the settings of a run, checked before it starts."""
     named_entries("settings", settings)
     _check_times(changes)
     if not (live.paths or settings or changes):

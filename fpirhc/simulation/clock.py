@@ -82,9 +82,7 @@ def missed_cycles(time: float, before: float, period: float) -> int:
     The sample of a missed cycle is missing. The command of the last step went on acting in it, as in every cycle that is skipped.
 
     Args:
-        time: of the step.
         before: time of the step before it, as the clock remembers it; -FINITE: there was none.
-        period: of the control cycle.
     """
     cycles = (time - before) / period
     return round(cycles) - 1 if before > -FINITE / 2 and 1.5 <= cycles <= LONGEST else 0
@@ -96,7 +94,6 @@ def most_missed(problem: Problem, bridged: int) -> int:
     Beyond it estimators begin anew, and queues hold nothing but the held command; an observer is predicted no further.
 
     Args:
-        problem: of the step.
         bridged: number of missing cycles up to which a gap is bridged; queues go on for their whole length.
     """
     late = problem.dead_time
@@ -122,11 +119,7 @@ class Deadline:
         """Begin to count.
 
         Args:
-            limit: s.
             clock: function that returns the time, s.
-
-        Raises:
-            InvalidValue: a limit that is not positive and finite.
         """
         if isinstance(limit, bool) or not isinstance(limit, int | float) or not 0 < limit < math.inf:
             raise InvalidValue(

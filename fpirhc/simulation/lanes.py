@@ -34,23 +34,16 @@ _ROOM = 2**27  # bytes of tables and of what is kept, beyond which runs take tur
 
 @dataclass(frozen=True, eq=False)
 class ManyRuns:
-    """Errors of many plants.
+    """Errors of many plants."""
 
-    Args:
-        rms_error: by coordinate, shape (plants,), in its unit; NaN where a run ended before `measure_from`.
-        max_error: the same, largest sizes.
-        statuses: cycles with each status that occurred, by its name, shape (plants,).
-        stops: why the runs of some plants ended early, by number of the plant.
-        lanes: plants that ran side by side in one register, or work item of a device; 0: one after the other by the ordinary loop.
-        why: no lanes; empty where there are some.
-    """
-
+    # by coordinate, shape (plants,), in its unit; NaN where a run ended before `measure_from`
     rms_error: Mapping[str, np.ndarray]
-    max_error: Mapping[str, np.ndarray]
-    statuses: Mapping[str, np.ndarray]
-    stops: Mapping[int, str]
+    max_error: Mapping[str, np.ndarray]  # the same, largest sizes
+    statuses: Mapping[str, np.ndarray]  # cycles with each status that occurred, by its name, shape (plants,)
+    stops: Mapping[int, str]  # why the runs of some plants ended early, by number of the plant
+    # plants that ran side by side in one register, or work item of a device; 0: one after the other by the ordinary loop
     lanes: int
-    why: str
+    why: str  # no lanes; empty where there are some
 
 
 def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str | None = None) -> ManyRuns:
@@ -105,17 +98,11 @@ def _errors_alone() -> tuple[Metric, ...]:
 
 @dataclass(frozen=True, eq=False)
 class OneRun:
-    """One of several runs of a loop.
+    """One of several runs of a loop."""
 
-    Args:
-        problem: the problem of the loop with the numbers of the run.
-        memory: first one of the loop, see `Simulator.first_memory`.
-        seed: of the noise.
-    """
-
-    problem: Problem
-    memory: np.ndarray
-    seed: int
+    problem: Problem  # the problem of the loop with the numbers of the run
+    memory: np.ndarray  # first one of the loop, see `Simulator.first_memory`
+    seed: int  # of the noise
 
 
 class Lanes:
@@ -218,20 +205,14 @@ def _why_no_lanes(ready: Simulator, device: str | None) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Library:
-    """The compiled loop over lanes.
+    """The compiled loop over lanes."""
 
-    Args:
-        run: function of (groups, cycles, first that is measured, whether tables are of lanes, first memories, first sums, tables,
-            results, what is kept).
-        lanes: plants of a group.
-        batch: groups of a call.
-        threads: calls at a time.
-    """
-
+    # function of (groups, cycles, first that is measured, whether tables are of lanes, first memories, first sums, tables,
+    # results, what is kept)
     run: Callable[..., int]
-    lanes: int
-    batch: int
-    threads: int
+    lanes: int  # plants of a group
+    batch: int  # groups of a call
+    threads: int  # calls at a time
 
     def results(
         self, problem: Problem, memories: np.ndarray, begun: np.ndarray, reads: np.ndarray, kept: int
@@ -239,11 +220,9 @@ class _Library:
         """Return the last sums, which runs ended, and what was kept, shape (runs, cycles, kept).
 
         Args:
-            problem: of the runs.
             memories: first ones, shape (runs, memory).
             begun: first sums, shape (runs, sums).
             reads: what cycles read, shape (cycles, entries), or (runs, cycles, entries).
-            kept: numbers that are kept of every cycle.
         """
         count, cycles, own = len(memories), problem.cycles, reads.ndim > 2
         groups = -(-count // self.lanes)
@@ -286,13 +265,7 @@ def _starts(ready: Simulator, exact: np.ndarray) -> np.ndarray:
 
 
 def _built(ready: Simulator, sums: Sums, device: str | None) -> _Library:
-    """Compile the loop.
-
-    Raises:
-        CompileError: the compiler fails.
-        InvalidName, NotInstalled: no such device.
-        NoCode: a part of the loop is not written for lanes, or for devices.
-    """
+    """Compile the loop."""
     functions = ready.loop.function, sums.function()
     if device is not None:
         text, callees = written_for_devices(*functions)

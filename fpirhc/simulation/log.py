@@ -65,11 +65,7 @@ class Log(FoundByName):
         return [(a * self.period, b * self.period, int(slots[a])) for a, b in zip(starts, ends, strict=True)]
 
     def unit(self, column: str) -> str:
-        """Return the unit of one column.
-
-        Raises:
-            InvalidName: an unknown column; the nearest one is offered.
-        """
+        """Return the unit of one column."""
         if column not in self.layout.columns:
             raise self._unknown(column)
         return self.layout.units[self.layout.columns.index(column)]

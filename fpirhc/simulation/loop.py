@@ -35,9 +35,6 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
     Both parameter sets are part of the memory (constant), so that other values need no new Function; live settings likewise. The
     disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
     `setpoints` only where the reference is given some.
-
-    Raises:
-        NotSupported: a live setting that this loop cannot keep open.
     """
     if live is not None:
         return live.composed(lambda problem, controller: _closed(problem, controller, live))
@@ -71,9 +68,7 @@ def start_memory(
     """Return the first memory of a loop, shape (loop.memory.size,).
 
     Args:
-        loop: from `close_loop`.
         problem: the problem of the loop, or one that differs from it in the exact parameters only.
-        controller: the controller of the loop, resolved.
         numbers: of all live settings, by path; None: those of the build.
     """
     remembered = []

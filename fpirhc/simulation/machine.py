@@ -51,11 +51,7 @@ def watch_block(problem: Problem, controller: Controller, status: str, *, longes
     must exceed (|r| / 1000)^2. The watch changes no command.
 
     Args:
-        problem: of the controller.
-        controller: resolved.
-        status: name of the signal with the status so far.
         longest: cycles at a limit, beyond which the status is SATURATED.
-        window: cycles of the fit, and of the factor above one.
     """
     plant, watched = problem.plant, _iterates(problem, controller)
     pair = (plant.response_signal("deformed"), plant.response_signal("realised")) if watched else ()
@@ -166,10 +162,7 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, monitor: 
     """Return the step (memory, sample, parameters) -> (memory, trace, command); `Gate.named` names its memory.
 
     Args:
-        problem: of the controller.
-        controller: resolved.
         gate: around the controller's step.
-        monitor: the limits of the monitor.
     """
     block = under_names(gate.block(), {"status": _GATED})
     longest = round(monitor.saturated_after / problem.period)
@@ -241,11 +234,7 @@ def measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
 
 
 def refuse_unbounded(controller: Controller) -> None:
-    """Refuse a controller whose optimiser may take any time.
-
-    Raises:
-        NotSupported: its planner's optimiser says that its time has no bound.
-    """
+    """Refuse a controller whose optimiser may take any time."""
     planner = controller.planner
     why = planner.optimiser.unbounded if planner is not None else ""
     if why:

@@ -153,7 +153,6 @@ def behind_actuators(plant: Plant, lags: Sequence[float]) -> Plant:
     """Return the plant whose inputs act through lags.
 
     Args:
-        plant: given by differential equations, without algebraic states.
         lags: time constant of every input's actuator, in the plant's unit of time; 0: the input acts at once.
     """
     taus = {name: tau for name, tau in zip(plant.inputs, lags, strict=True) if tau > 0}

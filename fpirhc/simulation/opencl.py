@@ -16,13 +16,7 @@ def loaded_kernel(source: str, device: str) -> Callable[..., int]:
     """Build the kernel `run_lanes` and return it as a function of (plants, cycles, first, own, start, begun, reads, results, log).
 
     Args:
-        source: OpenCL C.
         device: part of the name of a device; '': the first graphics processor, else the first device.
-
-    Raises:
-        InvalidName: no device has this name.
-        NoCode: the device's compiler fails.
-        NotInstalled: pyopencl is not there, or no device with double precision.
     """
     cl = package("pyopencl", "opencl", "a device")
     chosen = _device(cl, device)

@@ -436,10 +436,7 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
     """Return the block of the true motion, with the true response of a map in place of the one that it writes.
 
     Args:
-        problem: with a map.
-        sense: block that writes `motion` and `response`.
         motion: signal of the state, or of the outputs where the plant has some.
-        response: signal of the response.
     """
     period = problem.period
     orders = problem.plant.response_orders
@@ -556,12 +553,7 @@ def _by_place(problem: Problem, disturbance: Expression) -> dict[tuple[bool, str
 
 
 def added(problem: Problem, disturbance: Expression) -> tuple[Expression, Expression]:
-    """Return what disturbances add to y, y', ... below the responses, and to the controlled responses.
-
-    Args:
-        problem: with disturbed outputs.
-        disturbance: value of `disturbance_signal`.
-    """
+    """Return what disturbances add to y, y', ... below the responses, and to the controlled responses."""
     plant, orders = problem.plant, problem.disturbed_outputs
     values: Mapping[str, Expression] = dict(
         zip(disturbance_signal(problem).elements, ca.vertsplit(disturbance), strict=True)

@@ -32,19 +32,12 @@ _DIVERGED = 1e100  # size of numbers that no loop but a diverging one has
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """Where logged numbers must be, and what is said of one that is not.
+    """Where logged numbers must be, and what is said of one that is not."""
 
-    Args:
-        columns: of the log, shape (m,).
-        lower: shape (m,).
-        upper: shape (m,).
-        words: (before, behind) a number that is outside.
-    """
-
-    columns: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    words: tuple[tuple[str, str], ...]
+    columns: np.ndarray  # of the log, shape (m,)
+    lower: np.ndarray  # shape (m,)
+    upper: np.ndarray  # shape (m,)
+    words: tuple[tuple[str, str], ...]  # (before, behind) a number that is outside
 
     def first_outside(self, rows: np.ndarray) -> tuple[int, str] | None:
         """Return the first row of a log in which a number is outside, and which one; None where all are inside."""
@@ -120,9 +113,6 @@ class Dropped:
 
     What a controller computes in a cycle of status NON_FINITE reaches neither the plant nor its memory: that step was dropped, what
     it logged shows its last finite values, and the run goes on.
-
-    Args:
-        loop: whose log it is.
     """
 
     def __init__(self, loop: Composite) -> None:

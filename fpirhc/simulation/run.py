@@ -173,9 +173,6 @@ def _write(run: Log, path: Path) -> None:
     """Write the file beside its place first, then under its name, so that a broken write leaves an earlier file as it was.
 
     Log and facts are a numpy array and JSON, so that reading a file of somebody else never runs its code.
-
-    Raises:
-        OutputError: the place cannot be written, or is a symbolic link or no ordinary file.
     """
     facts = {
         "format": FORMAT,
@@ -196,11 +193,7 @@ def _write(run: Log, path: Path) -> None:
 
 
 def _read(path: Path) -> tuple[Facts, Layout, np.ndarray]:
-    """Return facts, layout and log of a file, with columns that a file of an older version lacks.
-
-    Raises:
-        OutputError: the file is missing, damaged, of another format, or no file of a run.
-    """
+    """Return facts, layout and log of a file, with columns that a file of an older version lacks."""
     try:
         log, stored = _parts(path)
         facts = _facts(stored)

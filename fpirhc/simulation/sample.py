@@ -24,12 +24,7 @@ def raw_measurements(run: Run) -> np.ndarray:
 
 
 def numbers(name: str, value: object, size: int) -> np.ndarray:
-    """Return `value` as float64, shape (size,).
-
-    Raises:
-        InvalidValue: text, truth values, masked arrays, None, complex numbers, or anything else that is not made of real numbers.
-        InvalidShape: a wrong number of entries, or a matrix.
-    """
+    """Return `value` as float64, shape (size,)."""
     if isinstance(value, np.ma.MaskedArray):
         raise InvalidValue(
             f"argument '{name}' is a masked array; a missing number is NaN: {name}.filled(np.nan) skips the cycle"
@@ -52,11 +47,7 @@ def numbers(name: str, value: object, size: int) -> np.ndarray:
 
 
 def one_number(name: str, value: object) -> float:
-    """Return `value` as a float.
-
-    Raises:
-        InvalidValue: anything that is not one real number.
-    """
+    """Return `value` as a float."""
     number = real_number(value)
     if number is None:
         raise InvalidValue(f"argument '{name}' must be a number of seconds, got {described(value)}")

@@ -273,13 +273,9 @@ def judged_run(
     """Run a loop that is ready and return every signal, also those that judge the run; see `simulate`.
 
     Args:
-        ready: from `simulator`.
-        seed: of the noise of disturbances and sensors.
         name: of the controller in the results; '': its label, or the name of its class.
         progress: called with (cycles done, cycles in all).
         settings: numbers of live settings by path; the others have the numbers of the build.
-        changes: numbers of live settings from a time on.
-        setpoints: by coordinate, in place of those of the reference.
     """
     title = name or name_in_task(ready.controller)
     run = ready.run(seed=seed, name=title, progress=progress, settings=settings, changes=changes, setpoints=setpoints)
@@ -311,11 +307,8 @@ def run_tables(
     """Return what the loop reads in every cycle: disturbances, the sensors' random series, set-points, where there are any.
 
     Args:
-        problem: the task.
         seed: of the noise of disturbances and sensors; each has its own stream.
-        cycles: number of rows.
         disturbed: whether disturbances act; the sensors' noise always does.
-        setpoints: by coordinate, in place of those of the reference.
         later: (first cycle, problem) with other numbers of disturbances and sensors from a cycle on.
     """
     times, sensing, disturbances = np.arange(cycles) * problem.period, problem.sensing, problem.disturbances
@@ -346,17 +339,10 @@ def run_cycles(
     """Return the log, shape (cycles, trace.size), and the reason why the run ended early.
 
     Args:
-        problem: of the run.
-        start: first memory of the loop.
-        loop: one cycle, which the log is of.
         evaluator: of the loop over as many cycles as a call runs, see `chained`.
         tables: disturbances and the sensors' random series, one row per cycle, in whole chunks.
         talk: what passes between the loop and a plant outside after every call.
         progress: called with (cycles done, cycles in all).
-        patches: changes of the memory before some cycles.
-
-    Raises:
-        InvalidProblem: a bad first answer of a plant outside.
     """
     cycles, trace, dropped, padded = problem.cycles, loop.trace, Dropped(loop), _padded(problem, patches)
     count = evaluator.results[1].size // trace.size  # a call

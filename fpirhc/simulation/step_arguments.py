@@ -43,12 +43,7 @@ _FUNCTION = "a function of time"
 
 
 def set_point_table(problem: Problem, setpoints: Setpoints | None, cycles: int) -> np.ndarray:
-    """Return what the reference is given in every cycle, shape (cycles, entries); no entries for a reference without set-points.
-
-    Raises:
-        InvalidName: a coordinate without set-point; the nearest one is offered.
-        InvalidValue: no steps, or a set-point that is not finite, or outside the range or the limits of its state.
-    """
+    """Return what the reference is given in every cycle, shape (cycles, entries); no entries for a reference without set-points."""
     signals, steps = given_signals(problem), _steps(problem, setpoints)
     if not signals:
         return np.zeros((cycles, 0))
@@ -68,13 +63,7 @@ def set_point_record(problem: Problem, setpoints: Setpoints | None) -> dict[str,
 
 
 def set_points_now(problem: Problem, setpoints: SetpointsNow, before: np.ndarray) -> np.ndarray:
-    """Return the row of one step: `before` with other set-points of some coordinates, shape (entries,).
-
-    Raises:
-        InvalidName: a coordinate without set-point; the nearest one is offered.
-        InvalidShape: neither one number nor one per node.
-        InvalidValue: a set-point that is not finite, or outside the range or the limits of its state.
-    """
+    """Return the row of one step: `before` with other set-points of some coordinates, shape (entries,)."""
     _check_names(problem, setpoints)
     names = list(problem.plant.chains)
     rows = before.reshape(-1, len(names)).copy()
@@ -186,12 +175,7 @@ class StepArguments:
         self.command = _view(self.command_next)
 
     def accept(self, time: object, state: object, realised: object, memory: object, measures: tuple[str, ...]) -> None:
-        """Take arguments that are no arrays of float64, or say what is wrong with them.
-
-        Raises:
-            InvalidShape: a wrong number of entries, named; `measures` are the names of the raw measurements.
-            InvalidValue: an argument that is not made of numbers.
-        """
+        """Take arguments that are no arrays of float64, or say what is wrong with them."""
         if self.estimates and np.size(cast(float, realised)):
             raise InvalidShape(
                 f"this controller estimates its state and response from {', '.join(measures)}: use "
@@ -216,8 +200,6 @@ class StepArguments:
         """Return the memory of a skipped cycle, and write status, command and count of it into the trace.
 
         Args:
-            layout: of the memory.
-            signals: of the trace.
             missing: number of cycles that the next step will count as skipped; 0: this cycle is counted now.
         """
         memory = np.where(np.isfinite(self.memory_before), self.memory_before, layout.start())
@@ -228,11 +210,7 @@ class StepArguments:
         return memory
 
     def refuse_foreign_memory(self) -> None:
-        """Raise for a memory with another fingerprint; a memory of NaN is a restart.
-
-        Raises:
-            InvalidValue: the memory of another controller.
-        """
+        """Raise for a memory with another fingerprint; a memory of NaN is a restart."""
         if isnan(self.memory[0]):
             return
         raise InvalidValue(
@@ -262,9 +240,6 @@ class NumbersNow:
         """Put the numbers of the build in force.
 
         Args:
-            live: the settings and what they may be.
-            composite: the step.
-            settings: arguments of the step, by the name of their signal.
             setpoints: argument of the step, with the set-points at the start; no entries without any.
         """
         self._live, self._composite = live, composite
@@ -279,12 +254,7 @@ class NumbersNow:
         return self._composite.memory.pack(remembered)
 
     def change(self, settings: Numbers) -> bool:
-        """Put numbers of live settings in force, by path, and return whether they were accepted.
-
-        Raises:
-            InvalidField: no mapping of names.
-            InvalidName: a setting that is not live.
-        """
+        """Put numbers of live settings in force, by path, and return whether they were accepted."""
         if not named_entries("settings", settings):
             return True
         before = {path: value for path, value in self.numbers.items() if path in self._live.paths}
@@ -303,13 +273,7 @@ class NumbersNow:
         return {path: self._live.bounds(path) for path in self._live.paths}
 
     def set_reference(self, setpoints: SetpointsNow) -> bool:
-        """Put set-points in force, by coordinate or output, and return whether they were accepted.
-
-        Raises:
-            InvalidField: no mapping of names.
-            InvalidName: a coordinate without set-point.
-            InvalidShape: neither one number nor one per node.
-        """
+        """Put set-points in force, by coordinate or output, and return whether they were accepted."""
         if not named_entries("setpoints", setpoints):
             return True
         try:

@@ -102,26 +102,14 @@ class Stepper(Checked):
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
 
         Args:
-            problem: the task.
-            controller: its automatic settings are chosen here.
-            compiled: whether it is compiled to C.
             plausible: intervals (lower, upper) by name of a state ("q1", "q1'") or response ("q1''"), which replace the automatic
                 ones (see `fpirhc.controllers.plausible`).
             max_age: oldest sample that is used, s; the time stamps of samples must then increase. None: they are not looked at.
             monitor: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
             bounded: whether an optimiser whose call may take any time is refused.
-            live: paths of the live settings.
             deadline: longest time of a step, s; longer ones are counted, see `deadline`. None: no step is timed.
             clock: function that returns the time for that, s.
             bridged: number of missing cycles up to which estimators and queues are moved over a gap.
-
-        Raises:
-            InvalidProblem: an unknown name or a wrong interval in `plausible`.
-            InvalidName: a live setting that does not exist.
-            InvalidValue: a deadline that is no positive number.
-            NotContractive: a gain with which the deformation cannot converge; the message names the recommended one.
-            NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
-            CompileError: the compiler fails on a controller with live settings.
         """
         self.deadline = None if deadline is None else Deadline(deadline, clock)
         if self.deadline is not None:

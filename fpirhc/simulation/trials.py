@@ -39,22 +39,17 @@ SLIGHT, CLEAR = 1e-3, 1e-2  # added error as a share of the coordinate's range
 
 @dataclass(frozen=True, eq=False)
 class ErrorPair:
-    """Errors of two runs on the same plant.
+    """Errors of two runs on the same plant."""
 
-    Args:
-        without: rms tracking error by judged coordinate without adaptation, in the unit of the coordinate; infinite where the run
-            ended early.
-        adapted: the same with the deformation.
-        ranges: range of the reference, or the largest error of the run without adaptation where that is larger, by coordinate.
-        units: of the coordinates.
-        at_limit: share of the cycles in which a command stands at a limit, of the run where it is smaller; NaN where one
-            ended before errors count.
-    """
-
+    # rms tracking error by judged coordinate without adaptation, in the unit of the coordinate; infinite where the run
+    # ended early
     without: Mapping[str, float]
-    adapted: Mapping[str, float]
+    adapted: Mapping[str, float]  # the same with the deformation
+    # range of the reference, or the largest error of the run without adaptation where that is larger, by coordinate
     ranges: Mapping[str, float]
-    units: Mapping[str, str]
+    units: Mapping[str, str]  # of the coordinates
+    # share of the cycles in which a command stands at a limit, of the run where it is smaller; NaN where one ended before
+    # errors count
     at_limit: float = 0.0
 
     def unit(self, name: str) -> str:
@@ -190,14 +185,8 @@ class Trials:
         """Take the problem and the controller without adaptation.
 
         Args:
-            problem: of all runs.
-            bare: the controller without adaptation.
-            cycles: largest number of cycles of a run.
             goes_on: whether a run with more error, which may be one of the start alone, is made again with so many cycles where
                 errors count, unless they count in the short one.
-
-        Raises:
-            FpirhcError: every error that the controller raises about the problem.
         """
         self.problem = shortened(problem, cycles)
         end = min(problem.duration, problem.measure_from + cycles * problem.period)

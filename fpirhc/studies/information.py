@@ -28,43 +28,26 @@ _SAMPLES = 2000  # of the reference, at most
 
 @dataclass(frozen=True)
 class Reachable:
-    """What one measured quantity allows.
+    """What one measured quantity allows."""
 
-    Args:
-        coordinate: controlled coordinate.
-        measured: the quantity: its response, or a derivative below.
-        order: n, one more than the number of integrators between the residual and the quantity.
-        noise: s, deviation per sample, in its unit.
-        error: smallest deviation of the residual from any estimate of it, one cycle ahead, in the response's unit.
-        formula: the same by the formula of slow filters.
-        bandwidth: omega, rad per unit of time; infinite without noise.
-        gain: T omega up to 1 for n = 1, the gain of the deformation that reaches it; NaN for others.
-        margin: largest gain of the plant, in units of the model's, that the filter survives by itself.
-    """
-
-    coordinate: str
-    measured: str
-    order: int
-    noise: float
-    error: float
-    formula: float
-    bandwidth: float
-    gain: float
-    margin: float
+    coordinate: str  # controlled coordinate
+    measured: str  # the quantity: its response, or a derivative below
+    order: int  # n, one more than the number of integrators between the residual and the quantity
+    noise: float  # s, deviation per sample, in its unit
+    error: float  # smallest deviation of the residual from any estimate of it, one cycle ahead, in the response's unit
+    formula: float  # the same by the formula of slow filters
+    bandwidth: float  # omega, rad per unit of time; infinite without noise
+    gain: float  # T omega up to 1 for n = 1, the gain of the deformation that reaches it; NaN for others
+    margin: float  # largest gain of the plant, in units of the model's, that the filter survives by itself
 
 
 @dataclass(frozen=True)
 class InformationComparison:
-    """What every measured quantity allows, the best first within a coordinate.
+    """What every measured quantity allows, the best first within a coordinate."""
 
-    Args:
-        rows: one per measured quantity.
-        drift: D of every controlled coordinate, response unit / s^0.5.
-        residual: rms of the residual along the reference by coordinate: the error without any correction; empty where D was given.
-    """
-
-    rows: tuple[Reachable, ...]
-    drift: Mapping[str, float]
+    rows: tuple[Reachable, ...]  # one per measured quantity
+    drift: Mapping[str, float]  # D of every controlled coordinate, response unit / s^0.5
+    # rms of the residual along the reference by coordinate: the error without any correction; empty where D was given
     residual: Mapping[str, float]
 
     def best(self, coordinate: str) -> Reachable:

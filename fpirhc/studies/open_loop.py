@@ -19,31 +19,18 @@ from fpirhc.task.exogenous import previewed_values
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """One optimiser's plan.
+    """One optimiser's plan."""
 
-    Args:
-        name: label of the optimiser.
-        plan: its plan.
-        certificate: certificate of the plan; None where the plan is not inside its bounds.
-    """
-
-    name: str
-    plan: Plan
-    certificate: Certificate | None
+    name: str  # label of the optimiser
+    plan: Plan  # its plan
+    certificate: Certificate | None  # certificate of the plan; None where the plan is not inside its bounds
 
 
 def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solved]:
     """Solve the horizon that begins at the start of the problem, with the approximate model.
 
     Args:
-        task: the loaded problem file.
         names: names of optimisers; 'all' among them stands for every optimiser.
-        tolerance: tolerance of the optimisers.
-
-    Raises:
-        InvalidProblem: the problem has no horizon or cost.
-        InvalidName: an unknown optimiser.
-        NotSupported: an optimiser that cannot serve the problem.
     """
     problem = task.problem
     if problem.horizon is None or problem.cost is None:

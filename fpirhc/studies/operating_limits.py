@@ -87,23 +87,14 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class OperatingLimit:
-    """The limit of one controller in one quantity.
+    """The limit of one controller in one quantity."""
 
-    Args:
-        controller: its name.
-        quantity: what grew.
-        holds: largest value below which no run failed; NaN where the problem as it stands fails.
-        fails: smallest value at which one did; infinite where none did.
-        why: what failed there.
-        points: all runs, in the order of their values.
-    """
-
-    controller: str
-    quantity: Quantity
-    holds: float
-    fails: float
-    why: str
-    points: tuple[Point, ...]
+    controller: str  # its name
+    quantity: Quantity  # what grew
+    holds: float  # largest value below which no run failed; NaN where the problem as it stands fails
+    fails: float  # smallest value at which one did; infinite where none did
+    why: str  # what failed there
+    points: tuple[Point, ...]  # all runs, in the order of their values
 
     @property
     def text(self) -> str:
@@ -115,31 +106,19 @@ class OperatingLimit:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OperatingLimits(Study):
-    """The result of `operating_limits`.
+    """The result of `operating_limits`."""
 
-    Args:
-        fails: relative error from which a run has failed.
-        seed: of noise and lost samples.
-        quantities: what grew.
-        limits: one per controller and quantity that could be tried.
-        untried: reasons why not, by controller and quantity.
-    """
-
-    fails: float
-    seed: int
-    quantities: tuple[Quantity, ...]
-    limits: tuple[OperatingLimit, ...]
-    untried: Mapping[tuple[str, str], str]
+    fails: float  # relative error from which a run has failed
+    seed: int  # of noise and lost samples
+    quantities: tuple[Quantity, ...]  # what grew
+    limits: tuple[OperatingLimit, ...]  # one per controller and quantity that could be tried
+    untried: Mapping[tuple[str, str], str]  # reasons why not, by controller and quantity
 
     def __repr__(self) -> str:
         return line(self, self.problem, *(f"{one.controller}: {one.quantity.name} {one.text}" for one in self.limits))
 
     def of(self, controller: str, quantity: str) -> OperatingLimit:
-        """Return one limit.
-
-        Raises:
-            InvalidName: there is none.
-        """
+        """Return one limit."""
         result = {f"{one.controller}: {one.quantity.name}": one for one in self.limits}
         key = f"{controller}: {quantity}"
         if key not in result:
@@ -259,11 +238,7 @@ def bracket(
 
     Args:
         failed: whether a value fails; the start does not.
-        start: value that holds.
-        first: the first value that is tried.
-        most: the largest one.
         step: of which all values are multiples; 0: they are any.
-        near: ratio of both from which they are near enough.
     """
     holds, fails = start, min(first, most)
     while not failed(fails):

@@ -37,63 +37,39 @@ _SIDE_BY_SIDE = 64  # plants that run before it is asked whether one failed
 
 @dataclass(frozen=True)
 class Counterexample:
-    """A plant of the box that fails.
+    """A plant of the box that fails."""
 
-    Args:
-        parameters: its exact parameters, by name.
-        why: it fails.
-        from_percent: the smallest box, in whole percent, at whose edge in this direction a plant fails.
-    """
-
-    parameters: Mapping[str, float]
-    why: str
-    from_percent: int
+    parameters: Mapping[str, float]  # its exact parameters, by name
+    why: str  # it fails
+    from_percent: int  # the smallest box, in whole percent, at whose edge in this direction a plant fails
 
 
 @dataclass(frozen=True)
 class RobustBox:
-    """The largest box of one controller.
+    """The largest box of one controller."""
 
-    Args:
-        controller: its name.
-        percent: the largest box that was tried in which no drawn plant failed; NaN where the plant of the problem fails.
-        fails_at: the smallest box above it in which one failed, percent; infinite where none did.
-        why: what failed there.
-        worst_drawn: largest relative error of the plants drawn from the box.
-        worst_found: largest relative error of those that the search tried beside them.
-        counterexample: a plant of the box that the search found to fail; None: it found none.
-    """
-
-    controller: str
-    percent: float
-    fails_at: float
-    why: str
-    worst_drawn: float
-    worst_found: float
-    counterexample: Counterexample | None
+    controller: str  # its name
+    percent: (
+        float  # the largest box that was tried in which no drawn plant failed; NaN where the plant of the problem fails
+    )
+    fails_at: float  # the smallest box above it in which one failed, percent; infinite where none did
+    why: str  # what failed there
+    worst_drawn: float  # largest relative error of the plants drawn from the box
+    worst_found: float  # largest relative error of those that the search tried beside them
+    counterexample: Counterexample | None  # a plant of the box that the search found to fail; None: it found none
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RobustBoxes(Study):
-    """The result of `robust_boxes`.
+    """The result of `robust_boxes`."""
 
-    Args:
-        risk: largest share of failing plants in a box that holds.
-        confidence: with which that is said.
-        draws: plants that are drawn from a box.
-        fails: relative error from which a run has failed.
-        seed: of the draws.
-        boxes: by controller, in their order.
-        untried: reasons why controllers did not run, by name.
-    """
-
-    risk: float
-    confidence: float
-    draws: int
-    fails: float
-    seed: int
-    boxes: tuple[RobustBox, ...]
-    untried: Mapping[str, str]
+    risk: float  # largest share of failing plants in a box that holds
+    confidence: float  # with which that is said
+    draws: int  # plants that are drawn from a box
+    fails: float  # relative error from which a run has failed
+    seed: int  # of the draws
+    boxes: tuple[RobustBox, ...]  # by controller, in their order
+    untried: Mapping[str, str]  # reasons why controllers did not run, by name
 
     def __repr__(self) -> str:
         return line(self, self.problem, *(f"{one.controller}: {_percent(one.percent)}" for one in self.boxes))

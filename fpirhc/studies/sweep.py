@@ -111,27 +111,17 @@ class CellFields(Checked):
 
 @dataclass(frozen=True, eq=False)
 class SweepMap:
-    """What one controller does.
+    """What one controller does."""
 
-    Args:
-        controller: its name.
-        values: the figure that is judged, an entry per value of every setting; smaller is better, and infinite where a run failed.
-        outcomes: 'finished', 'diverged', 'ended early' or 'refused', of the same shape.
-        reasons: why a first run of each outcome did not finish; '' where it only diverged.
-        without: paths of settings that it does not have: its numbers are the same along these axes.
-        rebuilt: paths of settings of which every value needed a loop of its own.
-        apart: why its runs were one after the other; empty where they were side by side.
-        now: its settings and those of the problem as they stand, by path.
-    """
-
-    controller: str
+    controller: str  # its name
+    # the figure that is judged, an entry per value of every setting; smaller is better, and infinite where a run failed
     values: np.ndarray
-    outcomes: np.ndarray
-    reasons: Mapping[str, str]
-    without: tuple[str, ...]
-    rebuilt: tuple[str, ...]
-    now: Mapping[str, float]
-    apart: str = ""
+    outcomes: np.ndarray  # 'finished', 'diverged', 'ended early' or 'refused', of the same shape
+    reasons: Mapping[str, str]  # why a first run of each outcome did not finish; '' where it only diverged
+    without: tuple[str, ...]  # paths of settings that it does not have: its numbers are the same along these axes
+    rebuilt: tuple[str, ...]  # paths of settings of which every value needed a loop of its own
+    now: Mapping[str, float]  # its settings and those of the problem as they stand, by path
+    apart: str = ""  # why its runs were one after the other; empty where they were side by side
 
     @property
     def failed(self) -> float:
@@ -141,19 +131,12 @@ class SweepMap:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sweep(Study):
-    """The result of `sweep`.
+    """The result of `sweep`."""
 
-    Args:
-        axes: one setting or two.
-        maps: one per controller.
-        aim: the figure that is judged.
-        seed: of the noise, the same in all cells.
-    """
-
-    axes: tuple[Axis, ...]
-    maps: tuple[SweepMap, ...]
-    aim: Objective
-    seed: int
+    axes: tuple[Axis, ...]  # one setting or two
+    maps: tuple[SweepMap, ...]  # one per controller
+    aim: Objective  # the figure that is judged
+    seed: int  # of the noise, the same in all cells
 
     def __repr__(self) -> str:
         names = " x ".join(f"{len(axis.values)} {axis.path}" for axis in self.axes)
@@ -162,11 +145,7 @@ class Sweep(Study):
         )
 
     def of(self, controller: str) -> SweepMap:
-        """Return the map of a controller.
-
-        Raises:
-            InvalidName: there is none.
-        """
+        """Return the map of a controller."""
         result = {one.controller: one for one in self.maps}
         if controller not in result:
             raise InvalidName(f"no map of '{controller}'.{nearest(controller, result)}")
@@ -234,22 +213,12 @@ def sweep(
         sweep(fp.load_problem("two_mass"), axes, folder=Path("map"), controllers=["CTC+FPI"]).to_dataframe()
 
     Args:
-        task: the loaded problem file.
         over: one setting or two. A path that begins with a field of the problem, or with exact., approximate., known. or start., is
             the problem's, see `Cases`; any other is the controllers', and those that do not have it are the same along it.
         folder: folder to which finished cells are written; those that it holds are not repeated.
         controllers: names of controllers; None: all.
         metric: figure of merit, such as 'settling.q1'; None: the problem's headline metric, or the relative error.
-        seed: of the noise, the same in all cells.
-        compiled: whether runs use compiled C.
-        command: the command line, for the report.
         progress: function of (controller, cells done, cells in all).
-
-    Raises:
-        InvalidName: a path that leads nowhere; an unknown metric.
-        InvalidProblem: unknown controllers, gains of the wrong sign.
-        InvalidValue: no setting or more than two, a value that the problem does not accept, a metric without better direction.
-        OutputError: the folder cannot be written, or holds results under other conditions.
     """
     begin = time.perf_counter()
     chosen = select(task, controllers)
@@ -271,11 +240,7 @@ def sweep(
 
 
 def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
-    """Return the paths that are the problem's.
-
-    Raises:
-        InvalidName, InvalidValue: mistakes, all together.
-    """
+    """Return the paths that are the problem's."""
     if not 0 < len(axes) <= _MOST:
         raise InvalidValue(
             f"a sweep has one setting or two, got {len(axes)}; a third one is another sweep, with run --set"
@@ -341,9 +306,7 @@ class _Grid:
     """The cells, by number: the last axis is the fastest.
 
     Args:
-        axes: the settings.
         of_problem: paths that are the problem's.
-        seed: of the noise of every case.
     """
 
     def __init__(self, axes: Sequence[Axis], of_problem: frozenset[str], seed: int) -> None:

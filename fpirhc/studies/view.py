@@ -24,35 +24,23 @@ Progress = Callable[[str, int, int], None]  # of (controller, what is done, what
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What is said of a study; all texts are as they are in a user's file, and every output escapes them.
+    """What is said of a study; all texts are as they are in a user's file, and every output escapes them."""
 
-    Args:
-        title: its title.
-        about: the problem's description.
-        sentences: the verdict, with the outcome that each sentence states; None for a remark.
-        conditions: what the numbers of the first table are measured on.
-        tables: its tables, the controllers first; those without rows are not shown.
-        settings: settings of the problem and of every controller, by name.
-        versions: versions of fpirhc and of what its numbers depend on.
-        command: the command that reproduces it; '' where there is none.
-        elapsed: wall time, s.
-        facts: what the JSON object holds.
-        lists: sentences by the heading under which a page has them.
-        skipped: reasons why controllers did not run, by name.
-    """
-
-    title: str
-    about: str
+    title: str  # its title
+    about: str  # the problem's description
+    # the verdict, with the outcome that each sentence states; None for a remark
     sentences: Sequence[tuple[str, Outcome | None]]
-    conditions: str
-    tables: Sequence[Table]
-    settings: Mapping[str, Any]
-    versions: Mapping[str, str]
-    command: str
-    elapsed: float
-    facts: Mapping[str, Any] = field(repr=False)
-    lists: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    skipped: Mapping[str, str] = field(default_factory=dict)
+    conditions: str  # what the numbers of the first table are measured on
+    tables: Sequence[Table]  # its tables, the controllers first; those without rows are not shown
+    settings: Mapping[str, Any]  # settings of the problem and of every controller, by name
+    versions: Mapping[str, str]  # versions of fpirhc and of what its numbers depend on
+    command: str  # the command that reproduces it; '' where there is none
+    elapsed: float  # wall time, s
+    facts: Mapping[str, Any] = field(repr=False)  # what the JSON object holds
+    lists: Mapping[str, Sequence[str]] = field(
+        default_factory=dict
+    )  # sentences by the heading under which a page has them
+    skipped: Mapping[str, str] = field(default_factory=dict)  # reasons why controllers did not run, by name
 
     def html(self) -> str:
         """Return the verdict and the first table for a notebook."""

@@ -251,14 +251,7 @@ def compose(
 
     Args:
         name: of the composite and of its Function.
-        reads: signals that come from outside.
-        blocks: the blocks in the order in which they run.
-        delays: signals that are carried to the next cycle.
         outputs: names of traced signals that the Function returns once more by themselves, after (memory, trace).
-
-    Raises:
-        InvalidName: a block reads a signal that no earlier block writes, or two blocks write the same signal.
-        InvalidShape: a reader and a writer disagree on a size.
     """
     memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
@@ -291,12 +284,7 @@ def scalar_code(function: ca.Function) -> ca.Function:
 
 
 def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix]) -> None:
-    """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory.
-
-    Raises:
-        InvalidName: a signal that it reads is not known, or one that it writes is.
-        InvalidShape: they disagree on a size.
-    """
+    """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory."""
     function, inputs = block._built
     arguments = []
     for s in inputs.signals:
@@ -327,7 +315,6 @@ def unseen(block: Block, samples: Sequence[str]) -> Block:
     """Return the block that runs a step in a cycle without a sample, for a step that passes over samples which are not finite.
 
     Args:
-        block: whose memory goes on.
         samples: names of the signals that are missing; it is given a number beyond the finite ones.
     """
     missing = {s.name: s.size for s in block.reads.signals if s.name in samples}
@@ -346,9 +333,6 @@ def every(block: Block, cycles: int) -> Block:
     """Return a block that runs `block` in every `cycles`-th cycle and holds its writes in between.
 
     A skipped cycle does not evaluate the block (short circuit), so an expensive block costs time only when it runs.
-
-    Raises:
-        InvalidValue: `cycles` below 1.
     """
     if cycles < 1:
         raise InvalidValue(f"block '{block.name}' is to run every {cycles} cycles; expected 1 or more")

@@ -57,15 +57,10 @@ class Unwritten(Exception):
 
 
 class Words(NamedTuple):
-    """How operations and constants are written in C.
+    """How operations and constants are written in C."""
 
-    Args:
-        operations: by CasADi's number of them; `{0}` and `{1}` are the operands.
-        side_by_side: whether a value is a row of numbers, one of each loop, see `lanes.c`.
-    """
-
-    operations: Mapping[int, str]
-    side_by_side: bool
+    operations: Mapping[int, str]  # by CasADi's number of them; `{0}` and `{1}` are the operands
+    side_by_side: bool  # whether a value is a row of numbers, one of each loop, see `lanes.c`
 
     def constant(self, number: float) -> str:
         """Return a number of an expression."""
@@ -261,26 +256,17 @@ def length(value: Value) -> int:
 
 @dataclass
 class Dataflow:
-    """What Functions compute.
+    """What Functions compute."""
 
-    Args:
-        callee: returns how a Function is called that is not read into its caller.
-        sites: in how many places of the whole program every Function is called, by its hash; see `call_sites`.
-        words: of the operations.
-        tables: C text of constants, without their names.
-    """
-
-    callee: Callable[[ca.Function], Callee]
-    sites: Counter[int]
-    words: Words
-    tables: list[str] = field(default_factory=list)
+    callee: Callable[[ca.Function], Callee]  # returns how a Function is called that is not read into its caller
+    sites: Counter[
+        int
+    ]  # in how many places of the whole program every Function is called, by its hash; see `call_sites`
+    words: Words  # of the operations
+    tables: list[str] = field(default_factory=list)  # C text of constants, without their names
 
     def region(self, function: ca.Function, inputs: Sequence[Value]) -> Region:
-        """Return the steps of a Function, of a choice between two, or of scalar code.
-
-        Raises:
-            Unwritten: it has an operation that is not known here.
-        """
+        """Return the steps of a Function, of a choice between two, or of scalar code."""
         region, branches = Region(), branches_of(function)
         if branches is not None:
             region.outputs = self._chosen(region, branches, inputs)

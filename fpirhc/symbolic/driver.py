@@ -63,26 +63,19 @@ _LATEST: Latest[ca.Function] = Latest(16)
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """The C text of a driver.
+    """The C text of a driver."""
 
-    Args:
-        text: C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys.
-            ROOM is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw; all their
-            arguments and results have an address.
-            Truths are written by `WORDS`, so that the same text computes numbers side by side.
-        leaves: generated Functions by key.
-        constants: preprocessor definitions by name.
-        room: numbers that the driver needs in w.
-        in_place: (argument, result) that may lie at one place: the argument is not read after the result is begun.
-        side_by_side: whether the text keeps to `WORDS`.
-    """
-
+    # C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys. ROOM
+    # is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw; all their
+    # arguments and results have an address. Truths are written by `WORDS`, so that the same text computes numbers side by
+    # side.
     text: str
-    leaves: Mapping[str, ca.Function]
-    constants: Mapping[str, object]
-    room: int = 0
+    leaves: Mapping[str, ca.Function]  # generated Functions by key
+    constants: Mapping[str, object]  # preprocessor definitions by name
+    room: int = 0  # numbers that the driver needs in w
+    # (argument, result) that may lie at one place: the argument is not read after the result is begun
     in_place: tuple[int, int] | None = None
-    side_by_side: bool = True
+    side_by_side: bool = True  # whether the text keeps to `WORDS`
 
     def source(self) -> str:
         """Return the whole C file, in which the entry is called ENTRY."""

@@ -31,15 +31,10 @@ _TINY = float(np.finfo(float).tiny)
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Intervals, entry by entry.
+    """Intervals, entry by entry."""
 
-    Args:
-        lower: least values.
-        upper: largest values, of the same shape.
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
+    lower: np.ndarray  # least values
+    upper: np.ndarray  # largest values, of the same shape
 
     def within(self, other: Box) -> bool:
         """Return whether every entry is inside the other's; False where an end is not a number."""
@@ -61,17 +56,11 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """Affine forms, one per lane.
+    """Affine forms, one per lane."""
 
-    Args:
-        centre: c, shape (lanes,).
-        slopes: a, shape (arguments, lanes).
-        spread: e of at least 0, shape (lanes,).
-    """
-
-    centre: np.ndarray
-    slopes: np.ndarray
-    spread: np.ndarray
+    centre: np.ndarray  # c, shape (lanes,)
+    slopes: np.ndarray  # a, shape (arguments, lanes)
+    spread: np.ndarray  # e of at least 0, shape (lanes,)
 
     @property
     def radius(self) -> np.ndarray:
@@ -274,10 +263,6 @@ class Enclosure:
 
         Args:
             value: any shape.
-            argument: a column of symbols.
-
-        Raises:
-            NotSupported: an operation without a rule.
         """
         self.function = ca.Function("fpirhc_enclosed", [argument], [ca.densify(ca.vec(value))])
         own = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_RULES}

@@ -48,11 +48,7 @@ class Evaluator:
         vars(self.evaluate)["owners"] = owners
 
     def redirect(self, k: int, array: np.ndarray) -> None:
-        """Write result `k` into `array` from now on, such as a slice of a log, and no longer into `results[k]`.
-
-        Raises:
-            InvalidShape: `array` is not a contiguous array of float64 with as many entries as the result.
-        """
+        """Write result `k` into `array` from now on, such as a slice of a log, and no longer into `results[k]`."""
         if array.size != self.results[k].size or array.dtype != np.float64 or not array.flags.c_contiguous:
             name, size = self.function.name_out(k), self.results[k].size
             raise InvalidShape(f"result '{name}' needs a contiguous float64 array of {size} entries")
@@ -68,11 +64,7 @@ class Evaluator:
         return bool(self._buffer.ret() != 0)
 
     def failure(self) -> str:
-        """Evaluate; return why that failed, empty where it did not.
-
-        Raises:
-            KeyboardInterrupt: from the keyboard, wherever it reached the Function.
-        """
+        """Evaluate; return why that failed, empty where it did not."""
         try:
             self.evaluate()
         except (RuntimeError, SystemError) as error:
@@ -83,12 +75,7 @@ class Evaluator:
         return "compiled code failed" if self.failed else ""
 
     def __call__(self, *values: npt.ArrayLike) -> tuple[np.ndarray, ...]:
-        """Evaluate with these arguments and return copies of the results.
-
-        Raises:
-            InvalidShape: a wrong number of arguments, or an argument of a wrong shape.
-            InvalidValue: an argument that is not made of numbers, or arguments that the Function refuses.
-        """
+        """Evaluate with these arguments and return copies of the results."""
         if len(values) != len(self.arguments):
             names = ", ".join(self.function.name_in())
             raise InvalidShape(f"expected {len(self.arguments)} arguments ({names}), got {len(values)}")
@@ -105,11 +92,7 @@ class Evaluator:
         return tuple(result.copy() for result in self.results)
 
     def __reduce__(self) -> NoReturn:
-        """Refuse to be copied or pickled: the buffers belong to this process.
-
-        Raises:
-            TypeError: always.
-        """
+        """Refuse to be copied or pickled: the buffers belong to this process."""
         raise TypeError("an Evaluator cannot be copied or pickled; build one from its Function in each process")
 
     def _checked(self, k: int, value: npt.ArrayLike) -> np.ndarray:

@@ -52,7 +52,6 @@ class FlatCode:
 
     Args:
         outside: returns how a Function is called that is not written here.
-        words: of the operations.
 
     Attributes:
         texts: C functions, callees first.

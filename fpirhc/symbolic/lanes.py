@@ -27,9 +27,6 @@ def written_in_lanes(*functions: ca.Function) -> tuple[tuple[str, ...], list[Cal
     """Return the C files of Functions, in which LANES is to be defined, and how they are called in the first one.
 
     The others are the loops of optimisers. Every argument and result needs an address.
-
-    Raises:
-        NoCode: a part of it is not written for lanes.
     """
     own = _File(SIDE_BY_SIDE)
     inner = [own.flat.callee(function, always=True) for function in functions]
@@ -37,11 +34,7 @@ def written_in_lanes(*functions: ca.Function) -> tuple[tuple[str, ...], list[Cal
 
 
 def written_for_devices(*functions: ca.Function) -> tuple[str, list[Callee]]:
-    """Return Functions in OpenCL C, and how they are called: scalar code alone.
-
-    Raises:
-        NoCode: it has the loops of an optimiser, or tables.
-    """
+    """Return Functions in OpenCL C, and how they are called: scalar code alone."""
     own = _File(DEVICE)
     inner = [own.flat.callee(function, always=True) for function in functions]
     if own.flat.tables:
@@ -53,9 +46,6 @@ def lanes_library(sources: Sequence[str]) -> tuple[ctypes.CDLL, int]:
     """Compile C files for the widest registers of this machine; return the library and how many lanes it has.
 
     It has the vector library of the system where that can be linked.
-
-    Raises:
-        CompileError: neither with it nor without it.
     """
     lanes, flags = _registers()
     try:
@@ -86,11 +76,7 @@ class _File:
         self.flat = FlatCode(self._outside, words)
 
     def _outside(self, function: ca.Function) -> Callee:
-        """How that is called which is no graph.
-
-        Raises:
-            NoCode: it is not written for lanes.
-        """
+        """How that is called which is no graph."""
         name = function.name()
         if is_driver(name) and driver_of(name).side_by_side and self._words.side_by_side:
             if name not in self.drivers:

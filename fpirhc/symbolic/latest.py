@@ -26,7 +26,6 @@ class Latest(Generic[T]):
 
         Args:
             same: arguments that must be the same objects, because values with functions and arrays cannot be compared.
-            equal: arguments that must be equal.
             build: function without arguments.
         """
         for objects, others, result in tuple(self._known):

@@ -289,36 +289,26 @@ Values = Mapping[str, float]
 
 @dataclass(frozen=True, eq=False)
 class Derived:
-    """Numbers that follow from the settings outside the loop.
+    """Numbers that follow from the settings outside the loop."""
 
-    Args:
-        signals: values of signals 'setting.derived.NAME', by their names.
-        memory: function that returns values of remembered signals at the start of a run, by their names; a change during a run
-            does not need them.
-        stale: the effect of running a deployed build with the outdated value of a signal, by name, for a device without Python;
-            '' where it must not.
-    """
-
+    # values of signals 'setting.derived.NAME', by their names
     signals: Mapping[str, np.ndarray] = field(default_factory=dict)
+    # function that returns values of remembered signals at the start of a run, by their names; a change during a run does
+    # not need them
     memory: Callable[[], Mapping[str, np.ndarray]] = dict
+    # the effect of running a deployed build with the outdated value of a signal, by name, for a device without Python; ''
+    # where it must not
     stale: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Following:
-    """A column of numbers that follows from live settings.
+    """A column of numbers that follows from live settings."""
 
-    Args:
-        signal: that the block reads, with the numbers of the build as its start.
-        settings: from which it follows, by path.
-        of: function of the numbers of all settings, by path, that returns the column.
-        stale: what becomes of a loop that goes on with the old column; '' where it must not, see `Derived`.
-    """
-
-    signal: Signal
-    settings: Mapping[str, LiveNumber]
-    of: Callable[[Values], np.ndarray]
-    stale: str
+    signal: Signal  # that the block reads, with the numbers of the build as its start
+    settings: Mapping[str, LiveNumber]  # from which it follows, by path
+    of: Callable[[Values], np.ndarray]  # function of the numbers of all settings, by path, that returns the column
+    stale: str  # what becomes of a loop that goes on with the old column; '' where it must not, see `Derived`
 
     @property
     def reads(self) -> Layout:

@@ -39,17 +39,11 @@ _loaded: dict[str, ca.Function] = {}
 
 @dataclass(frozen=True, eq=False)
 class Native:
-    """A Function that runs as compiled code or in the virtual machine.
+    """A Function that runs as compiled code or in the virtual machine."""
 
-    Args:
-        function: the Function to call.
-        compiled: whether it is compiled.
-        reason: why it is not compiled; empty otherwise.
-    """
-
-    function: ca.Function
-    compiled: bool
-    reason: str
+    function: ca.Function  # the Function to call
+    compiled: bool  # whether it is compiled
+    reason: str  # why it is not compiled; empty otherwise
 
 
 def find_compiler() -> str | None:
@@ -83,13 +77,8 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
     """Return `function` compiled, or as it is with the reason why not.
 
     Args:
-        function: to compile.
-        flags: for the compiler, after its usual ones.
         required: whether a failure of the compiler is an error; without a compiler `function` is returned as it is all the same.
         calls: number of calls in a row that the compiled Function makes, see `program.chained`; 0: it is `function` itself.
-
-    Raises:
-        CompileError: `required`, and the compiler failed.
     """
     if function.is_a("External"):
         return Native(function, True, "")
@@ -150,11 +139,7 @@ def _version(compiler: str) -> str:
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a compiler with untranslated messages.
-
-    Raises:
-        CompileError: it cannot be started.
-    """
+    """Run a compiler with untranslated messages."""
     untranslated = {**os.environ, "LC_ALL": "C"}
     try:
         # A list instead of a shell line: folder names are never read as commands.
@@ -278,11 +263,7 @@ def shared_library(sources: Sequence[str], flags: Sequence[str] = (), libraries:
 
     Args:
         sources: C; all but the first may be shared with other libraries.
-        flags: for the compiler, after its usual ones.
         libraries: for the linker, such as '-lm'.
-
-    Raises:
-        CompileError: there is no compiler, or it fails.
     """
     compiler = find_compiler()
     if compiler is None:
@@ -402,11 +383,7 @@ def own_name() -> str:
 
 
 def read_own(path: Path) -> bytes:
-    """Return the contents of a file that nobody else can have written.
-
-    Raises:
-        OSError: it is missing, no regular file, a link, of another user, or writable by others.
-    """
+    """Return the contents of a file that nobody else can have written."""
     # Without O_NONBLOCK the opening of a FIFO would wait for a writer.
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     with os.fdopen(os.open(path, flags), "rb") as file:

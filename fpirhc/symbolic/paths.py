@@ -34,11 +34,7 @@ def entry(value: object, name: str) -> object:
 
 
 def content_at(owner: object, path: str, what: str = "the controller") -> object:
-    """Return what stands at a path.
-
-    Raises:
-        InvalidName: there is nothing; the nearest name is offered.
-    """
+    """Return what stands at a path."""
     value = owner
     done: list[str] = []
     for name in path.split("."):

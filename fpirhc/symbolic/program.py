@@ -29,9 +29,6 @@ def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
     Args:
         function: the Function.
         calls: number of calls in a row, see `chained`; 0: it is called once.
-
-    Raises:
-        NoCode: a part of it cannot be written as C.
     """
     called = function.find_functions()
     if any(f.is_a("External") for f in called):
@@ -58,8 +55,6 @@ def chained(function: ca.Function, calls: int, base: int) -> ca.Function:
 
     Args:
         function: (memory, reads...) -> (memory one call later, results...).
-        calls: number of calls.
-        base: of the inner chain.
     """
     whole = function.mapaccum(f"{function.name()}_run", calls, {"base": base})
     arguments = [ca.MX.sym(whole.name_in(k), *whole.size_in(k)) for k in range(whole.n_in())]
@@ -79,11 +74,7 @@ class _Leaves:
         self._tokens: dict[str, str] = {}
 
     def callee(self, function: ca.Function) -> Callee:
-        """Return how it is called.
-
-        Raises:
-            NoCode: a driver in it needs more numbers than the graph that it replaces.
-        """
+        """Return how it is called."""
         name = function.name()
         if is_driver(name):
             self._needs(name)
@@ -110,11 +101,7 @@ class _Leaves:
         return "".join(f"int {entry_of(name)[0]}{SIGNATURE};\n" for name in self.drivers)
 
     def text(self, stub: ca.Function) -> str:
-        """Return CasADi's text of the stub and of all leaves, of which only the stub is exported.
-
-        Raises:
-            NoCode: CasADi cannot write one.
-        """
+        """Return CasADi's text of the stub and of all leaves, of which only the stub is exported."""
         generator = ca.CodeGenerator(NAME, {"with_header": False})
         try:
             # CasADi warns on stderr of parts that it cannot write. The text has it too, and the caller announces it once.

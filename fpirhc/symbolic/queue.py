@@ -28,16 +28,11 @@ class Queue:
     """Delays of the entries of a vector.
 
     The column of past values holds the newest value of every entry first, then the values of the cycle before, and so on.
-
-    Args:
-        cycles: delay of all entries, or a tuple with one per entry.
-        width: of the triangular mean around the delay, cycles to either side.
-        longest: longest delay that a run may set, cycles; None: no delay is live.
     """
 
-    cycles: Cycles
-    width: int = 0
-    longest: float | None = None
+    cycles: Cycles  # delay of all entries, or a tuple with one per entry
+    width: int = 0  # of the triangular mean around the delay, cycles to either side
+    longest: float | None = None  # longest delay that a run may set, cycles; None: no delay is live
 
     @classmethod
     def up_to(cls, cycles: Cycles, longest: float) -> Queue:
@@ -46,11 +41,7 @@ class Queue:
 
     @property
     def length(self) -> int:
-        """Number of cycles that are remembered, the newest included.
-
-        Raises:
-            NotSupported: a live delay without a longest one.
-        """
+        """Number of cycles that are remembered, the newest included."""
         if self.longest is not None:
             return math.ceil(self.longest - _WHOLE) + self.width + 1
         for path in live_numbers(self.cycles):
@@ -120,10 +111,7 @@ class Queue:
 
         Args:
             step: Function (state, value, held...) -> state one cycle later.
-            state: of now.
             queue: the past values; those that entered less than `cycles` ago are on their way.
-            size: number of entries of a value.
-            held: arguments that stay the same.
         """
         assert not isinstance(self.cycles, tuple)
         longest = int(nominal(self.cycles)) if not is_live(self.cycles) else self.length - 1

@@ -285,12 +285,7 @@ def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
 
 
 def _check_change(problem: Problem, changes: Mapping[str, object], path: str) -> None:
-    """Raise where one change does not fit.
-
-    Raises:
-        InvalidName: nothing stands at the path; the message says what does.
-        InvalidValue: no number, or one outside the range of a parameter or a state.
-    """
+    """Raise where one change does not fit."""
     word, _, name = path.partition(".")
     if word == START:
         _check_name(f"'{START}.NAME' has a state", name, problem.plant.state.elements)

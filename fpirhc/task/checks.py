@@ -170,21 +170,13 @@ def _view_of_symbols(plant: Plant) -> View:
 
 
 def check_steps(plant: Plant, limits: Limits, set_points: Mapping[str, Steps]) -> None:
-    """Raise if some set-points are no steps, or can never be reached.
-
-    Raises:
-        InvalidValue: see `pairs` and `check_values`.
-    """
+    """Raise if some set-points are no steps, or can never be reached."""
     known = {name: steps for name, steps in set_points.items() if name in plant.chains}
     check_values(plant, limits, {name: [v for _, v in pairs(name, steps)] for name, steps in known.items()})
 
 
 def check_values(plant: Plant, limits: Limits, values: Mapping[str, Sequence[float]]) -> None:
-    """Raise if a set-point is not finite, or can never be reached.
-
-    Raises:
-        InvalidValue: all such set-points together, each with the range that it leaves.
-    """
+    """Raise if a set-point is not finite, or can never be reached."""
     mistakes = []
     for name, numbers in values.items():
         for value in dict.fromkeys(numbers):

@@ -100,10 +100,6 @@ def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Queue
 
     Args:
         target: the delayed signal; its start value fills the queues.
-        waits: how long every entry waits.
-
-    Raises:
-        NotSupported: a live delay without a stated longest one.
     """
     lengths = [wait.length - 1 for wait in waits]
     start = target.start_vector()

@@ -162,7 +162,6 @@ def check_signals(
 
     Args:
         plants: the model, and the plant of a reality where there is one.
-        times: of the run: its first, some between, its last.
     """
     units: dict[str, str] = {}
     for plant in plants:
@@ -294,11 +293,7 @@ def _span_of(course: Course) -> tuple[float, float]:
 
 
 def _course_function(courses: Sequence[Course]) -> ca.Function:
-    """Function time -> the value of every course, shape (number of courses,).
-
-    Raises:
-        InvalidProblem: a function of time raises, or does not return one scalar of the time.
-    """
+    """Function time -> the value of every course, shape (number of courses,)."""
     matrix = kind(any(map(_is_opaque, courses)))
     t = matrix.sym("t")
     values = [_value(course, t) for course in courses]

@@ -42,15 +42,10 @@ Make = Callable[[Mapping[str, float], int], Body]
 
 @dataclass(frozen=True)
 class Reading:
-    """One answer of a body.
+    """One answer of a body."""
 
-    Args:
-        values: shape (number of quantities,); None where the answer is bad.
-        mistake: why it is bad; empty where it is not.
-    """
-
-    values: np.ndarray | None
-    mistake: str = ""
+    values: np.ndarray | None  # shape (number of quantities,); None where the answer is bad
+    mistake: str = ""  # why it is bad; empty where it is not
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,12 +365,8 @@ class _Caller:
         """Return what a function returns, or raise what it raises.
 
         Args:
-            function: without arguments.
             patience: longest time that is waited for it, s; None: any.
             free_within: longest time in which an earlier call that was given up has to return, s.
-
-        Raises:
-            GaveUp: it has not returned by then.
         """
         end = None if patience is None else wall.monotonic() + patience
         if not self._last.wait(free_within):

@@ -141,19 +141,12 @@ class Ellipsoid(Limit):
 
 @dataclass(frozen=True, eq=False)
 class _Box(Limit):
-    """An input or a state.
+    """An input or a state."""
 
-    Args:
-        part: of a stage, 'input' or 'state', which may have entries of one name.
-        name: of the entry.
-        lower: lower end of the interval.
-        upper: upper end of the interval.
-    """
-
-    part: str
-    name: str
-    lower: float
-    upper: float
+    part: str  # of a stage, 'input' or 'state', which may have entries of one name
+    name: str  # of the entry
+    lower: float  # lower end of the interval
+    upper: float  # upper end of the interval
     unit: str
 
     def value(self, view: OfStage) -> Value:
@@ -162,19 +155,14 @@ class _Box(Limit):
 
 @dataclass(frozen=True, eq=False)
 class _Rate(Limit):
-    """The change of an input per unit of time, from stage to stage.
-
-    Args:
-        lower: lower end of the interval.
-        upper: upper end of the interval.
-    """
+    """The change of an input per unit of time, from stage to stage."""
 
     uses_rate: ClassVar[bool] = True
 
     input: str
     step: float
-    lower: float
-    upper: float
+    lower: float  # lower end of the interval
+    upper: float  # upper end of the interval
     unit: str
 
     def value(self, view: OfStage) -> Value:

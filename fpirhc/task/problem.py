@@ -402,11 +402,7 @@ def _check_times(problem: Problem, mistakes: Mistakes) -> None:
 
 
 def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:
-    """Return how many control cycles one stage of the horizon lasts.
-
-    Raises:
-        InvalidValue: the period does not divide the horizon step.
-    """
+    """Return how many control cycles one stage of the horizon lasts."""
     ratio = horizon.step / period
     if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
         whole = max(1, round(ratio))
@@ -418,11 +414,7 @@ def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:
 
 
 def cycles_per_plan(horizon: Horizon, period: float, unit: str = "s") -> int:
-    """Return how many control cycles pass from plan to plan.
-
-    Raises:
-        InvalidValue: the period does not divide the horizon step, or a plan would be older than a stage.
-    """
+    """Return how many control cycles pass from plan to plan."""
     stage = cycles_per_stage(horizon, period, unit)
     if isinstance(horizon.replan, str):
         return stage if horizon.replan == "stage" else 1

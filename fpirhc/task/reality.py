@@ -194,9 +194,7 @@ class Reality(Checked):
         """Return what the derivatives of the model's start say of states that are no derivatives here, by place of the state.
 
         Args:
-            model: of the problem.
             start: first state of the model, shape (nx,).
-            free: places of the states that nothing else gives.
         """
         shared, elements = self.shared(model), self.plant.state.elements
         tied: dict[int, Tied] = {}
@@ -336,11 +334,8 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
     """Add what is wrong with the coordinate of a reality that stands for a coordinate of the model.
 
     Args:
-        plant: the reality's.
         seen: name of the model's coordinate -> name of what is measured in its place.
-        model: of the problem.
         name: of the model's coordinate.
-        mistakes: to which it is added.
     """
     own, units, unit = seen.get(name, name), _quantities_of(plant), model.coordinates[name]
     if own not in units:
@@ -411,11 +406,9 @@ def settled(
     Where many values are at rest, a near one is taken, see `fpirhc.symbolic.roots`.
 
     Args:
-        plant: the plant.
         state: shape (nx,); its free entries are the first guess.
         command: held input, shape (nu,).
         parameters: shape (np,).
-        free: places of the entries that settle.
         tied: by place of a free entry, a quantity that has a value there, in place of its rate.
     """
     from fpirhc.symbolic.roots import Equations  # of a start that must settle alone

@@ -264,11 +264,7 @@ def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:
 
 
 def pairs(name: str, steps: Steps) -> list[tuple[float, float]]:
-    """Return the steps of one coordinate as pairs (time, set-point).
-
-    Raises:
-        InvalidValue: no number and no pairs of numbers; times that do not begin at 0 and increase.
-    """
+    """Return the steps of one coordinate as pairs (time, set-point)."""
     entries = [(0.0, steps)] if not isinstance(steps, Sequence | np.ndarray) else list(steps)
     text = f"set-points of '{name}'"
     if not entries or any(not isinstance(e, Sequence | np.ndarray) or len(e) != 2 for e in entries):

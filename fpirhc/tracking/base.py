@@ -85,17 +85,11 @@ ROOM = 10.0  # times the largest response that a law may ask for, because a mode
 
 @dataclass(frozen=True)
 class Useful:
-    """What the integral of an error may ask for.
+    """What the integral of an error may ask for."""
 
-    Args:
-        integral: its gain g_0.
-        error: the gain g_1 of the error itself.
-        largest: response that the limits of the inputs allow, L; infinite where they are not finite.
-    """
-
-    integral: float
-    error: float
-    largest: float
+    integral: float  # its gain g_0
+    error: float  # the gain g_1 of the error itself
+    largest: float  # response that the limits of the inputs allow, L; infinite where they are not finite
 
     def next(self, integral: Expression, error: Expression, period: float) -> Expression:
         """The integral one cycle later.
@@ -162,7 +156,6 @@ def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) 
     Over a gap the error is on a line: cycle by cycle the last one is integrated again, and the next sample adds the rest.
 
     Args:
-        plant: whose errors are integrated.
         period: of the control cycle, s.
         useful: what the integral of every controlled coordinate may ask for; empty: anything.
     """
@@ -208,10 +201,6 @@ def bumpless(s: Signals, gains: Sequence[float]) -> tuple[Expression, dict[str, 
 
     The contribution of the integral stays where a live gain changes, I+ = I g_before / g, so that the command does not jump by the
     integral's share. Without a change the factor is exactly 1.
-
-    Args:
-        s: signals of the law, with `gains_before` in its memory.
-        gains: of the integral, one per controlled coordinate.
     """
     if "integral_gain" not in vars(s):
         return s._integral_before, {}

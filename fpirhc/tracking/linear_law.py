@@ -59,11 +59,7 @@ class LinearLaw(IntegralLaw):
         """Gains of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first."""
 
     def check_cycle(self, plant: Plant, period: float) -> None:
-        """Raise if the law cannot act on the plant in this cycle; by default, if its modes do not decay in the steps of a map.
-
-        Raises:
-            InvalidValue: a mode that does not decay, with its pole.
-        """
+        """Raise if the law cannot act on the plant in this cycle; by default, if its modes do not decay in the steps of a map."""
         del period
         for order in plant.response_orders.values():
             check_modes(self, plant, self.gains(order))

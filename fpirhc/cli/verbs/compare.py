@@ -146,11 +146,7 @@ def _add_scenarios(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Check that options of scenarios stand beside `--scenarios` or `--cases`, and not beside `--optimisers` or `--lab`.
-
-    Raises:
-        InvalidValue: options that cannot be combined; the message names the remedy.
-    """
+    """Check that options of scenarios stand beside `--scenarios` or `--cases`, and not beside `--optimisers` or `--lab`."""
     from fpirhc.errors import InvalidValue
 
     changed = [n for n in ("scenarios", "cases", "tuned", "optimisers") if getattr(options, n)] + ["set"] * bool(

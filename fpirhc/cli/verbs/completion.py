@@ -17,11 +17,7 @@ PROBLEMS = ("problem", "problems")
 
 
 def script(shell: str) -> str:
-    """Return the completion script of a shell.
-
-    Raises:
-        NotInstalled: shtab is not installed, or it does not know the shell.
-    """
+    """Return the completion script of a shell."""
     from fpirhc.errors import NotInstalled, package
 
     shtab = package("shtab", "completion", "completion")

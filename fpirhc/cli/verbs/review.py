@@ -46,11 +46,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
 
 def _probed(problem: Problem, controllers: Mapping[str, Controller], seed: int) -> Problem:
-    """The problem with the plant as a probe estimates it.
-
-    Raises:
-        NotSupported: a plant whose estimate is refused, or has no equations.
-    """
+    """The problem with the plant as a probe estimates it."""
     from fpirhc.errors import NotSupported
     from fpirhc.probing.probe import probe
 

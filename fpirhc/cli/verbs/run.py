@@ -83,11 +83,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 def by_kind(
     values: Mapping[str, float | tuple[float, ...]],
 ) -> tuple[dict[str, float | tuple[float, ...]], dict[str, float] | None]:
-    """Return the numbers of settings by path, and the set-points by coordinate; None without set-points.
-
-    Raises:
-        InvalidValue: a set-point that is no single number.
-    """
+    """Return the numbers of settings by path, and the set-points by coordinate; None without set-points."""
     from fpirhc.errors import InvalidValue
 
     points: dict[str, float] = {}

@@ -188,29 +188,17 @@ _STILL = 1e-6  # size of a derivative, relative to its terms, that counts as zer
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """One slot near the set-point, with n states of the plant.
+    """One slot near the set-point, with n states of the plant."""
 
-    Args:
-        plant: that moves.
-        generator: A of z' = A z, or of the divided differences of a map, shape (n + 2, n + 2).
-        command: row k with u - u* = k z, shape (n + 2,).
-        own: row of y^(r) in x - x*, shape (n,).
-        gain: b, derivative of y^(r) with respect to the input.
-        law: row of y^(r),Des in z without the offset, shape (n + 2,).
-        first_integral: row of the integral at the start of the slot in x - x*, shape (n,).
-        blends: whether a switch leaves an offset.
-        integrates: whether the law has an integral.
-    """
-
-    plant: Plant
-    generator: np.ndarray
-    command: np.ndarray
-    own: np.ndarray
-    gain: float
-    law: np.ndarray
-    first_integral: np.ndarray
-    blends: bool
-    integrates: bool
+    plant: Plant  # that moves
+    generator: np.ndarray  # A of z' = A z, or of the divided differences of a map, shape (n + 2, n + 2)
+    command: np.ndarray  # row k with u - u* = k z, shape (n + 2,)
+    own: np.ndarray  # row of y^(r) in x - x*, shape (n,)
+    gain: float  # b, derivative of y^(r) with respect to the input
+    law: np.ndarray  # row of y^(r),Des in z without the offset, shape (n + 2,)
+    first_integral: np.ndarray  # row of the integral at the start of the slot in x - x*, shape (n,)
+    blends: bool  # whether a switch leaves an offset
+    integrates: bool  # whether the law has an integral
 
     @property
     def eigenvalues(self) -> np.ndarray:
@@ -231,7 +219,6 @@ class Mode:
         """Return the matrix from z at the end of the slot `before` to z at the start of this one; the command is continuous.
 
         Args:
-            before: slot that ends.
             held: time before its end at which z is taken, since the last command was given then: the cycle of a map.
         """
         n = self.own.size

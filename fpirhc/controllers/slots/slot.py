@@ -59,22 +59,14 @@ class Slot(Checked):
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """A slot on a plant.
+    """A slot on a plant."""
 
-    Args:
-        slot: that is on the plant.
-        chain: the derivatives of its coordinate.
-        number: place among the slots.
-        plant: the light one, y^(r) = u.
-        start_gain: d y^(r)/du of the model at the problem's start.
-        differences: how often the highest derivative that is measured is differenced to find y^(r); 0: y^(r) itself is measured.
-    """
-
-    slot: Slot
-    chain: OutputChain
-    number: int
-    plant: Plant
-    start_gain: float
+    slot: Slot  # that is on the plant
+    chain: OutputChain  # the derivatives of its coordinate
+    number: int  # place among the slots
+    plant: Plant  # the light one, y^(r) = u
+    start_gain: float  # d y^(r)/du of the model at the problem's start
+    # how often the highest derivative that is measured is differenced to find y^(r); 0: y^(r) itself is measured
     differences: int
 
     def wire(self, name: str) -> str:
@@ -87,14 +79,7 @@ class Channel:
 
 
 def channel(problem: Problem, slot: Slot, number: int) -> Channel:
-    """Return the slot on the problem's plant.
-
-    Raises:
-        InvalidName: the coordinate or the input is unknown.
-        NotInvertible: the input has no effect on the coordinate, y^(r) is not affine in it, or its gain is zero at the start.
-        InvalidProblem: the order of the slot is not the model's.
-        NotSupported: a deformation that keeps pairs of earlier cycles, or a model that cannot be compared with what is measured.
-    """
+    """Return the slot on the problem's plant."""
     plant = problem.plant
     chain = output_chain(plant, slot.coordinate, slot.input)
     if slot.order is not None and slot.order != chain.order:
@@ -159,10 +144,6 @@ def for_channel(
     """Return the block on the slot's own copies of its signals. The memory of the block starts anew with every slot.
 
     Args:
-        block: that runs in the slot.
-        one: the slot.
-        shared: names of signals that all slots share.
-        names: signal of the block -> another name for the slot's copy.
         first: (signals) -> values with which the memory starts, by name; signals that are not named keep their own start.
     """
 
@@ -211,9 +192,7 @@ def integrators(plant: Plant, quantities: Mapping[str, tuple[str, int]], inputs:
     """Return the plant y^(r) = u of some quantities, in the time of another plant.
 
     Args:
-        plant: the other one.
         quantities: (unit, order) of every quantity, by name.
-        inputs: names of the inputs that act on them, in order.
     """
     names, orders = tuple(quantities), {name: order for name, (_, order) in quantities.items()}
 

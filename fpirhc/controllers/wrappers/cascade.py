@@ -48,12 +48,9 @@ class Shifted(Reference):
     """The motion of another reference plus a shift of its controlled coordinates, which is held along a horizon.
 
     Whatever is decided before a run uses the motion without shift. Derivatives are not shifted: the shift changes slowly.
-
-    Args:
-        reference: that is shifted. Its own signals are given from outside too.
     """
 
-    reference: Reference
+    reference: Reference  # that is shifted. Its own signals are given from outside too.
 
     @property
     def opaque(self) -> bool:
@@ -371,11 +368,7 @@ class Cascade(Controller):
         return ca.Function("fpirhc_steepness", [y, p], [ca.densify(ca.diag(slopes))])
 
     def _check_units(self, problem: Problem) -> None:
-        """Raise where a unit is of nothing, or its functions are not each other's inverse at the reference's start.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
+        """Raise where a unit is of nothing, or its functions are not each other's inverse at the reference's start."""
         plant, mistakes = problem.plant, Mistakes("Cascade")
         mistakes.unknown("units: controlled coordinate", self.units, plant.controlled_names)
         mistakes.raise_if_any()

@@ -36,7 +36,6 @@ class _Queued(Wrapper):
     """The wrapped map with its own past requests and desired responses.
 
     Args:
-        map: any deformation that iterates.
         cycles: dead time d between a request and its response, beyond the one cycle that every loop has; a tuple gives every
             controlled coordinate its own.
         longest: longest dead time that a run may set, `live=["deformation.cycles"]`; None: twice the dead time.

@@ -63,26 +63,17 @@ class Rows:
 
 @dataclass(frozen=True)
 class Slider:
-    """A number that is moved in the page.
+    """A number that is moved in the page."""
 
-    Args:
-        path: of a live setting, exact.NAME and approximate.NAME of a parameter, that of a deviation of noise in the problem, or
-            setpoints.NAME.K of the K-th set-point of a coordinate.
-        unit: of it.
-        value: number of the build.
-        low: smallest number.
-        high: largest number.
-        places: entries of the loops' memories, by the number of the loop.
-        rows: of what the loops read in every cycle.
-    """
-
+    # of a live setting, exact.NAME and approximate.NAME of a parameter, that of a deviation of noise in the problem, or
+    # setpoints.NAME.K of the K-th set-point of a coordinate
     path: str
-    unit: str
-    value: float
-    low: float
-    high: float
-    places: dict[int, list[int]]
-    rows: tuple[Rows, ...] = ()
+    unit: str  # of it
+    value: float  # number of the build
+    low: float  # smallest number
+    high: float  # largest number
+    places: dict[int, list[int]]  # entries of the loops' memories, by the number of the loop
+    rows: tuple[Rows, ...] = ()  # of what the loops read in every cycle
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +98,7 @@ class Lab:
 
 
 def lab_of(task: Task, file: str, names: Sequence[str] = (), live: Sequence[str] = ()) -> Lab:
-    """Return the lab of some controllers of a problem file, or of the pair of its headline; see `make_lab`.
-
-    Raises:
-        FpirhcError: as `make_lab`; InvalidName for a controller that the file does not have.
-    """
+    """Return the lab of some controllers of a problem file, or of the pair of its headline; see `make_lab`."""
     chosen = names or task.headline or list(task.controllers)[:2]
     controllers = select(task, list(chosen))
     shown = {name: controllers[name] for name in chosen}
@@ -130,18 +117,9 @@ def make_lab(
     """Return the loops of some controllers with their sliders.
 
     Args:
-        title: of the page.
-        about: what the problem is.
-        file: name or path of the problem file.
         problem: the task; its equations run in the page, so a reality outside cannot.
-        controllers: by name.
         live: paths of settings with a slider; none: gains, rates, limits of inputs, dead times, and numbers of the reference.
         pictures: of the problem; the first `Planar` moves with the loops.
-
-    Raises:
-        NotSupported: a plant outside, zig is not installed, or a controller that needs a solver's own library.
-        InvalidValue: a path in `live` that no controller can have live.
-        InvalidName: a setting that no controller has.
     """
     problem.require_equations(
         "a lab runs the plant's equations in the page; a plant outside Python's equations has none"
@@ -368,12 +346,7 @@ def _is_the_number(column: str, path: str) -> bool:
 
 
 def write_lab(lab: Lab, path: Path) -> None:
-    """Write the page, atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-        CompileError: a loop cannot be compiled.
-    """
+    """Write the page, atomically."""
     write_whole(page(lab), path, "lab")
 
 

@@ -27,17 +27,11 @@ _FRAMES = 500  # of a mechanism that moves
 
 @dataclass(frozen=True, eq=False)
 class LabLoop:
-    """A closed loop that a page runs.
+    """A closed loop that a page runs."""
 
-    Args:
-        name: of the controller.
-        ready: the loop with its live settings.
-        picture: the mechanism that moves with it; None: none.
-    """
-
-    name: str
-    ready: Simulator
-    picture: Planar | None = None
+    name: str  # of the controller
+    ready: Simulator  # the loop with its live settings
+    picture: Planar | None = None  # the mechanism that moves with it; None: none
 
     @cached_property
     def start(self) -> np.ndarray:

@@ -84,16 +84,7 @@ TARGET = Target("arduino", "a library folder of the Arduino IDE, in float, with 
 
 
 def size_on(files: Mapping[str, str], name: str, board: _Board) -> _Size:
-    """Return what one controller takes of a board.
-
-    Args:
-        files: C files and headers by name.
-        name: prefix of the controller.
-        board: and its processor.
-
-    Raises:
-        CompileError: avr-gcc refuses them.
-    """
+    """Return what one controller takes of a board."""
     main = f'#include "{name}.h"\n{name}_controller c; {name}_inputs in; {name}_command out;\n'
     main += f"int main(void) {{ {name}_init(&c); for (;;) {name}_step(&c, &in, &out); }}\n"
     with tempfile.TemporaryDirectory() as place:

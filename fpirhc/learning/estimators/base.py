@@ -27,24 +27,18 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Data of an estimator in one cycle.
+    """Data of an estimator in one cycle."""
 
-    Args:
-        state: the measured state at which the response was measured.
-        command: it caused `response` at `state`: the last one, or an older one behind dead time and estimators.
-        response: the measured response.
-        parameters: those of the model without the estimator's change.
-        valid: 0 before the first pair of this run (in the first cycle, and until the first sample of the run arrives), then 1.
-        followed: what the estimator computes from its live settings; None without any.
-        output: the measured outputs y, y', ... at that instant; None without outputs, or where the estimator does not read them.
-    """
-
-    state: Expression
-    command: Expression
-    response: Expression
-    parameters: Expression
+    state: Expression  # the measured state at which the response was measured
+    command: (
+        Expression  # it caused `response` at `state`: the last one, or an older one behind dead time and estimators
+    )
+    response: Expression  # the measured response
+    parameters: Expression  # those of the model without the estimator's change
+    # 0 before the first pair of this run (in the first cycle, and until the first sample of the run arrives), then 1
     valid: Expression
-    followed: Expression | None = None
+    followed: Expression | None = None  # what the estimator computes from its live settings; None without any
+    # the measured outputs y, y', ... at that instant; None without outputs, or where the estimator does not read them.
     output: Expression | None = None
 
 
@@ -124,14 +118,10 @@ Memory: TypeAlias = Annotated[float, Range("a positive number of seconds, or mat
 
 @dataclass(frozen=True, eq=False)
 class Learner(ParameterEstimator):
-    """What learners of parameters share: the priors, and the noise of the responses.
+    """What learners of parameters share: the priors, and the noise of the responses."""
 
-    Args:
-        parameters: name -> Uncertain(lower, upper, deviation) of every learned parameter.
-        noise: controlled coordinate -> deviation of the part of its response that the model lacks, in the response's unit.
-    """
-
-    parameters: Mapping[str, Uncertain]
+    parameters: Mapping[str, Uncertain]  # name -> Uncertain(lower, upper, deviation) of every learned parameter
+    # controlled coordinate -> deviation of the part of its response that the model lacks, in the response's unit
     noise: Mapping[str, Deviation]
 
     def __post_init__(self) -> None:
@@ -142,11 +132,7 @@ class Learner(ParameterEstimator):
         return tuple(self.parameters)
 
     def check(self, problem: Problem) -> None:
-        """Raise if names do not fit the plant, or an approximate value lies outside its bounds.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
+        """Raise if names do not fit the plant, or an approximate value lies outside its bounds."""
         _check_names(type(self).__name__, problem.plant, self.parameters, self.noise)
 
     def residual(self, plant: Plant) -> ca.Function:

@@ -33,17 +33,11 @@ _SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as un
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """The parts of one disturbance and how they move by themselves in a control cycle.
+    """The parts of one disturbance and how they move by themselves in a control cycle."""
 
-    Args:
-        names: what is added to the disturbance's name, one per part.
-        moves: matrix of the parts from one cycle to the next, shape (parts, parts).
-        adds: what the parts add up to, shape (1, parts).
-    """
-
-    names: tuple[str, ...]
-    moves: np.ndarray
-    adds: np.ndarray
+    names: tuple[str, ...]  # what is added to the disturbance's name, one per part
+    moves: np.ndarray  # matrix of the parts from one cycle to the next, shape (parts, parts)
+    adds: np.ndarray  # what the parts add up to, shape (1, parts)
 
     def of(self, count: int) -> tuple[ca.DM, ca.DM]:
         """Return both matrices for that many disturbances, without their zeros."""

@@ -15,17 +15,13 @@ Bounds = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Data of a rule in one cycle; a rule calls the function of the pair that it uses, so that only this pair is computed.
+    """Data of a rule in one cycle; a rule calls the function of the pair that it uses, so that only this pair is computed."""
 
-    Args:
-        gradient: the controller's Lyapunov function falls along p' = Gamma G^T w: returns (G (n x m), w (n)).
-        equation: the model error h = G (p - p_hat) of the response, exact without disturbances: returns (G (n x m), h (n)).
-        clipped: 1 where the last command was clipped, so that the gradient is wrong.
-    """
-
+    # the controller's Lyapunov function falls along p' = Gamma G^T w: returns (G (n x m), w (n))
     gradient: Callable[[], Pair]
+    # the model error h = G (p - p_hat) of the response, exact without disturbances: returns (G (n x m), h (n))
     equation: Callable[[], Pair]
-    clipped: Expression
+    clipped: Expression  # 1 where the last command was clipped, so that the gradient is wrong
 
 
 class Rule(Checked, ABC):

@@ -80,10 +80,8 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
     """Return whether the zero dynamics are stable, with their rate and its sign.
 
     Args:
-        problem: the problem.
         rate: largest real part of the zero dynamics, per unit of time; None where there are none.
         planned: whether the controller is a plan; with these states in its cost it may hold unstable ones.
-        loops: linear loops of the controller.
     """
     if rate is None:
         return Answer(ZERO_DYNAMICS, Verdict.YES, "there are none: every coordinate is controlled")
@@ -182,14 +180,7 @@ _NEAR = 0.1  # distance from a mode of the zero dynamics, as a share of its own 
 
 
 def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: list[str]) -> Answer:
-    """Return whether the deformation of a controller converges.
-
-    Args:
-        grid: points of the reference and draws of the parameters.
-        controller: the controller with its deformation.
-        loops: its linear loops.
-        doubts: reasons against convergence from other answers.
-    """
+    """Return whether the deformation of a controller converges."""
     if not loops.loops:
         return Answer(CONVERGES, Verdict.UNKNOWN, f"no linear loop: {loops.reason}", "Run it and look at the factor.")
     radii, left_out = _own_radii(grid, loops)

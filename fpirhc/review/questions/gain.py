@@ -41,23 +41,14 @@ OUTSIDE = "the model knows no lag and no latency of the plant outside"
 
 @dataclass(frozen=True)
 class Recommended:
-    """A gain, and what sets it.
+    """A gain, and what sets it."""
 
-    Args:
-        value: of the map's own gain; NaN where none is recommended.
-        limit: of the map's own gain, the smallest one.
-        sets: which limit that is.
-        why_not: why none is recommended; empty where one is.
-        lowered: whether it is less than half of the limit, so that the loop keeps its margins.
-        exceeded: whether the gain in use is beyond the limit.
-    """
-
-    value: float
-    limit: float
-    sets: str
-    why_not: str = ""
-    lowered: bool = False
-    exceeded: bool = False
+    value: float  # of the map's own gain; NaN where none is recommended
+    limit: float  # of the map's own gain, the smallest one
+    sets: str  # which limit that is
+    why_not: str = ""  # why none is recommended; empty where one is
+    lowered: bool = False  # whether it is less than half of the limit, so that the loop keeps its margins
+    exceeded: bool = False  # whether the gain in use is beyond the limit
 
     @property
     def text(self) -> str:
@@ -76,8 +67,6 @@ def recommended_gain(
     """Return the recommended gain of a map.
 
     Args:
-        deformation: the map.
-        boxed: its report over the box of parameters.
         share: limit of gain times eigenvalue as a share of 2, below 1 behind a delay, an estimator or a filter.
         loops: its loops for every gain; None where no linear loop is known.
     """
@@ -126,10 +115,6 @@ def least_gain(loops: LoopsByGain, limit: float) -> float | None:
     """Return the smallest effective gain with which the loop converges along the reference, where that of the map is too small.
 
     None where the loop converges with the map's gain, or with none between it and the limit.
-
-    Args:
-        loops: of the map.
-        limit: effective gain up to which one is sought.
     """
     own, along = loops.gains[1], loops.along(_ALONG)
     if loops.all_stable(own, along) or not abs(own) < abs(limit):
@@ -196,7 +181,6 @@ def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended
     Where its own gain is beyond the limits, the null test of a gain within them counts.
 
     Args:
-        case: of the controller.
         boxed: eigenvalues of the response Jacobian over the box of parameters.
         null: the answer whether adaptation leaves a right model alone.
     """
@@ -245,8 +229,6 @@ def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> s
     """Return what a review says of the gain: the recommended one where errors grow, else whether it is too small, else nothing.
 
     Args:
-        problem: of the run.
-        controller: resolved.
         grows: whether the iteration is no contraction along the run.
     """
     if controller.deforms == "target" or not controller.deformation.adapts:
@@ -276,11 +258,8 @@ def gain_admissible(
     """Return the interval of admissible gains and the recommended value.
 
     Args:
-        deformation: the map.
         own: eigenvalues of the response Jacobian along the reference, with the exact parameters.
-        boxed: the same over the box of parameters.
         limit: limit of gain times eigenvalue, 2 without dead time.
-        advice: the recommended gain.
     """
     share = limit / 2
     near, wide = assess_gain(deformation, own), assess_gain(deformation, boxed)

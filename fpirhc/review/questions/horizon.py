@@ -82,8 +82,6 @@ def plan_gain(
         V_k(x) = x' P_k x / 2 + x' E_k mu + mu' G_k mu / 2,      E_N = C',  G_N = 0,      mu = -G_0^-1 E_0' x.
 
     Args:
-        problem: with a cost.
-        horizon: of the plan.
         states_at: times (m,) -> states (m, nx) at which the model is linearised; None: those of the reference. Of a plant with
             outputs only the first counts: the model's own motion begins there.
     """

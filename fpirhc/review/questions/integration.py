@@ -28,19 +28,12 @@ _FINER = (2, 4, 8, 16, 32, 64)  # times the sub-steps in use
 
 @dataclass(frozen=True)
 class StepPoles:
-    """Poles of one step beside those of the plant.
+    """Poles of one step beside those of the plant."""
 
-    Args:
-        apart: largest distance of exp(lambda h) from the nearest pole of the step.
-        fastest: largest |lambda|, per unit of time.
-        largest: largest |pole| of the step.
-        decays: whether no mode of the plant grows.
-    """
-
-    apart: float
-    fastest: float
-    largest: float
-    decays: bool
+    apart: float  # largest distance of exp(lambda h) from the nearest pole of the step
+    fastest: float  # largest |lambda|, per unit of time
+    largest: float  # largest |pole| of the step
+    decays: bool  # whether no mode of the plant grows
 
     @property
     def unstable(self) -> bool:
@@ -68,11 +61,7 @@ def first_place(grid: ReviewGrid, parameters: np.ndarray) -> Place:
 
 
 def step_poles(plant: Plant, integrator: Integrator, step: float, place: Place) -> StepPoles:
-    """Return the poles of one step at a point.
-
-    Raises:
-        LinAlgError: the linearisation is not finite.
-    """
+    """Return the poles of one step at a point."""
     rates = np.linalg.eigvals(state_slopes(plant, place.state, place.command, place.parameters).a)
     poles = np.linalg.eigvals(_matrix(plant, integrator, step, place))
     exact = poles_over(plant, rates, step)

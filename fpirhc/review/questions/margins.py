@@ -44,8 +44,6 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
     Where plans are not made in every cycle they are those of all points.
 
     Args:
-        problem: the problem.
-        loops: linear loops of the controller.
         adapts: whether the controller has a deformation.
         planned: whether the controller is a plan, which has weights in place of a rate.
         learner: whether its model changes in a run.
@@ -106,10 +104,6 @@ def _sizes(gain: float, phase: float, delay: float, problem: Problem) -> str:
 
 def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
     """Return the margins of one input's loop.
-
-    Args:
-        loop: the linear loop.
-        place: number of the input.
 
     Returns:
         Gain margin as a factor of at least 1, up or down; phase margin, degrees; delay margin, in the unit of time.

@@ -254,10 +254,6 @@ def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, f
     """Return the loops at points of the reference with the noise of the problem's sensors, or the given one.
 
     Parameters: `controller`, resolved; `noise`: standard deviation of the measured response by controlled coordinate.
-
-    Raises:
-        InvalidValue: no noise, as of a response that is estimated, or a negative one. InvalidName: an unknown coordinate.
-        NotSupported: a map that cannot be replaced. FpirhcError: no linear loop.
     """
     covariance, gain = np.diag(_deviations(grid.problem, noise) ** 2), controller.deformation.effective_gain()
     bare = controller.with_deformation(_with(controller.deformation, gain, 0.0))
@@ -271,9 +267,6 @@ def chatter_of(grid: ReviewGrid, controller: Controller, gain: float, pole: floa
     """Return, by input, the rms step of the command per cycle that the noise of the problem's sensors causes.
 
     Parameters: `controller`, resolved; effective `gain` and `pole` of the filter of its error.
-
-    Raises:
-        InvalidValue, NotContractive: as `noisy_points`.
     """
     noisy = noisy_points(grid, controller, None)
     return dict(zip(grid.problem.plant.inputs, map(float, noisy.steps(gain, pole)), strict=True))

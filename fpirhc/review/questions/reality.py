@@ -43,30 +43,20 @@ _MOVES = 1e-9  # rate, as a share of the fastest, below which a pole is an integ
 
 @dataclass(frozen=True, eq=False)
 class RealPoint:
-    """A point of the reference where reality and model have the same input.
+    """A point of the reference where reality and model have the same input."""
 
-    Args:
-        place: number of the point.
-        real: state of the reality, shape (its nx,).
-        command: shape (nu,).
-    """
-
-    place: int
-    real: np.ndarray
-    command: np.ndarray
+    place: int  # number of the point
+    real: np.ndarray  # state of the reality, shape (its nx,)
+    command: np.ndarray  # shape (nu,)
 
 
 @dataclass(frozen=True, eq=False)
 class Extra:
-    """What a reality has beyond its model at a point.
+    """What a reality has beyond its model at a point."""
 
-    Args:
-        poles: that the settled reality does not have, per unit of time.
-        eigenvalues: of the response Jacobian for requests that are slow beside these poles, shape (n,). What is behind a spring
-            moves along with the plant then, so this is no gain at rest.
-    """
-
-    poles: np.ndarray
+    poles: np.ndarray  # that the settled reality does not have, per unit of time
+    # of the response Jacobian for requests that are slow beside these poles, shape (n,). What is behind a spring moves
+    # along with the plant then, so this is no gain at rest.
     eigenvalues: np.ndarray
 
 
@@ -94,12 +84,7 @@ def real_points(grid: ReviewGrid) -> tuple[RealPoint, ...]:
 
 
 def real_loops(grid: ReviewGrid, controller: Controller) -> list[LinearLoop]:
-    """Return linear loops of the real pair at some points of the reference.
-
-    Raises:
-        NotSupported: no linear loop; a controller whose model is the reality; a reality that rounds or switches an input.
-        FpirhcError: every error that the controller raises about the problem.
-    """
+    """Return linear loops of the real pair at some points of the reference."""
     assert grid.real is not None
     if controller.plant_model(grid.real).plant is not grid.problem.plant:
         raise NotSupported("its model is the reality")
@@ -187,7 +172,6 @@ def _carrying(reality: Reality, model: Plant) -> Guided | None:
     with as many derivatives as the reality has states and inputs, and the input held.
 
     Args:
-        reality: the plant that moves.
         model: of the controllers; the wanted values are in the order of its state, then its controlled responses.
 
     Returns:
@@ -225,8 +209,6 @@ def _outer_slopes(reality: Reality, model: Plant, state: np.ndarray, command: np
     Where the reality lacks a state of the model, or the model has outputs, they are those of its coordinates of the same names.
 
     Args:
-        reality: the plant that moves.
-        model: of the controllers.
         state: of the reality, shape (nx,).
         command: shape (nu,).
     """

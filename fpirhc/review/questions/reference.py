@@ -34,17 +34,11 @@ Motion = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class Jump:
-    """A jump of the reference.
+    """A jump of the reference."""
 
-    Args:
-        state: name of the state of the reference.
-        time: of the jump.
-        size: of the jump, in the state's unit.
-    """
-
-    state: str
-    time: float
-    size: float
+    state: str  # name of the state of the reference
+    time: float  # of the jump
+    size: float  # of the jump, in the state's unit
 
 
 def jumps(problem: Problem) -> list[Jump]:

@@ -59,8 +59,6 @@ def right_form(
     """Whether the form in use is the recommended one, or runs show that it is as good; advice, so never no.
 
     Args:
-        problem: the problem.
-        deformation: in use.
         harm: what runs show against a deformation; empty where it does no harm.
         error: errors of a run with a deformation by coordinate, none without a run; None: nothing is run.
     """

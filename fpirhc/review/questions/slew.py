@@ -37,8 +37,6 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
     """Return the slew limit of the map beside the slew that the reference, the disturbances and the start need.
 
     Args:
-        grid: points of the reference.
-        deformation: the map.
         believed: parameters of the model, shape (np,).
         ideal: the linear loop of a plan with the right model; None where no plan is in the loop.
     """

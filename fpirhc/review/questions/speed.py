@@ -48,13 +48,7 @@ def fast_enough(case: Case) -> Answer | None:
 
 
 def faster(case: Case, factor: float, otherwise: str) -> str:
-    """Return what to do: a form or a larger gain that runs on plant and model speak for, or else something that is not run.
-
-    Args:
-        case: of a controller that is too slow.
-        factor: by which the gain would grow.
-        otherwise: what helps without another form or gain.
-    """
+    """Return what to do: a form or a larger gain that runs on plant and model speak for, or else something that is not run."""
     deformation = case.controller.deformation
     forms = forms_of(case.problem, deformation)
     passing = [name for kind, name in _FORMS.items() if kind in forms and not case.harm(forms[kind])]

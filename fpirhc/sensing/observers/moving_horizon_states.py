@@ -45,16 +45,13 @@ class Interior:
 
     To second order the cost -mu log s of a distance s is a measurement of this distance that says 2 s, with the deviation
     s / sqrt(mu).
-
-    Args:
-        elements: names of the states.
-        bounds: state -> (lower, upper); an end may be infinite.
-        barrier: weight mu of the logarithm.
     """
 
-    elements: tuple[str, ...]
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    barrier: float = 1.0
+    elements: tuple[str, ...]  # names of the states
+    bounds: Mapping[str, tuple[float, float]] = field(
+        default_factory=dict
+    )  # state -> (lower, upper); an end may be infinite
+    barrier: float = 1.0  # weight mu of the logarithm
 
     @property
     def ends(self) -> list[tuple[int, float, float]]:

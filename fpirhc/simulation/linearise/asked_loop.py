@@ -39,17 +39,11 @@ GAIN, POLE, FILTERED, NOISE = "map_gain", "map_pole", "map_filtered", "map_noise
 
 @dataclass(frozen=True)
 class LinearMap(Deformation):
-    """r+ = r - a W (f - d); behind noise and a filter r+ = r - a W g+ with g+ = p g + (1 - p)(f + n - d).
+    """r+ = r - a W (f - d); behind noise and a filter r+ = r - a W g+ with g+ = p g + (1 - p)(f + n - d)."""
 
-    Args:
-        gain: a at the start.
-        weights: W by rows; None: the one matrix.
-        noisy: whether n and p are in the memory: n is zero again one cycle later, p is zero at the start.
-    """
-
-    gain: float
-    weights: tuple[tuple[float, ...], ...] | None = None
-    noisy: bool = False
+    gain: float  # a at the start
+    weights: tuple[tuple[float, ...], ...] | None = None  # W by rows; None: the one matrix
+    noisy: bool = False  # whether n and p are in the memory: n is zero again one cycle later, p is zero at the start
 
     @property
     def iteration(self) -> Iteration:
@@ -103,11 +97,7 @@ def near_fixed_point(controller: Controller) -> Controller:
 
 
 def behind_noise(controller: Controller) -> Controller:
-    """Return the controller with its map as it is near the fixed point, behind noise of the response and a filter of the error.
-
-    Raises:
-        NotSupported: a controller whose map cannot be replaced.
-    """
+    """Return the controller with its map as it is near the fixed point, behind noise of the response and a filter of the error."""
     return controller.with_deformation(_linear(controller.deformation, noisy=True))
 
 
@@ -127,27 +117,17 @@ _STILL = 1e-7  # change of a command from period to period, as a share of the la
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """A part of a loop's run.
+    """A part of a loop's run."""
 
-    Args:
-        memories: before every cycle and after the last, shape (cycles + 1, n).
-        trace: of every cycle, shape (cycles, columns).
-    """
-
-    memories: np.ndarray
-    trace: np.ndarray
+    memories: np.ndarray  # before every cycle and after the last, shape (cycles + 1, n)
+    trace: np.ndarray  # of every cycle, shape (cycles, columns)
 
 
 class AskedLoop:
     """A closed loop whose step is run and differentiated; it works in one thread only."""
 
     def __init__(self, problem: Problem, controller: Controller) -> None:
-        """Compose the loop.
-
-        Raises:
-            NotSupported: a reality whose equations are not known.
-            FpirhcError: every error that the controller raises about the problem.
-        """
+        """Compose the loop."""
         problem.require_equations("the step of a loop with a foreign reality cannot be evaluated twice at one point")
         self.problem, self.controller = _calm(problem), resolved(problem, controller)
         with any_gain(), compiled_plans():  # one that a run refuses has poles too
@@ -199,7 +179,6 @@ class AskedLoop:
         """Return the memory of a loop that is started.
 
         Args:
-            time: of the start.
             state: first state of the model; None: that of the problem.
             before: inputs before; None: those of the problem.
             exact: parameters of the plant that moves; None: its own.
@@ -212,11 +191,7 @@ class AskedLoop:
         return memory if gain is None else self.with_gain(memory, gain)
 
     def with_gain(self, memory: np.ndarray, gain: float) -> np.ndarray:
-        """Return the memory with another gain of a `LinearMap`.
-
-        Raises:
-            NotSupported: the loop has no such map.
-        """
+        """Return the memory with another gain of a `LinearMap`."""
         if not self.gained:
             raise NotSupported("the gain is no part of the loop's memory")
         changed = memory.copy()
@@ -230,8 +205,6 @@ class AskedLoop:
         """Return the run from a memory; it ends before the first cycle that runs away, or where it is led and has come to rest.
 
         Args:
-            memory: at its start.
-            cycles: at most.
             led: states (cycles, nx) at which the plant is put after each cycle, so that it stays on the reference while what the
                 controller remembers finds its place there; those that are NaN move by themselves. None: all do.
             request: that is put in place of the last deformed response once everything else has found its place, so that an
@@ -276,9 +249,6 @@ class AskedLoop:
 
         Plans are in the same phase there as at the beginning of the run. Cycles at a limit are left out as long as there are
         others: there a command has no slope.
-
-        Raises:
-            NotSupported: a run that is not finite from its first cycles on.
         """
         commands, n = passage.trace[:, self._command], self.repeats
         if len(commands) <= n + 1:
@@ -316,15 +286,7 @@ class AskedLoop:
         return self.late_at(memory, self._lines) if self._lines else self._among([self._period(memory)])[0]
 
     def late_at(self, memory: np.ndarray, lines: Sequence[np.ndarray]) -> LateLoop:
-        """Return the linear loop at a memory without the entries of some delay lines.
-
-        Args:
-            memory: of a loop that repeats itself in every cycle.
-            lines: places of the entries of each line, the oldest first.
-
-        Raises:
-            NotSupported: entries that do more than wait, such as those of a plan.
-        """
+        """Return the linear loop at a memory without the entries of some delay lines."""
         scales, free = self._scales(memory), self._free.copy()
         way, acting = self._step.way(memory, scales), []
         for number, line in enumerate(lines):
@@ -363,11 +325,7 @@ class AskedLoop:
         """Return the linear loop behind the noise of the sensors, n+ = c n + w, with the commands that are sent for v.
 
         Args:
-            memory: at which it is linearised.
             correlation: c, shape (noises,); zero for white noise.
-
-        Raises:
-            NotSupported: no sensor has noise.
         """
         if self._noise is None:
             raise NotSupported("no sensor has noise")
@@ -389,8 +347,6 @@ class AskedLoop:
         What `at` has found of the second gain is not sought again.
 
         Args:
-            memory: at which both are linearised.
-            gains: the effective gains.
             held: whether plans are held for ever, as far as there are cycles between them.
         """
         period = self._period(memory)
@@ -398,12 +354,7 @@ class AskedLoop:
         return self._among([[self.with_gain(one, gain) for one in some] for gain in gains])
 
     def shaken(self, memory: np.ndarray, corners: Sequence[tuple[float, float]]) -> tuple[LinearLoop, ...]:
-        """Return linear loops behind white noise w of the response that a map sees, one for each (gain, pole of its filter).
-
-        Args:
-            memory: of a loop with a map that is `behind_noise`.
-            corners: the effective gains and poles.
-        """
+        """Return linear loops behind white noise w of the response that a map sees, one for each (gain, pole of its filter)."""
         period, periods = self._period(memory), []
         for gain, pole in corners:
             moved = [self.with_gain(one, gain) for one in period]
@@ -517,14 +468,7 @@ _FELT = 1e-7  # of a deviation
 
 
 def _acting(way: Way, line: np.ndarray, size: int, inputs: int) -> list[int]:
-    """Which entries of a delay line, the oldest first, do more than wait; sought by halves, because few do.
-
-    Args:
-        way: of the loop.
-        line: places of the entries.
-        size: of the memory.
-        inputs: entries of w.
-    """
+    """Which entries of a delay line, the oldest first, do more than wait; sought by halves, because few do."""
     random = np.random.default_rng(0).standard_normal(len(line))
 
     def felt(some: range) -> bool:

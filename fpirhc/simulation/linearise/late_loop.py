@@ -50,13 +50,9 @@ class Late:
 
 @dataclass(frozen=True, eq=False)
 class LateLoop(LinearLoop):
-    """A loop of one cycle, whose matrices are those of what acts at once; build it with `AskedLoop.at`.
+    """A loop of one cycle, whose matrices are those of what acts at once; build it with `AskedLoop.at`."""
 
-    Args:
-        late: what acts later.
-    """
-
-    late: tuple[Late, ...] = ()
+    late: tuple[Late, ...] = ()  # what acts later
 
     @property
     def longest(self) -> int:

@@ -37,19 +37,12 @@ class LinearCycle:
 
 @dataclass(frozen=True, eq=False)
 class LinearLoop:
-    """The cycles of one period of a linear loop.
+    """The cycles of one period of a linear loop."""
 
-    Args:
-        cycles: as many as the loop needs to repeat itself; one for plans in every cycle.
-        errors: E (judged, n); no rows: every mode counts.
-        placed: Z (n, nx), the deviation z of a deviation of the plant's state alone.
-        period: of the control cycle.
-    """
-
-    cycles: tuple[LinearCycle, ...]
-    errors: np.ndarray
-    placed: np.ndarray
-    period: float
+    cycles: tuple[LinearCycle, ...]  # as many as the loop needs to repeat itself; one for plans in every cycle
+    errors: np.ndarray  # E (judged, n); no rows: every mode counts
+    placed: np.ndarray  # Z (n, nx), the deviation z of a deviation of the plant's state alone
+    period: float  # of the control cycle
 
     @cached_property
     def dynamics(self) -> np.ndarray:

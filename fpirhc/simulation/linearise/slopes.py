@@ -91,18 +91,12 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Directions of one cycle, and what each way makes of them.
+    """Directions of one cycle, and what each way makes of them."""
 
-    Args:
-        basis: orthonormal directions (n, m) at its beginning, in scales.
-        moved: by way, the next deviations (n, m).
-        traces: by way, the deviations of the trace (columns, m).
-        kicked: by way, the next deviations (n, m) and the deviations of the trace (columns, m) after each w alone.
-    """
-
-    basis: np.ndarray
-    moved: list[np.ndarray]
-    traces: list[np.ndarray]
+    basis: np.ndarray  # orthonormal directions (n, m) at its beginning, in scales
+    moved: list[np.ndarray]  # by way, the next deviations (n, m)
+    traces: list[np.ndarray]  # by way, the deviations of the trace (columns, m)
+    # by way, the next deviations (n, m) and the deviations of the trace (columns, m) after each w alone
     kicked: list[tuple[np.ndarray, np.ndarray]]
 
 
@@ -128,15 +122,9 @@ def reached(
     """Return directions at every cycle of a period that the motion from some first ones does not leave.
 
     Args:
-        ways: of the cycles of the period, one or several each.
         free: which entries may deviate, (n,).
         first: places of the plant's state.
-        inputs: entries of w.
         begun: those of each cycle's last way alone, from which the others go on; None: none are known.
-        always: places of entries that deviate anew in every cycle.
-
-    Raises:
-        NotSupported: more directions than a loop should need.
     """
     count, fixed = len(ways), ~free
     parts = [_Part(some, free.size, inputs, None if begun is None else begun[k]) for k, some in enumerate(ways)]

@@ -27,11 +27,7 @@ _TAKEN = frozenset({"compiled", "cycle_us", "notes", "optimality", "outcome", "p
 
 @cache
 def known_metrics() -> tuple[Metric, ...]:
-    """Return the shipped metrics and those of installed packages, in the order of their columns.
-
-    Raises:
-        InvalidName: two metrics have the same name.
-    """
+    """Return the shipped metrics and those of installed packages, in the order of their columns."""
     shipped = [
         metric for module in within("fpirhc.simulation.metrics.entries") for metric in getattr(module, "METRICS", ())
     ]
@@ -43,9 +39,6 @@ def with_own_metrics(own: Iterable[Metric]) -> tuple[Metric, ...]:
     """Return the known metrics and the own ones of a problem file, in the order of their columns.
 
     Those of another problem file are its own and the known ones, which are not there twice.
-
-    Raises:
-        InvalidName: another metric or another fact of a run has the name.
     """
     known = known_metrics()
     return _ordered([*known, *(metric for metric in own if metric not in known)])
@@ -194,17 +187,11 @@ def measure(problem: Problem, run: Run, metrics: Sequence[Metric] | None = None)
 
 @dataclass(frozen=True)
 class Column:
-    """One number of every run.
+    """One number of every run."""
 
-    Args:
-        metric: the metric.
-        element: of the metric; '' for a single number.
-        unit: of the number.
-    """
-
-    metric: Metric
-    element: str
-    unit: str
+    metric: Metric  # the metric
+    element: str  # of the metric; '' for a single number
+    unit: str  # of the number
 
     @property
     def heading(self) -> str:

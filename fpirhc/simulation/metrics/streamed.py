@@ -57,17 +57,13 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Streamed:
-    """How a metric is summed up; its numbers are those of its function to rounding.
+    """How a metric is summed up; its numbers are those of its function to rounding."""
 
-    Args:
-        start: of a run, its first memory, shape (n,), with the constants that its cycles need; None where the problem does not
-            say before a run what they are.
-        step: (memory, cycle) -> memory.
-        result: (last memories, shape (runs, n), their runs) -> numbers by element, each of shape (runs,); a masked number is none.
-    """
-
+    # of a run, its first memory, shape (n,), with the constants that its cycles need; None where the problem does not say
+    # before a run what they are
     start: Callable[[Measured], np.ndarray | None]
-    step: Callable[[ca.SX, Cycle], ca.SX]
+    step: Callable[[ca.SX, Cycle], ca.SX]  # (memory, cycle) -> memory
+    # (last memories, shape (runs, n), their runs) -> numbers by element, each of shape (runs,); a masked number is none
     result: Callable[[np.ndarray, Measured], Mapping[str, np.ndarray]]
 
 
@@ -81,10 +77,6 @@ def summed(
     """Return the sum of a term of every entry of a signal over the measured cycles, a number for each.
 
     Args:
-        signal: whose entries they are.
-        names: signal that names them.
-        term: of the entries in a cycle, not negative.
-        number: of the sums of some runs.
         joined: (what is remembered, term of this cycle) -> what is remembered; starts at zero.
     """
     return Streamed(

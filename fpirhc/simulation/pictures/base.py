@@ -81,11 +81,7 @@ class Picture(Checked, ABC):
 
 
 def numbers(run: Run, what: str | Quantity) -> np.ndarray:
-    """Return the values of a signal or a quantity, shape (cycles,).
-
-    Raises:
-        InvalidName: the run does not have the signal.
-    """
+    """Return the values of a signal or a quantity, shape (cycles,)."""
     return run[what] if isinstance(what, str) else np.asarray(what.values(run), dtype=float)
 
 
@@ -98,11 +94,7 @@ def averaged(values: np.ndarray, columns: int) -> np.ndarray:
 
 
 def readable(kept: Mapping[str, Sequence[Kept]]) -> Mapping[str, Sequence[Kept]]:
-    """Return what was kept.
-
-    Raises:
-        FpirhcError: the picture did not fit a run; with its reason.
-    """
+    """Return what was kept."""
     for one in (one for cases in kept.values() for one in cases if NOT_DRAWN in one):
         raise FpirhcError(str(one[NOT_DRAWN]))
     return kept

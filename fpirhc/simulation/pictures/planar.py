@@ -252,13 +252,9 @@ class Planar(Picture):
 
 @dataclass(frozen=True)
 class Player:
-    """A moving picture with its numbers, in a frame of its own.
+    """A moving picture with its numbers, in a frame of its own."""
 
-    Args:
-        data: of the picture, as `Planar.motion` returns it.
-    """
-
-    data: Mapping[str, object]
+    data: Mapping[str, object]  # of the picture, as `Planar.motion` returns it
 
     def _repr_html_(self) -> str:
         text = json.dumps(self.data, separators=(",", ":")).replace("<", "\\u003c")

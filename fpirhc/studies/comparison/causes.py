@@ -32,20 +32,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What errors are measured against, by judged coordinate.
+    """What errors are measured against, by judged coordinate."""
 
-    Args:
-        scales: by which errors are judged, see `fpirhc.studies.comparison.changes`; 1 where not named.
-        ranges: of the references that move, the start included; of one that moves from the start alone at least what the plant
-            left alone has for an error, because disturbances and not the reference move it.
-        turns: a quarter turn for angles whose references do not move.
-        alone: rms error of the plant left alone; empty where it is not known.
-    """
-
+    # by which errors are judged, see `fpirhc.studies.comparison.changes`; 1 where not named
     scales: Mapping[str, float] = field(default_factory=dict)
+    # of the references that move, the start included; of one that moves from the start alone at least what the plant left
+    # alone has for an error, because disturbances and not the reference move it
     ranges: Mapping[str, float] = field(default_factory=dict)
-    turns: Mapping[str, float] = field(default_factory=dict)
-    alone: Mapping[str, float] = field(default_factory=dict)
+    turns: Mapping[str, float] = field(default_factory=dict)  # a quarter turn for angles whose references do not move
+    alone: Mapping[str, float] = field(
+        default_factory=dict
+    )  # rms error of the plant left alone; empty where it is not known
 
     def beyond(self, entry: Entry, name: str) -> str:
         """What the rms error of a coordinate exceeds, in words: the range of its reference, or a quarter turn; else nothing."""
@@ -77,10 +74,6 @@ def error_left_alone(problem: Problem, *, seed: int) -> Mapping[str, float]:
 
     It is not known for a plant outside, which is not run for the sake of a comparison, and where the run ends early. The run has
     the start, disturbances and noise of the comparison. It is made in the virtual machine: it is shorter than a compilation.
-
-    Args:
-        problem: of the comparison.
-        seed: of disturbances and noise.
     """
     try:
         problem.require_equations("a plant outside is not run for the sake of a comparison")

@@ -33,18 +33,14 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Finding(FoundByName):
-    """One sentence of a verdict.
+    """One sentence of a verdict."""
 
-    Args:
-        text: the sentence.
-        outcome: of the pair that it is about; None for a remark.
-        pair: names of the controllers without and with adaptation, where it is about a pair.
-        ratios: rms error with adaptation over that without, by judged coordinate, largest first; NaN where both are zero.
-    """
-
-    text: str
-    outcome: Outcome | None = None
-    pair: tuple[str, str] | None = None
+    text: str  # the sentence
+    outcome: Outcome | None = None  # of the pair that it is about; None for a remark
+    pair: tuple[str, str] | None = (
+        None  # names of the controllers without and with adaptation, where it is about a pair
+    )
+    # rms error with adaptation over that without, by judged coordinate, largest first; NaN where both are zero
     ratios: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

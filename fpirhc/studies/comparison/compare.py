@@ -50,11 +50,7 @@ from fpirhc.task.problem import Problem
 
 
 def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
-    """Return the named controllers of a task in the given order; all of them when no names are given.
-
-    Raises:
-        InvalidProblem: unknown names, with the nearest valid ones.
-    """
+    """Return the named controllers of a task in the given order; all of them when no names are given."""
     if not names:
         return dict(task.controllers)
     mistakes = Mistakes(f"problem '{task.name}'")

@@ -36,26 +36,17 @@ _SAMPLE = ("state", "output", "realised", "measured", "arrived")
 
 @dataclass(frozen=True)
 class Information:
-    """What a controller uses, and when.
+    """What a controller uses, and when."""
 
-    Args:
-        uses: names of the measured quantities on which its command depends.
-        rate: in words: in every cycle, or with every plan.
-        waits: whether what it learns waits for the next plan.
-    """
-
-    uses: tuple[str, ...]
-    rate: str
-    waits: bool = False
+    uses: tuple[str, ...]  # names of the measured quantities on which its command depends
+    rate: str  # in words: in every cycle, or with every plan
+    waits: bool = False  # whether what it learns waits for the next plan
 
 
 def information(problem: Problem, controller: Controller, loop: Composite, cycles: int) -> Information:
     """Return what a controller uses, and when.
 
     Args:
-        problem: of the loop.
-        controller: resolved.
-        loop: closed with it.
         cycles: from plan to plan; 1 for a controller that does not plan.
     """
     waits = cycles > 1 and controller.learns and not _acts_at_once(controller)
@@ -63,12 +54,7 @@ def information(problem: Problem, controller: Controller, loop: Composite, cycle
 
 
 def lines_of(problem: Problem, known: Mapping[str, Information]) -> tuple[str, ...]:
-    """Return the lines of a comparison: what all are given, what each uses, and when each acts.
-
-    Args:
-        problem: of all controllers.
-        known: by name of the controller.
-    """
+    """Return the lines of a comparison: what all are given, what each uses, and when each acts."""
     if not known:
         return ()
     return _given(problem), *_grouped("use", _by_use(known)), *_grouped("act", _by_rate(known))
@@ -166,55 +152,32 @@ class Contraction:
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One controller of a comparison.
+    """One controller of a comparison."""
 
-    Args:
-        name: name of the controller.
-        run: its run.
-        metrics: metrics of the run.
-        cycle: time of a control cycle; None for a run that is too short.
-        adaptive: whether the controller adapts.
-        pair: name of the same controller without adaptation, if there is one.
-        contraction: contraction of the iteration, if the controller adapts.
-        optimality: excess cost of its plans, if it plans.
-        notes: sentences for the report.
-        lyapunov: Lyapunov function along the run, if one is known.
-        prediction: prediction of the response, for the adaptive controller of the headline.
-        weighed: judged coordinates that its cost weighs; None: all.
-        exact: whether its model is exact where the others' is not, so that it should be a bound.
-        learns: whether its model or its gains change during a run.
-        fixed: name of the same controller with a model that does not change, for one that learns, if there is one.
-        plan_every: cycles from plan to plan; 1 for a controller that does not plan.
-        price: its time per cycle beside that of its pair.
-        no_bound: why it is no bound, for an exact model that an adapted controller beats.
-        information: what it measures and when it acts; None: not asked.
-        automatic: settings of its deformation that were chosen automatically.
-        reviewed_gain: what a review says of a gain that is too large or too small; empty where it is neither, or was not asked.
-        not_reached: what a review says of wrong parameters that adaptation does not correct; empty likewise.
-    """
-
-    name: str
-    run: Run
-    metrics: Metrics
-    cycle: CycleTime | None
-    adaptive: bool
-    pair: str | None
-    contraction: Contraction | None
-    optimality: Optimality | None = None
-    notes: tuple[str, ...] = ()
-    lyapunov: LyapunovView | None = None
-    prediction: Prediction | None = None
-    weighed: frozenset[str] | None = None
-    exact: bool = False
-    learns: bool = False
+    name: str  # name of the controller
+    run: Run  # its run
+    metrics: Metrics  # metrics of the run
+    cycle: CycleTime | None  # time of a control cycle; None for a run that is too short
+    adaptive: bool  # whether the controller adapts
+    pair: str | None  # name of the same controller without adaptation, if there is one
+    contraction: Contraction | None  # contraction of the iteration, if the controller adapts
+    optimality: Optimality | None = None  # excess cost of its plans, if it plans
+    notes: tuple[str, ...] = ()  # sentences for the report
+    lyapunov: LyapunovView | None = None  # Lyapunov function along the run, if one is known
+    prediction: Prediction | None = None  # prediction of the response, for the adaptive controller of the headline
+    weighed: frozenset[str] | None = None  # judged coordinates that its cost weighs; None: all
+    exact: bool = False  # whether its model is exact where the others' is not, so that it should be a bound
+    learns: bool = False  # whether its model or its gains change during a run
+    # name of the same controller with a model that does not change, for one that learns, if there is one
     fixed: str | None = None
-    plan_every: int = 1
-    price: Price | None = None
-    no_bound: tuple[str, ...] = ()
-    information: Information | None = None
-    automatic: tuple[str, ...] = ()
+    plan_every: int = 1  # cycles from plan to plan; 1 for a controller that does not plan
+    price: Price | None = None  # its time per cycle beside that of its pair
+    no_bound: tuple[str, ...] = ()  # why it is no bound, for an exact model that an adapted controller beats
+    information: Information | None = None  # what it measures and when it acts; None: not asked
+    automatic: tuple[str, ...] = ()  # settings of its deformation that were chosen automatically
+    # what a review says of a gain that is too large or too small; empty where it is neither, or was not asked
     reviewed_gain: str = ""
-    not_reached: str = ""
+    not_reached: str = ""  # what a review says of wrong parameters that adaptation does not correct; empty likewise
 
 
 _MUCH = 1e-2  # relative cost above the optimum

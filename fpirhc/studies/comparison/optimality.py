@@ -40,9 +40,6 @@ class Optimality:
     """Relative excess (V - V*) / |V*| of sampled plans over the converged optimum.
 
     Args:
-        median: median excess.
-        worst: largest excess.
-        plans: number of plans that were compared.
         stuck: times of those that count as solved with every input at a limit, while one from the middle of the limits is
             clearly cheaper: they are in a local optimum, and the next plan begins there again.
     """

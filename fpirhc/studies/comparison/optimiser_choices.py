@@ -27,11 +27,7 @@ def optimiser_choices() -> dict[str, Choice]:
 
 
 def chosen_optimisers(names: Sequence[str]) -> dict[str, Choice]:
-    """Return the choices of these names; 'all' among them stands for every optimiser.
-
-    Raises:
-        InvalidName: an unknown optimiser.
-    """
+    """Return the choices of these names; 'all' among them stands for every optimiser."""
     choices = optimiser_choices()
     unknown = [n for n in names if n != "all" and n not in choices]
     if unknown:
@@ -43,10 +39,6 @@ def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str]
     """Return the task with its planning controllers once per optimiser: the headline pair, or those named.
 
     A controller that is named and does not plan stays as it is.
-
-    Raises:
-        InvalidName: an unknown optimiser.
-        InvalidProblem: no planning controller to vary.
     """
     choices = list(chosen_optimisers(names).values())
     sources = list(controllers or task.headline or task.controllers)

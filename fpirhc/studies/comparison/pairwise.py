@@ -42,27 +42,16 @@ _LARGER = (Outcome.WORSE, Outcome.MIXED)
 
 @dataclass(frozen=True)
 class NullTest(FoundByName):
-    """The result of a null test.
+    """The result of a null test."""
 
-    Args:
-        pair: names of the controllers without and with adaptation.
-        before: rms error without adaptation, by judged coordinate; NaN for a run that ended early.
-        after: rms error with adaptation.
-        outcome: what adaptation does where there is nothing to adapt.
-        harmful: whether it then makes an error that is larger than that of the wrong model without adaptation.
-        text: the result in a sentence.
-        cycles: of one run.
-        elapsed: wall time of both runs, s.
-    """
-
-    pair: tuple[str, str]
-    before: Mapping[str, float]
-    after: Mapping[str, float]
-    outcome: Outcome
-    harmful: bool
-    text: str
-    cycles: int
-    elapsed: float = field(default=0.0, compare=False)
+    pair: tuple[str, str]  # names of the controllers without and with adaptation
+    before: Mapping[str, float]  # rms error without adaptation, by judged coordinate; NaN for a run that ended early
+    after: Mapping[str, float]  # rms error with adaptation
+    outcome: Outcome  # what adaptation does where there is nothing to adapt
+    harmful: bool  # whether it then makes an error that is larger than that of the wrong model without adaptation
+    text: str  # the result in a sentence
+    cycles: int  # of one run
+    elapsed: float = field(default=0.0, compare=False)  # wall time of both runs, s
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "text", numbers_written_out(self.text))
@@ -86,10 +75,6 @@ def null_test(
     """Return what adaptation does on the approximate model as plant.
 
     Args:
-        model: as plant.
-        loops: without and with adaptation.
-        names: of both controllers.
-        scales: by which errors are judged, by coordinate.
         weighed: coordinates that are judged; None: all.
         cured: rms error on the plant itself without adaptation, by judged coordinate.
     """
@@ -186,14 +171,7 @@ class Built(NamedTuple):
 def beside_each_other(
     problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], scales: Mapping[str, float]
 ) -> list[Entry]:
-    """Return the entries with what only shows beside the others.
-
-    Args:
-        problem: of the comparison.
-        entries: the controllers that ran.
-        built: what they were built to, by name.
-        scales: by which errors are judged, by coordinate.
-    """
+    """Return the entries with what only shows beside the others."""
     shown: list[Entry] = []
     try:
         for entry in entries:
@@ -206,26 +184,13 @@ def beside_each_other(
 def with_reviewed_causes(
     problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], judged: Sequence[Finding]
 ) -> list[Entry]:
-    """Return the entries with what a review says of gain and wrong parameters, where a pair's verdict is not plainly positive.
-
-    Args:
-        problem: of the comparison.
-        entries: the controllers that ran.
-        built: what they were built to, by name.
-        judged: the verdict so far.
-    """
+    """Return the entries with what a review says of gain and wrong parameters, where a pair's verdict is not plainly positive."""
     asked = {finding.pair[1] for finding in judged if finding.pair and finding.outcome is not Outcome.BETTER}
     return [with_causes(problem, e, built[e.name].loop.controller) if e.name in asked else e for e in entries]
 
 
 def with_causes(problem: Problem, entry: Entry, controller: Controller) -> Entry:
-    """Return an entry with what a review says of the gain and of wrong parameters.
-
-    Args:
-        problem: of the comparison.
-        entry: of an adaptive controller.
-        controller: resolved.
-    """
+    """Return an entry with what a review says of the gain and of wrong parameters."""
     believed = controller.plant_model(problem).parameters(problem.plant)
     missed = not_reached(problem, np.asarray(believed))
     return replace(entry, reviewed_gain=reviewed_gain(problem, controller, grows=grows(entry)), not_reached=missed)
@@ -241,17 +206,7 @@ def null_tests(
     seed: int,
     broken: list[str],
 ) -> tuple[NullTest, ...]:
-    """Return the null tests of all pairs (without adaptation, with it), in their order.
-
-    Args:
-        problem: of the comparison.
-        pairs: names of the controllers.
-        entries: the controllers that ran.
-        built: what they were built to, by name.
-        scales: by which errors are judged, by coordinate.
-        seed: of the sensors' noise.
-        broken: takes a sentence for every test that could not be made.
-    """
+    """Return the null tests of all pairs (without adaptation, with it), in their order."""
     by_name, tests = {e.name: e for e in entries}, []
     model = ModelAsPlant(problem, seed=seed)
     try:
@@ -296,14 +251,6 @@ def harm_of_adaptation(
     """Return a sentence for a run in which adaptation raises the error, and one for a null test that it fails.
 
     Empty without harm, for a controller that does not adapt, and for one that has no pair or cannot run.
-
-    Args:
-        problem: with its two sets of parameters.
-        name: of the controller.
-        controller: with its deformation.
-        seed: of the disturbances and the noise.
-        compiled: whether the loops are compiled to C.
-        metrics: of the task.
     """
     if not controller.deformation.adapts:
         return ()
@@ -347,16 +294,7 @@ def partners(
     compiled: bool,
     metrics: Sequence[Metric] | None = None,
 ) -> tuple[dict[str, tuple[Entry, Simulator]], dict[str, str]]:
-    """Return runs without adaptation of the adaptive rows that have no pair, by row, and why others have none.
-
-    Args:
-        problem: of the comparison.
-        entries: its rows.
-        controllers: their controllers, by name.
-        seed: of the disturbances and the noise.
-        compiled: whether the loops are compiled to C.
-        metrics: of the task.
-    """
+    """Return runs without adaptation of the adaptive rows that have no pair, by row, and why others have none."""
     unadapted: dict[str, tuple[Entry, Simulator]] = {}
     missing: dict[str, str] = {}
     for name in (e.name for e in entries if e.adaptive and e.pair is None):

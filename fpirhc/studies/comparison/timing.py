@@ -24,21 +24,15 @@ _PLACEMENT = 0.03  # of a time: where code and data happen to lie changes it by 
 
 @dataclass(frozen=True)
 class CycleTime:
-    """Wall time of one call of `Stepper.step`, microseconds; only `first` includes the first call.
+    """Wall time of one call of `Stepper.step`, microseconds; only `first` includes the first call."""
 
-    Args:
-        median: median of the mean over the cycles from one plan to the next, so that it includes its share of planning.
-        p99: 99th percentile.
-        maximum: largest time.
-        first: time of the first call.
-        planning: median of the cycles in which a new plan is made; of all cycles where no plan is made.
-    """
-
-    median: float
-    p99: float
-    maximum: float
-    first: float
-    planning: float
+    median: (
+        float  # median of the mean over the cycles from one plan to the next, so that it includes its share of planning
+    )
+    p99: float  # 99th percentile
+    maximum: float  # largest time
+    first: float  # time of the first call
+    planning: float  # median of the cycles in which a new plan is made; of all cycles where no plan is made
 
 
 @dataclass(frozen=True)
@@ -83,7 +77,6 @@ def price_of(beside: str, times: np.ndarray) -> Price:
     rounds that were interrupted do not widen it.
 
     Args:
-        beside: name of the first controller.
         times: of a cycle, microseconds, shape (rounds, 2).
     """
     differences = np.sort(times[:, 1] - times[:, 0])
@@ -173,12 +166,7 @@ def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | N
 
 
 def _planned(skipped: np.ndarray, stride: int) -> np.ndarray:
-    """Which cycles make a new plan, the first one left out: a skipped cycle keeps the memory, and with it the count to the plan.
-
-    Args:
-        skipped: number of skipped cycles up to each.
-        stride: cycles from one plan to the next.
-    """
+    """Which cycles make a new plan, the first one left out: a skipped cycle keeps the memory, and with it the count to the plan."""
     ran = np.diff(skipped, prepend=0) == 0
     due = ran & ((np.arange(skipped.size) - skipped) % stride == 0)
     due[0] = False

@@ -47,8 +47,6 @@ def findings(
     """Return the verdict's sentences: the headline pair first, the other pairs, what other rows show, what was not run.
 
     Args:
-        entries: the controllers that ran.
-        skipped: reasons why others did not.
         headline: names without and with adaptation of the pair that comes first.
         yardstick: what errors are measured against; None: each in its own unit.
         partners: runs without adaptation that are no rows, of rows whose pair they are.

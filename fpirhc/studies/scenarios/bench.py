@@ -41,21 +41,14 @@ SIDE_BY_SIDE = 64  # scenarios from which it pays to compile a loop for lanes
 
 @dataclass(frozen=True)
 class Conditions:
-    """Everything apart from the task on which the numbers of a scenario depend.
+    """Everything apart from the task on which the numbers of a scenario depend."""
 
-    Args:
-        seed: of the scenarios.
-        use: of the scenarios, see `draws`.
-        percent: range of the exact parameters' draws, percent.
-        compiled: whether runs use compiled C; None: only those of loops with live settings, which are compiled once.
-        named: whether they are the cases of the problem file.
-    """
-
-    seed: int
-    use: int
-    percent: float
+    seed: int  # of the scenarios
+    use: int  # of the scenarios, see `draws`
+    percent: float  # range of the exact parameters' draws, percent
+    # whether runs use compiled C; None: only those of loops with live settings, which are compiled once
     compiled: bool | None
-    named: bool = False
+    named: bool = False  # whether they are the cases of the problem file
 
 
 def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
@@ -107,8 +100,6 @@ class Bench:
     """Runs scenarios by number and controller.
 
     Args:
-        task: the loaded problem file.
-        conditions: conditions of the scenarios.
         live: paths of the settings that `record` may change, by name of the controller.
         side_by_side: whether runs are side by side where they can be, see `records`.
         judged: whether runs have the signals that judge them, which take longer than the run.
@@ -392,16 +383,9 @@ def scenario_numbers(
     """Return the numbers of the scenarios of a study.
 
     Args:
-        task: the task.
         count: number of random scenarios; None beside cases.
         percent: range of the exact parameters, percent.
-        cases: patterns of cases.
         same: whether all scenarios may be the same one.
-
-    Raises:
-        InvalidName: a pattern without a case.
-        InvalidProblem: a case that does not fit the problem.
-        InvalidValue: nothing to run, or all scenarios the same.
     """
     if cases is not None:
         if count is not None or percent:

@@ -222,7 +222,6 @@ class Cluster:
         address: of the scheduler, such as 'tcp://10.0.0.1:8786'; 'local': a cluster that lives as long as this value.
         opening: what a worker needs to build the study, as for processes.
         greeting: facts on which the numbers depend; a worker with others is refused.
-        count: number of workers of a local cluster.
 
     Raises:
         InvalidValue: nothing answers at the address.
@@ -262,12 +261,7 @@ class Cluster:
             self._stack.close()
 
     def answers(self, jobs: Sequence[Job], own: Callable[[Job], Any] | None = None) -> Iterator[Any]:
-        """Yield the answer of every job as it comes, in no particular order.
-
-        Raises:
-            FpirhcError: a worker's numbers would depend on other facts.
-            WorkerDied: workers die again and again at one task, or the scheduler is gone.
-        """
+        """Yield the answer of every job as it comes, in no particular order."""
         del own  # this process has the ledger to write
         try:
             for answers in self._chunks(deque(jobs)):
@@ -312,8 +306,6 @@ def run_jobs(
     """Answer jobs on a worker; return the records of each and the seconds that they took.
 
     Args:
-        opening: what the study is built from, as JSON.
-        content: of the problem file.
         greeting: facts on which the client's numbers depend.
         jobs: (numbers of scenarios, name of the controller).
     """

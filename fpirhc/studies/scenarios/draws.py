@@ -49,10 +49,6 @@ def draw(
     """Return what is drawn; its exact parameters lie in `exact_ranges(plant, percent)`.
 
     Args:
-        plant: the plant that a run moves.
-        seed: seed of the study.
-        use: `COMPARING` or `TUNING`.
-        number: number of the scenario.
         percent: range of the exact parameters, percent.
         model: the controllers' model, where it is another plant. The mismatch is then that of the parameters which both have.
     """
@@ -106,17 +102,11 @@ class Scenario:
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """A loop that serves several scenarios, because numbers in which they differ are live.
+    """A loop that serves several scenarios, because numbers in which they differ are live."""
 
-    Args:
-        key: scenarios with equal ones have one loop.
-        built: the problem for which it is built.
-        live: paths of its live settings; the scenario's problem has their numbers.
-    """
-
-    key: object
-    built: Problem
-    live: tuple[str, ...]
+    key: object  # scenarios with equal ones have one loop
+    built: Problem  # the problem for which it is built
+    live: tuple[str, ...]  # paths of its live settings; the scenario's problem has their numbers
 
 
 class Scenarios(ABC):
@@ -141,22 +131,12 @@ class Scenarios(ABC):
 
 @dataclass(frozen=True, eq=False)
 class RandomScenarios(Scenarios):
-    """Scenarios with drawn parameters and dead times.
+    """Scenarios with drawn parameters and dead times."""
 
-    Args:
-        of: the problem.
-        seed: of the study.
-        use: `COMPARING` or `TUNING`.
-        percent: range of the exact parameters, percent.
-
-    Raises:
-        InvalidProblem, InvalidValue: draws that could leave the parameters' physical bounds.
-    """
-
-    of: Problem
-    seed: int
-    use: int
-    percent: float
+    of: Problem  # the problem
+    seed: int  # of the study
+    use: int  # `COMPARING` or `TUNING`
+    percent: float  # range of the exact parameters, percent
 
     def __post_init__(self) -> None:
         exact_ranges(self.of.moved, self.percent)
@@ -197,17 +177,11 @@ class RandomScenarios(Scenarios):
 
 @dataclass(frozen=True, eq=False)
 class NamedCases(Scenarios):
-    """Scenarios that are the cases of a problem file.
+    """Scenarios that are the cases of a problem file."""
 
-    Args:
-        cases: the cases.
-        of: the problem.
-        seed: of the study; a case without a seed of its own has noise of this one and of its place among the cases.
-    """
-
-    cases: Cases
-    of: Problem
-    seed: int
+    cases: Cases  # the cases
+    of: Problem  # the problem
+    seed: int  # of the study; a case without a seed of its own has noise of this one and of its place among the cases
     _built: dict[object, Problem] = field(default_factory=dict, init=False)
     _shared_builds: dict[object, Problem] = field(default_factory=dict, init=False)
 

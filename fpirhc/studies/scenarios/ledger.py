@@ -175,8 +175,6 @@ class Ledger:
     """The open file; `records` are those that it held and those appended, in this order.
 
     Args:
-        path: path of the file.
-        header: conditions of the results.
         record: class whose fields every record has; None: records are not checked.
 
     Raises:
@@ -201,20 +199,12 @@ class Ledger:
             raise
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Write one record; every so often, wait until all are on the disk.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write one record; every so often, wait until all are on the disk."""
         self._write(record)
         self.records.append(record)
 
     def close(self) -> None:
-        """Force all to the disk and close the file; another process may open it then.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Force all to the disk and close the file; another process may open it then."""
         try:
             self._force()
         finally:
@@ -311,11 +301,7 @@ class Ledger:
 
 
 def header_of(path: Path) -> dict[str, Any]:
-    """Return the conditions of the results in a file.
-
-    Raises:
-        OutputError: it cannot be read, or its first line is damaged.
-    """
+    """Return the conditions of the results in a file."""
     try:
         with path.open("rb") as file:
             text = file.readline()

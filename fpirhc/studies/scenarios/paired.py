@@ -23,43 +23,27 @@ Record = Mapping[str, Any]
 class Summary(FoundByName):
     """One controller over all scenarios. Values are relative errors, or those of another figure with the sign that makes smaller
     better; they are infinite for runs that ended early.
-
-    Args:
-        name: name of the controller.
-        errors: relative errors by scenario, shape (n,).
-        values: of the figure of the comparison by scenario, shape (n,).
-        mismatch: mismatch of the model by scenario, shape (n,).
-        median: median of the values.
-        worst: worst value.
-        worst_scenario: number of the scenario with the worst value.
-        worst_name: its name; the number as text where scenarios are random.
-        metrics: median over the scenarios, by metric and element; a run without the number counts as worse than any
-            other.
-        worst_metrics: the worst number over the scenarios, by metric and element, of metrics with a better direction.
-        outcomes: number of scenarios by outcome.
-        statuses: number of cycles by status, over all scenarios.
-        difference: this value minus the baseline's in the same scenario; None for the baseline itself.
-        ratio: median of this value over the baseline's.
-        better: number of scenarios in which this value is the smaller one.
-        equal: number of scenarios in which both are equal, or failed; 0 for the baseline itself.
     """
 
-    name: str
-    errors: np.ndarray
-    values: np.ndarray
-    mismatch: np.ndarray
-    median: float
-    worst: float
-    worst_scenario: int
-    worst_name: str
+    name: str  # name of the controller
+    errors: np.ndarray  # relative errors by scenario, shape (n,)
+    values: np.ndarray  # of the figure of the comparison by scenario, shape (n,)
+    mismatch: np.ndarray  # mismatch of the model by scenario, shape (n,)
+    median: float  # median of the values
+    worst: float  # worst value
+    worst_scenario: int  # number of the scenario with the worst value
+    worst_name: str  # its name; the number as text where scenarios are random
+    # median over the scenarios, by metric and element; a run without the number counts as worse than any other
     metrics: Mapping[str, Mapping[str, float]]
+    # the worst number over the scenarios, by metric and element, of metrics with a better direction
     worst_metrics: Mapping[str, Mapping[str, float]]
-    outcomes: Mapping[str, int]
-    statuses: Mapping[str, int]
+    outcomes: Mapping[str, int]  # number of scenarios by outcome
+    statuses: Mapping[str, int]  # number of cycles by status, over all scenarios
+    # this value minus the baseline's in the same scenario; None for the baseline itself
     difference: ConfidenceInterval | None
-    ratio: float
-    better: int
-    equal: int
+    ratio: float  # median of this value over the baseline's
+    better: int  # number of scenarios in which this value is the smaller one
+    equal: int  # number of scenarios in which both are equal, or failed; 0 for the baseline itself
 
     @property
     def rms_error(self) -> Mapping[str, float]:
@@ -96,11 +80,7 @@ def summarise(
     """Return the summary of one controller's records against the baseline's of the same scenarios, in the same order.
 
     Args:
-        name: name of the controller.
-        records: its records.
         baseline: the baseline's records; None for the baseline itself.
-        seed: of the resampling.
-        metrics: metrics with which the records were measured; None: the shipped and the installed ones.
         figure: by which controllers are compared; None: the relative error.
     """
     figure, known = figure or Objective(), known_metrics() if metrics is None else metrics
@@ -171,9 +151,6 @@ def verdict(
     """Return sentences: every controller against the baseline, failures, and controllers that were not run.
 
     Args:
-        summaries: the baseline first.
-        skipped: reasons why controllers were not run, by name.
-        what: what the scenarios are called.
         figure: by which controllers are compared; None: the relative error.
     """
     figure = figure or Objective()
@@ -261,17 +238,11 @@ def share_interval(count: int, total: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """A median and its interval at level `LEVEL`.
+    """A median and its interval at level `LEVEL`."""
 
-    Args:
-        median: the median.
-        low: lower end of the interval.
-        high: upper end of the interval.
-    """
-
-    median: float
-    low: float
-    high: float
+    median: float  # the median
+    low: float  # lower end of the interval
+    high: float  # upper end of the interval
 
 
 def median_interval(values: np.ndarray, seed: int) -> ConfidenceInterval:

@@ -158,11 +158,7 @@ def _to_look_at(
 
 
 def _of_shard(numbers: Sequence[int], part: int, parts: int) -> Sequence[int]:
-    """Every n-th of the scenarios.
-
-    Raises:
-        InvalidValue: there is no such part, or nothing in it.
-    """
+    """Every n-th of the scenarios."""
     if not 1 <= part <= parts:
         raise InvalidValue(f"shard {part}/{parts}: expected a part from 1 to {parts}")
     own = numbers[part - 1 :: parts]
@@ -258,30 +254,19 @@ def _columns(task: Task, summaries: Sequence[Summary], figure: Objective) -> tup
 
 @dataclass(frozen=True)
 class Joined:
-    """What a folder holds after its parts were joined.
+    """What a folder holds after its parts were joined."""
 
-    Args:
-        records: number of results, those from before included.
-        controllers: their names.
-        scenarios: number of different scenarios.
-        twice: results that were there already.
-    """
-
-    records: int
-    controllers: tuple[str, ...]
-    scenarios: int
-    twice: int
+    records: int  # number of results, those from before included
+    controllers: tuple[str, ...]  # their names
+    scenarios: int  # number of different scenarios
+    twice: int  # results that were there already
 
 
 def merge_shards(folders: Sequence[Path], out: Path) -> Joined:
     """Join the results of several folders; what stands in two of them is kept once.
 
     Args:
-        folders: of parts of one comparison of scenarios.
         out: folder of the whole; it may hold some results already.
-
-    Raises:
-        OutputError: a folder without results, results under other conditions, or one result that differs between two folders.
     """
     header = header_of(folders[0] / LEDGER)
     with Ledger(out / LEDGER, header, RecordFields) as whole:

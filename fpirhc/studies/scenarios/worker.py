@@ -22,23 +22,14 @@ from fpirhc.studies.tuning.tuned_file import with_tuned
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """What a worker runs.
+    """What a worker runs."""
 
-    Args:
-        bench: runs scenarios.
-        greeting: facts on which the numbers depend.
-    """
-
-    bench: Bench
-    greeting: Mapping[str, Any]
+    bench: Bench  # runs scenarios
+    greeting: Mapping[str, Any]  # facts on which the numbers depend
 
 
 def study(opening: Mapping[str, Any]) -> Study:
-    """Return the study that an opening states: the path of the problem file, tuned settings, conditions.
-
-    Raises:
-        FpirhcError: the file cannot be loaded, or the settings do not fit it.
-    """
+    """Return the study that an opening states: the path of the problem file, tuned settings, conditions."""
     task = with_tuned(load_problem(opening["path"]), opening["tuned"])
     conditions = Conditions(**opening["conditions"])
     bench = Bench(task, conditions, side_by_side=opening["side by side"], judged=opening["judged"])

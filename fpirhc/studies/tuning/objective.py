@@ -24,16 +24,11 @@ class Objective:
 
     The cost is a number of the metric, with the opposite sign where larger is better. A run that ended early, or without the
     number, costs between one and two penalties, less if it lasted long.
-
-    Args:
-        metric: the metric; None: the relative rms error (see `score`).
-        element: element of the metric.
-        unit: of the number.
     """
 
-    metric: Metric | None = None
-    element: str = ""
-    unit: str = ""
+    metric: Metric | None = None  # the metric; None: the relative rms error (see `score`)
+    element: str = ""  # element of the metric
+    unit: str = ""  # of the number
 
     @property
     def name(self) -> str:
@@ -102,20 +97,12 @@ class Objective:
         return value if math.isfinite(value) else math.inf
 
     def value(self, record: Mapping[str, Any]) -> float:
-        """Return the number of a scenario's record with the sign that makes smaller better; infinite where the run failed.
-
-        Raises:
-            InvalidName: a run that finished has no such number.
-        """
+        """Return the number of a scenario's record with the sign that makes smaller better; infinite where the run failed."""
         value = record["error"] if self.metric is None else self._number(record)
         return math.inf if value is None else float(value)
 
     def cost(self, record: Mapping[str, Any]) -> float:
-        """Return the cost of a scenario's record.
-
-        Raises:
-            InvalidName: a run that finished has no such number.
-        """
+        """Return the cost of a scenario's record."""
         if "skipped" in record:
             return self.refused
         value = self.value(record)
@@ -134,17 +121,7 @@ class Objective:
 
 
 def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> Objective:
-    """Return the objective by the name of a number: None for the relative error, else 'at_limit' or 'overshoot.q1'.
-
-    Args:
-        name: of the number.
-        metrics: those that there are.
-        problem: with the units and names of coordinates and inputs.
-
-    Raises:
-        InvalidName: an unknown metric.
-        InvalidValue: one without a better direction, or with one number for every element.
-    """
+    """Return the objective by the name of a number: None for the relative error, else 'at_limit' or 'overshoot.q1'."""
     if name is None or name == RELATIVE_ERROR:
         return Objective()
     for metric in metrics:

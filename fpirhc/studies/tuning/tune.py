@@ -45,24 +45,15 @@ _PRESENT = -1  # number of the trial of the settings as they are, which no budge
 
 @dataclass(frozen=True, eq=False)
 class TunedController(FoundByName):
-    """One controller's settings before and after tuning, with their costs.
+    """One controller's settings before and after tuning, with their costs."""
 
-    Args:
-        name: name of the controller.
-        before: settings of the problem file, by path.
-        settings: the best settings, by path.
-        cost_before: cost of the settings before.
-        cost: cost of the best settings.
-        failed: number of trials with a failure in some scenario.
-        harm: what speaks against its adaptation with the best settings, in the run of the problem file; see `harm_of_adaptation`.
-    """
-
-    name: str
-    before: Mapping[str, float]
-    settings: Mapping[str, float]
-    cost_before: float
-    cost: float
-    failed: int
+    name: str  # name of the controller
+    before: Mapping[str, float]  # settings of the problem file, by path
+    settings: Mapping[str, float]  # the best settings, by path
+    cost_before: float  # cost of the settings before
+    cost: float  # cost of the best settings
+    failed: int  # number of trials with a failure in some scenario
+    # what speaks against its adaptation with the best settings, in the run of the problem file; see `harm_of_adaptation`
     harm: tuple[str, ...] = ()
 
 

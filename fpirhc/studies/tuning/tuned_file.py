@@ -20,24 +20,14 @@ FORMAT = 1
 
 @dataclass(frozen=True, eq=False)
 class TunedSettings:
-    """The content of a file of `fpirhc tune`.
+    """The content of a file of `fpirhc tune`."""
 
-    Args:
-        values: settings by controller and path.
-        notes: a sentence for every controller of the task.
-    """
-
-    values: Mapping[str, Values]
-    notes: Mapping[str, str]
+    values: Mapping[str, Values]  # settings by controller and path
+    notes: Mapping[str, str]  # a sentence for every controller of the task
 
 
 def read_tuned(path: str | Path, task: Task) -> TunedSettings:
-    """Read the file that `fpirhc tune` wrote for this problem.
-
-    Raises:
-        ProblemFileError: the file cannot be read.
-        ProblemFileError: the file is of another problem, or was not written by `fpirhc tune`.
-    """
+    """Read the file that `fpirhc tune` wrote for this problem."""
     try:
         facts = json.loads(Path(path).read_text(encoding="utf-8"))
         if facts["format"] != FORMAT:
@@ -69,11 +59,7 @@ def noted(comparison: Comparison, notes: Mapping[str, str]) -> Comparison:
 
 
 def with_tuned(task: Task, tuned: Mapping[str, Values]) -> Task:
-    """Return the task with these settings of these controllers changed.
-
-    Raises:
-        InvalidProblem: unknown controllers or settings.
-    """
+    """Return the task with these settings of these controllers changed."""
     mistakes = Mistakes(f"tuned settings of problem '{task.name}'")
     mistakes.unknown("controller", tuned, task.controllers)
     changed = dict(task.controllers)
@@ -98,10 +84,6 @@ def as_python(tuned: Mapping[str, Values], notes: Mapping[str, str]) -> str:
 
 
 def write_tuned(facts: Mapping[str, Any], path: Path) -> None:
-    """Write the facts of a tuning, atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the facts of a tuning, atomically."""
     content = json.dumps({"format": FORMAT, **facts}, indent=2, allow_nan=False) + "\n"
     write_whole(content, path, "tuned settings")

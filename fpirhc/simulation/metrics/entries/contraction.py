@@ -59,9 +59,6 @@ def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
     The cycles are those from `measure_from` on, without the first of the run, before which there is no request.
 
     With a reality that is a plant they are those over a whole cycle.
-
-    Raises:
-        InvalidValue: no eigenvalue is finite.
     """
     first = max(1, int(np.argmax(measured_cycles(problem, run))))
     rows = np.unique(np.linspace(first, run.cycles - 1, _SAMPLES).astype(int))
