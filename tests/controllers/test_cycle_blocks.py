@@ -437,10 +437,23 @@ def test_states_along_a_reference_are_those_of_a_motion_that_follows_it():
 
 def test_a_response_is_as_large_as_its_limits_allow():
     """By the model a'' = u and b'' = (w - 3) / 8: from the middle of the limits, plus what half of them adds."""
-    scale = response_scale(masses(limits=fp.Limits(inputs={"u": (-5.0, 3.0), "w": (-2.0, 6.0)})))
-    assert scale.largest == pytest.approx((1 + 4, (1 + 4) / 8))
+    scale = response_scale(masses(limits=fp.Limits(inputs={"u": (-5.0, 2.0), "w": (-2.0, 6.0)})))
+    assert scale.largest == pytest.approx((1.5 + 3.5, (1 + 4) / 8))
     np.testing.assert_allclose(scale.slope, np.diag([1.0, 1 / 8]))
     assert response_scale(masses(limits=fp.Limits(inputs={"u": (-5.0, 3.0)}))).largest == (np.inf, np.inf)
+
+
+def test_a_state_without_a_response_does_not_count_as_a_size():
+    """Of y'' = u / (10 y) along y = 2, and then y = 0, where there is none: up to 4 / 20 m/s^2."""
+    plant = fp.Plant(
+        coordinates={"y": "m"}, inputs={"u": "N"}, parameters={}, response=lambda q, v, u, p: {"y": u.u / (10 * q.y)}
+    )
+    reference = fp.Trajectory(lambda t: {"y": ca.if_else(t < 0.5, 2.0, 0.0)})
+    limits = fp.Limits(inputs={"u": (-4.0, 4.0)})
+    problem = fp.Problem(plant, reference, {"y": 2.0}, period=0.01, duration=1.0, limits=limits)
+    scale = response_scale(problem)
+    assert scale.largest == pytest.approx((0.2,))
+    np.testing.assert_allclose(scale.slope, [[0.05]])
 
 
 def test_a_small_error_asks_for_a_small_step():

@@ -29,6 +29,7 @@ from fpirhc.review.questions.gain import (
     _sign,
     gain_admissible,
     gain_of_target,
+    least_gain,
     recommended_gain,
 )
 from fpirhc.review.questions.margins import LEAST_PHASE, MARGINS, margins_enough
@@ -305,6 +306,28 @@ def test_where_a_gain_stops_being_admissible(gain, limit, verdict):
     one = admissible(gain, [1.0], [1.0, 2.0], limit)
     assert one.verdict == verdict
     assert one.change == ("" if verdict == "yes" else f"Use gain = {-limit / 2:.3g}.")
+
+
+@pytest.mark.parametrize(
+    ("own", "limit", "stable", "least"),
+    [
+        (-0.1, -1.0, (0.3, 0.8), -0.3),  # the smallest gain of the range with which the loop converges
+        (0.1, 1.0, (0.3, 0.8), 0.3),
+        (0.5, 1.0, (0.3, 0.8), None),  # its own does
+        (0.9, 0.4, (0.1, 0.5), None),  # too large, not too small
+        (0.1, 1.0, (2.0, 3.0), None),  # none up to the limit does
+        (0.3, 1.0, (0.1, 0.5), None),  # its own does, the lower one that is looked at beside it need not
+        (0.15, 1.0, (0.2, 0.5), 0.2),
+    ],
+)
+def test_the_smallest_gain_is_where_the_loop_begins_to_converge(own, limit, stable, least):
+    loops: Any = SimpleNamespace(
+        gains=(0.5 * own, own),
+        along=lambda most: [most],
+        all_stable=lambda gain, pairs: stable[0] <= abs(gain) <= stable[1],
+    )
+    answer = least_gain(loops, limit)
+    assert answer == (None if least is None else pytest.approx(least, rel=1e-3))
 
 
 def test_both_signs_have_no_gain():
