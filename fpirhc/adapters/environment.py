@@ -12,6 +12,8 @@ import numpy as np
 
 from fpirhc.adapters.names import adapter, finite_numbers
 from fpirhc.errors import package
+from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.held_input import HELD_INPUT, HeldInput
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
@@ -55,7 +57,8 @@ def as_env(problem: Problem, *, reward: Reward | None = None, setpoints: Setpoin
         action_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (play.observation.size,), dtype=np.float64)
 
-        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        @checked_call
+        def reset(self, *, seed: Seed | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
             """Go to the problem's start; the seed is that of its noise."""
             super().reset(seed=seed, options=options)
             play.reset(int(self.np_random.integers(2**31)) if seed is None else seed)

@@ -23,6 +23,7 @@ from fpirhc.fields.kinds import described, finite_number
 from fpirhc.fields.user_code import users_folder
 from fpirhc.plant.mismatch import Parametric
 from fpirhc.summary import line
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.paths import changed_at, content_at
 from fpirhc.task.problem import Problem
 
@@ -142,10 +143,13 @@ class Cases(Checked):
         return self.exactly(name, self.build(name, problem))
 
     def build(self, name: str, problem: Problem) -> Problem:
-        """Return the problem with all changes of a case but those of exact parameters, which are data of a loop."""
+        """Return the problem with all changes of a case but those of exact parameters, which are data of a loop.
+
+        Whichever case is asked first, the mistakes of all are told together.
+        """
         if name not in self.changes:
             raise InvalidName(f"case '{name}' is unknown.{nearest(name, self.names)}")
-        self.check(problem, [name])
+        _CHECKED.of((self, problem), (), lambda: self.check(problem))
         try:
             return _changed(problem, self.changes[name])
         except FpirhcError as error:
@@ -186,19 +190,14 @@ class Cases(Checked):
         roomy = [path for path in inside if _word(path) != "dead_time" or path.rpartition(".")[2] in queued]
         return tuple(path for path in roomy if _finite(_content(problem, path)))
 
-    def check(self, problem: Problem, names: Sequence[str] | None = None) -> None:
+    def check(self, problem: Problem) -> None:
         """Raise where a path or a number does not fit the problem.
-
-        Args:
-            problem: the problem.
-            names: of the cases; None: all.
 
         Raises:
             InvalidProblem: all mistakes together, each with its case and path, or its row and column.
         """
         mistakes, unknown = Mistakes(self._where), set[str]()
-        for name in self.names if names is None else names:
-            changes = self.changes[name]
+        for name, changes in self.changes.items():
             for path in (p for p in changes if p not in (*unknown, _GROUP, _SEED)):
                 try:
                     _check_change(problem, changes, path)
@@ -215,6 +214,9 @@ class Cases(Checked):
         if not row:
             return f"case {name!r}" + (f", {path!r}" if path else "")
         return (row.partition(",")[0] if head else f"{row} ({name})") + (f", column '{path}'" if path else "")
+
+
+_CHECKED: Latest[None] = Latest(8)  # cases with the problem that they fit
 
 
 def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
