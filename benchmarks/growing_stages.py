@@ -37,6 +37,7 @@ HORIZONS = {
     "20 of 20 ms, a plan per stage": fp.Horizon(20, 2e-2),
     "20 of 20 ms, a plan per cycle": fp.Horizon(20, 2e-2, replan="cycle"),
     "20 of 6 ms, a plan per cycle": fp.Horizon(20, 6e-3, replan="cycle"),
+    "2 and 8 ms, then 18 of 20 ms": fp.Horizon(20, PERIOD, lengths=(1.0, 4.0, *(10.0,) * 18)),
     "20 growing by 1.1": growing(20, 1.1),
     "20 growing by 1.2": growing(20, 1.2),
     "12 growing by 1.2": growing(12, 1.2),

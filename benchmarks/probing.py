@@ -19,7 +19,7 @@ from unseen_bodies import BODIES, CONTROLLER
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
-from fpirhc.probing.probe import Trial, tried
+from fpirhc.probing.trials import OnPlant, Trial
 from fpirhc.problem_files.shipped import missing, shipped_groups
 
 # The rule was changed where its choices on the first, on the last, on the late link and on the ship were poor.
@@ -101,7 +101,8 @@ def main() -> None:
         proposed = {} if found.deformation is None else {"probe": found.deformation}
         lags = tuple(one.value for one in found.lag.values())
         seeds = SEEDS if name in BODIES else SEEDS[:1]
-        runs = [tried(problem, alone, {**by_hand(lags), **proposed}, seed=seed) for seed in seeds]
+        plant, every = OnPlant(problem, alone), {**by_hand(lags), **proposed}
+        runs = [{n: plant.trial(one, seed) for n, one in every.items()} for seed in seeds]
         trials = {n: rms([run[n] for run in runs]) for n, one in runs[0].items() if isinstance(one, Trial)}
         probe = trials.pop("probe", Trial(1.0, 1.0))
         hand = min(trials, key=lambda n: trials[n].error)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +19,8 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count, Seed
 from fpirhc.probing.identification import Estimates, Interval, identify
 from fpirhc.probing.recording import Record, excited, read_recording
-from fpirhc.probing.rule import DARING, Predicted, Rule, mean_ratio, steps_of
-from fpirhc.simulation.model_as_plant import shortened
-from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import simulator
-from fpirhc.simulation.trials import errors_of, weighed
+from fpirhc.probing.rule import Rule
+from fpirhc.probing.trials import MARGIN, OnPlant, Trial, best
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
@@ -163,13 +160,13 @@ def probe(
             why = f"the plant as estimated cannot be run ({error})"
     try_them = trying and bool(shortlist)
     if try_them:
-        results = _trials(problem, bare, rule, shortlist, notes, seed + 1)
+        results = OnPlant(problem, bare, rule.allowed).walk(rule, shortlist, notes, seed + 1)
     candidates = {name: one.deformation for name, one in shortlist.items()}
     name = best(results) if try_them else "cautious" if "cautious" in candidates else None
     if try_them and not results:
         why = "the loop refuses every candidate"
     elif try_them and name is None:
-        bearing = "" if all(one.bears for one in results.values()) else f", and bore {_MARGIN:g} times its gain"
+        bearing = "" if all(one.bears for one in results.values()) else f", and bore {MARGIN:g} times its gain"
         why = f"in trials on the plant no candidate made the error clearly less, and that of no coordinate larger{bearing}"
     elif candidates and name is None:
         why = "no candidate bears twice the gain, which one that is not tried has to"
@@ -182,76 +179,6 @@ def probe(
         why = f"{name}{tests}"
     chosen = None if name is None else candidates[name]
     return _answer(problem, estimates, chosen, why, results, candidates, estimated, notes)
-
-
-def _trials(
-    problem: Problem, bare: Controller, rule: Rule, shortlist: dict[str, Predicted], notes: list[str], seed: int
-) -> dict[str, Trial]:
-    """Trials of the shortlist, then of the shares beside the best one, which are added to it, until there are none.
-
-    The best one is run with other seeds too, and counts with its largest errors: what rings at times may have been lucky.
-    """
-    results: dict[str, Trial] = {}
-    new, proven, again = dict(shortlist), set(), set()
-    while True:
-        deformations = {name: one.deformation for name, one in new.items()}
-        outcomes = tried(problem, bare, deformations, seed=seed, allowed=rule.allowed) if new else {}
-        notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
-        results |= {name: one for name, one in outcomes.items() if isinstance(one, Trial)}
-        name, new = best(results), {}
-        if name is None:
-            return results
-        chosen = shortlist[name]
-        if _walked(name) and name not in proven:  # before a larger share is tried
-            proven.add(name)
-            if not _bears_more(problem, bare, chosen.deformation, results[name], seed):
-                notes.append(f"{name} is not kept: on the plant it does not bear {_MARGIN:g} times its gain")
-                lost = [n for n in results if _walked(n) and shortlist[n].setting.is_larger(chosen.setting)]
-                results |= {n: replace(results[n], bears=False) for n in (name, *lost)}
-            continue
-        known = [one.deformation for one in shortlist.values()]
-        beside = rule.beside(chosen, shortlist.values())
-        titled = {f"{name.partition(',')[0]}{_SHARE}{share:g}": one for share, one in beside.items()}
-        new = {title: one for title, one in titled.items() if one.deformation not in known}
-        shortlist |= new
-        if not new and name in again:
-            return results
-        if not new:
-            again.add(name)
-            results[name] = _with_other_seeds(problem, bare, rule, {name: chosen.deformation}, results[name], seed)
-
-
-def _with_other_seeds(
-    problem: Problem, bare: Controller, rule: Rule, chosen: Mapping[str, Deformation], first: Trial, seed: int
-) -> Trial:
-    """The largest errors of a trial of one candidate, and of two with other seeds."""
-    trials = [first]
-    for other in range(seed + 1, seed + _SEEDS):
-        (one,) = tried(problem, bare, chosen, seed=other, allowed=rule.allowed).values()
-        if not isinstance(one, Trial) or one == first:  # nothing is random
-            break
-        trials.append(one)
-    error, worst = max(one.error for one in trials), max(one.worst for one in trials)
-    return replace(first, error=error, worst=worst, calm=all(one.calm for one in trials))
-
-
-def _walked(name: str) -> bool:
-    """Whether a candidate is there because of trials: prediction has not shown that it bears a larger gain."""
-    return name.startswith(DARING) or _SHARE in name
-
-
-def _bears_more(problem: Problem, bare: Controller, chosen: Deformation, own: Trial, seed: int) -> bool:
-    """Whether trials with a larger gain pass, and have no error that is much larger: else the limit is near."""
-    louder = chosen.with_effective_gain(_MARGIN * chosen.effective_gain())
-    before: Trial | str = ""
-    for other in range(seed, seed + _SEEDS):
-        outcome = tried(problem, bare, {"": louder}, seed=other)[""]
-        if not isinstance(outcome, Trial) or not outcome.passes or outcome.error > _LARGER * own.error:
-            return False
-        if outcome == before:  # nothing is random
-            break
-        before = outcome
-    return True
 
 
 def _recorded(
@@ -333,66 +260,3 @@ def _check(
 
 def _interval(one: Interval) -> str:
     return number(one.value) if one.certain else f"{number(one.value)} ({number(one.low)} to {number(one.high)})"
-
-
-LONGEST = 2000  # cycles
-_WORSE = 1.03  # largest ratio of any coordinate's error to that of the controller alone
-_WORTH = 0.95
-_MARGIN = 1.4  # times its gain that a candidate which prediction has not shown to be safe has to bear in a trial
-_LARGER = 1.5  # ratio of its errors with that gain and with its own
-_SHARE = ", share "
-_SEEDS = 3  # of the trials of the best candidate
-_DARED = 0.9  # ratio of errors, from which a candidate that is stable at the estimate alone is kept
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A run on the plant."""
-
-    error: float  # rms error over that of the controller alone, in the mean over the coordinates
-    worst: float  # of any coordinate
-    bears: bool = True  # False where a run with a larger gain, which a daring candidate has to bear, does not pass
-    calm: bool = True  # whether the steps of its commands are within what is allowed
-
-    @property
-    def passes(self) -> bool:
-        """Whether it makes the error clearly less, and that of no coordinate more, is calm, and bears what it has to."""
-        return self.error <= _WORTH and self.worst <= _WORSE and self.bears and self.calm
-
-
-def tried(
-    problem: Problem,
-    controller: Controller,
-    candidates: Mapping[str, Deformation],
-    *,
-    seed: int,
-    allowed: Callable[[Run], np.ndarray] | None = None,
-) -> dict[str, Trial | str]:
-    """Return the trial of every candidate, beside one of the controller alone; of one that the loop refuses, the reason.
-
-    Args:
-        allowed: function of the run of the controller alone -> largest rms step of every input; None: any.
-    """
-    short, bare, names = shortened(problem, LONGEST), without_deformation(controller), weighed(problem, controller)
-
-    def run(one: Controller) -> Run:
-        return simulator(short, one, compiled=False).run(seed=seed)
-
-    def trial(deformation: Deformation) -> Trial | str:
-        try:
-            again = run(bare.with_deformation(deformation))
-        except FpirhcError as error:
-            return str(error)
-        pair = errors_of(short, (alone, again), names)
-        calm = allowed is None or bool((steps_of(again) <= allowed(alone)).all())
-        return Trial(mean_ratio(short, alone, again, names), max(pair.ratio(n) for n in pair.without), calm=calm)
-
-    alone = run(bare)
-    return {name: trial(deformation) for name, deformation in candidates.items()}
-
-
-def best(trials: Mapping[str, Trial]) -> str | None:
-    """Return the name of the best trial that passes, a daring one where it is clearly better; None where none does."""
-    factors = {name: 1 / _DARED if name.startswith(DARING) else 1.0 for name in trials}
-    passing = {name: factors[name] * one.error for name, one in trials.items() if one.passes}
-    return min(passing, key=lambda name: passing[name]) if passing else None

@@ -14,11 +14,10 @@ from bodies import PERIOD, RHC, body_problem
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
-from fpirhc.probing import probe as probing
 from fpirhc.probing.identification import Channel, delayed, identify
-from fpirhc.probing.probe import Trial, best, tried
 from fpirhc.probing.recording import excited, sequence
-from fpirhc.probing.rule import Rule, _between
+from fpirhc.probing.rule import Predicted, Rule, _between
+from fpirhc.probing.trials import OnPlant, Trial, best
 
 KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (1.0, 0, 0.0, 0.05),
@@ -172,7 +171,7 @@ def test_inputs_that_are_exchanged_are_refused():
 def test_trials_keep_none_that_is_worse():
     """A gain far beyond the limit is tried, fails, and nothing is kept; nor is one that makes one coordinate worse."""
     problem = replace(body_problem(1.0, 3, 0.0, 0.05), duration=3.0)
-    wild = tried(problem, RHC, {"wild": fp.ModelReferenced(fp.Affine(gain=-1.2))}, seed=1)["wild"]
+    wild = OnPlant(problem, RHC).trial(fp.ModelReferenced(fp.Affine(gain=-1.2)), 1)
     assert isinstance(wild, Trial)
     assert wild.error > 1
     assert best({"wild": wild}) is None
@@ -187,7 +186,7 @@ def test_a_daring_candidate_that_bears_no_more_gain_is_told_as_such(monkeypatch)
     """It passes, but not with 1.4 times its gain: its trial is shown, and nobody says that the loop refuses it."""
     shortlist = Rule.shortlist
     monkeypatch.setattr(Rule, "shortlist", lambda rule: {"daring": next(iter(shortlist(rule).values()))})
-    monkeypatch.setattr(probing, "tried", lambda *given, **_: {n: Trial(0.5 if n else 1.5, 1.0) for n in given[2]})
+    monkeypatch.setattr(OnPlant, "trial", lambda *_, loud=False: Trial(1.5 if loud else 0.5, 1.0))
     found = fp.probe(body_problem(1.0, 0, 0.0, 0.05), RHC, cycles=100)
     assert found.deformation is None
     assert "bore 1.4 times its gain" in found.why
@@ -207,19 +206,29 @@ def test_shares_between_two_that_are_tried_are_finer_towards_the_larger_one():
 def test_a_lucky_trial_counts_with_its_worst_seed(monkeypatch):
     """What rings with one seed and not with another: a choice by one trial would be the one that was lucky."""
     shortlist = Rule.shortlist
-    monkeypatch.setattr(
-        Rule, "shortlist", lambda rule: dict(zip(("lucky", "steady"), shortlist(rule).values(), strict=False))
-    )
-    errors = {"lucky": {1: 0.1, 2: 0.1, 3: 0.8}, "steady": dict.fromkeys((1, 2, 3), 0.3)}
+    lucky: list[Deformation] = []
+
+    def two(rule: Rule) -> dict[str, Predicted]:
+        first, second, *_ = shortlist(rule).values()
+        lucky.append(first.deformation)
+        return {"lucky": first, "steady": second}
+
+    def trial(_: OnPlant, deformation: Deformation, seed: int) -> Trial:
+        error = {1: 0.1, 2: 0.1, 3: 0.8}[seed] if deformation in lucky else 0.3
+        return Trial(error, error)
+
+    monkeypatch.setattr(Rule, "shortlist", two)
     monkeypatch.setattr(Rule, "beside", lambda *_: {})
-    monkeypatch.setattr(
-        probing,
-        "tried",
-        lambda *given, seed, **_: {n: Trial(errors[n][seed], errors[n][seed] + seed / 100) for n in given[2]},
-    )
+    monkeypatch.setattr(OnPlant, "trial", trial)
     found = fp.probe(body_problem(1.0, 0, 0.0, 0.05), RHC, cycles=100)
     assert found.why.startswith("steady")
     assert found.trials["lucky"].error == 0.8
+
+
+@pytest.mark.parametrize(("noise", "runs"), [(0.0, 1), (0.05, 3)])
+def test_other_seeds_are_tried_where_they_change_a_run(noise, runs):
+    plant = OnPlant(replace(body_problem(1.0, 0, 0.0, noise), duration=0.5, measure_from=0.0), RHC)
+    assert len(plant._seeds(1)) == runs
 
 
 def test_no_neighbour_of_the_choice_is_better():
@@ -231,7 +240,8 @@ def test_no_neighbour_of_the_choice_is_better():
     assert found.deformation is not None
     gain = found.deformation.effective_gain()
     others = {f"{f:g}": found.deformation.with_effective_gain(f * gain) for f in (0.6, 1.6)}
-    outcomes = tried(task.problem, controller, {"chosen": found.deformation, **others}, seed=1)
+    plant = OnPlant(task.problem, controller)
+    outcomes = {name: plant.trial(one, 1) for name, one in {"chosen": found.deformation, **others}.items()}
     errors = {name: one.error for name, one in outcomes.items() if isinstance(one, Trial)}
     assert len(errors) == 3
     assert errors["chosen"] == min(errors.values())
@@ -334,9 +344,9 @@ def test_a_candidate_that_the_loop_refuses_is_not_tried_and_the_others_are():
     controller = next(iter(task.controllers.values()))
     fast = fp.ModelReferenced(map=fp.Filtered(map=fp.Affine(gain=-0.991), pole=0.75))
     slow = fp.ModelReferenced(map=fp.Filtered(map=fp.Affine(gain=-0.1), pole=0.75))
-    outcomes = tried(task.problem, controller, {"fast": fast, "slow": slow}, seed=0)
-    assert "use 0 < |gain| < 0.413" in str(outcomes["fast"])
-    assert isinstance(outcomes["slow"], Trial)
+    plant = OnPlant(task.problem, controller)
+    assert "use 0 < |gain| < 0.413" in str(plant.trial(fast, 0))
+    assert isinstance(plant.trial(slow, 0), Trial)
 
 
 def test_a_sign_that_is_not_certain_is_asked_again_louder(monkeypatch):
@@ -360,8 +370,9 @@ def test_coupled_bodies_are_offered_a_gain_matrix():
     for one in weighted.values():
         product = np.array(one.iteration.weights) @ np.array([[0.8, 0.6], [0.5, 0.7]])
         assert product == pytest.approx(np.eye(2), abs=0.15)
-    hand = {str(g): fp.ModelReferenced(fp.Affine(gain=-2 * g / 1.3)) for g in (0.15, 0.3, 0.6, 0.9)}
-    single = [one.error for one in tried(problem, RHC, hand, seed=1).values() if isinstance(one, Trial)]
+    hand = [fp.ModelReferenced(fp.Affine(gain=-2 * g / 1.3)) for g in (0.15, 0.3, 0.6, 0.9)]
+    plant = OnPlant(problem, RHC)
+    single = [one.error for one in (plant.trial(h, 1) for h in hand) if isinstance(one, Trial)]
     assert min(found.trials[name].error for name in weighted) <= min(single)
 
 
