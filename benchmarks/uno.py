@@ -19,22 +19,33 @@ _MAIN = """
 #include "@name@.h"
 static const float SAMPLES[][@inputs@] PROGMEM = {@rows@};
 static @name@_controller c;
+static volatile unsigned turns; /* of the counter, which has 16 bits */
+ISR(TIMER1_OVF_vect) { ++turns; }
+static unsigned long now(void) {
+  unsigned long at;
+  cli();
+  at = TCNT1;
+  if (TIFR1 & 1 << TOV1 && at < 0x8000) at += 0x10000;
+  at += (unsigned long)turns << 16;
+  sei();
+  return at;
+}
 static int put(char one, FILE* to) { (void)to; while (!(UCSR0A & 1 << UDRE0)) {} UDR0 = one; return 0; }
 static FILE out = FDEV_SETUP_STREAM(put, 0, _FDEV_SETUP_WRITE);
 int main(void) {
   unsigned k, j;
-  UCSR0B = 1 << TXEN0, TCCR1B = 2; /* clocks in eights */
+  UCSR0B = 1 << TXEN0, TCCR1B = 2, TIMSK1 = 1 << TOIE1; /* clocks in eights */
   stdout = &out;
   @name@_init(&c);
   for (k = 0; k < sizeof SAMPLES / sizeof *SAMPLES; ++k) {
     @name@_inputs in;
     @name@_command command;
-    unsigned took;
+    unsigned long took;
     memcpy_P(&in, SAMPLES[k], sizeof in);
-    TCNT1 = 0;
+    took = now();
     @name@_step(&c, &in, &command);
-    took = TCNT1;
-    printf("= %u", took);
+    took = now() - took;
+    printf("= %lu", took);
     for (j = 0; j < sizeof command / sizeof(float); ++j) printf(" %08lx", ((unsigned long*)&command)[j]);
     printf("\\n");
   }
