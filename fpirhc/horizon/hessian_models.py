@@ -187,14 +187,21 @@ def _named(edges: _Edges, values: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
     slopes = ca.cse(ca.vertcat(*(edges[n][place] for n, place in places), *values))
     partials, symbols = list[ca.SX](), dict[int, ca.SX]()
     for (n, place), slope in zip(places, ca.vertsplit(slopes[: len(places)]) if places else [], strict=True):
-        key = slope.element_hash()
+        half = _half(slope)  # twice a number costs less than to keep both
+        key = half.element_hash()
         if key not in symbols:
             symbols[key] = ca.SX.sym(f"m{len(partials)}")
-            partials.append(slope)
-        edges[n][place] = symbols[key]
+            partials.append(half)
+        edges[n][place] = symbols[key] if half is slope else 2 * symbols[key]
     if not partials:  # linear: a column must have an entry
         return ca.SX(0.0), ca.SX.sym("m")
     return ca.vertcat(*partials), ca.vertcat(*symbols.values())
+
+
+def _half(slope: ca.SX) -> ca.SX:
+    """X of a slope 2 x, as that of a square is; else the slope itself."""
+    twice = not slope.is_constant() and slope.is_op(ca.OP_TWICE)
+    return slope.dep(0) if twice else slope
 
 
 def _pulled(edges: _Edges, ends: list[int], weights: ca.SX, count: int) -> ca.SX:

@@ -13,12 +13,15 @@ typedef struct {
 typedef struct {
   Plan plans[2];
   casadi_real v[N * NU], k[N * NU * NS];
-  casadi_real partials[N * NM], lambda[(N + 1) * NS], final[NS * NS];
+  casadi_real partials[N * NM], lambda[COSTATES * NS], final[NS * NS];
   casadi_real envelope, reach, tau, gamma, resume;
 #ifdef SCALE_AT
   casadi_real metric[NU], first_gamma; /* settings are live: the scale and the first gamma are data of the call */
 #endif
 } Search;
+
+/* The costate of a node: that of the end stays, and of the others all or the last two. */
+#define COSTATE(i) (s->lambda + NS * (COSTATES > N ? (i) : (i) == N ? 2 : (i) & 1))
 
 typedef char search_fits[sizeof(Search) == ROOM * sizeof(casadi_real) ? 1 : -1];
 
@@ -71,10 +74,10 @@ INLINE Truth try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, I
   res[0] = &cost, res[1] = slope, res[2] = s->final;
   if (end(arg, res, 0, 0, 0)) return NO;
   plan->value += cost;
-  for (j = 0; j < NS; ++j) s->lambda[N * NS + j] = slope[j];
+  for (j = 0; j < NS; ++j) COSTATE(N)[j] = slope[j];
   for (i = N - 1; i >= 0; --i) {
-    arg[0] = s->partials + i * NM, arg[1] = s->lambda + (i + 1) * NS;
-    res[0] = s->lambda + i * NS, res[1] = plan->g + i * NU;
+    arg[0] = s->partials + i * NM, arg[1] = COSTATE(i + 1);
+    res[0] = COSTATE(i), res[1] = plan->g + i * NU;
     if (pull(arg, res, 0, 0, 0)) return NO;
   }
   return all_finite(&plan->value, 1) & all_finite(plan->g, N * NU) & all_finite(plan->x, (N + 1) * NS);
@@ -226,7 +229,7 @@ INLINE int direct(Search* s, const Plan* plan, Truth accepted, In data, In lower
   Out res[8];
   casadi_real p[NS * NS], lean[NS], wanted[N * NU], moved[N * NU];
   for (j = 0; j < NS * NS; ++j) p[j] = s->final[j];
-  for (j = 0; j < NS; ++j) lean[j] = s->lambda[N * NS + j];
+  for (j = 0; j < NS; ++j) lean[j] = COSTATE(N)[j];
   for (i = N - 1; i >= 0; --i) {
     casadi_real a[NS * NS], b[NS * NU], ls[NS], lu[NU];
     casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], turned[NS * NS], flat[NU * NS];
@@ -236,7 +239,7 @@ INLINE int direct(Search* s, const Plan* plan, Truth accepted, In data, In lower
     arg[0] = s->partials + i * NM;
     res[0] = a, res[1] = b, res[2] = ls, res[3] = lu;
     if (linearise(arg, res, 0, 0, 0)) return 1;
-    arg[0] = plan->x + i * NS, arg[1] = plan->u + i * NU, arg[2] = data + i * NT, arg[3] = s->lambda + (i + 1) * NS;
+    arg[0] = plan->x + i * NS, arg[1] = plan->u + i * NU, arg[2] = data + i * NT, arg[3] = COSTATE(i + 1);
     res[0] = q, res[1] = cross, res[2] = r;
     if (hessian(arg, res, 0, 0, 0)) return 1;
     condense(q, cross, r, p, a, b, turned);

@@ -112,15 +112,22 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[st
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     texts.insert(1, linearise)
-    constants = {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings), **stops}
-    return Driver("\n".join(texts), leaves, constants, _room(ocp), in_place=(4, 2))  # the memory
+    costates = _costates(ocp, leaves["hessian"])
+    constants = {**_sizes(ocp), "COSTATES": costates, **_metric(ocp), **_constants(ocp, settings), **stops}
+    return Driver("\n".join(texts), leaves, constants, _room(ocp, costates), in_place=(4, 2))  # the memory
 
 
-def _room(ocp: OptimalControl) -> int:
+def _costates(ocp: OptimalControl, hessian: ca.Function) -> int:
+    """Number of costates that stay: those of all nodes where second derivatives need them, else of the end and two others."""
+    needed = any(hessian.jac_sparsity(k, 3).nnz() for k in range(hessian.n_out()))
+    return ocp.stages + 1 if needed else min(ocp.stages + 1, 3)
+
+
+def _room(ocp: OptimalControl, costates: int) -> int:
     """Numbers of the struct Search of fixed_point.c."""
     nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
     plan = 2 * n * nu + (n + 1) * ns + 1
-    course = n * (nu + nu * ns + partial_count(ocp)) + (n + 1) * ns + ns * ns
+    course = n * (nu + nu * ns + partial_count(ocp)) + costates * ns + ns * ns
     return 2 * plan + course + 5 + (nu + 1 if ocp.settings else 0)
 
 
