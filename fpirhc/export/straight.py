@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from itertools import takewhile
 
 from fpirhc.export.choices import CHOICE, COMPARED, DIGITS, EVERY, NUMBER, POINTER, ROW, Graph
-from fpirhc.export.forms import FEW, Forms, Way
+from fpirhc.export.forms import Forms, Way
 
 _BODY = re.compile(
     r"(^static int \w+\([^{]*\{[^\n]*\n)((?:  casadi_real a\d[^;]*;\n)+)((?:  (?:a\d+=|if \(res\[)[^\n]*;\n)+)(?=  return 0;\n\})",
@@ -375,7 +375,7 @@ def _with_copies(body: str) -> str:
                 runs[-1] = indent, to, k, source, j, count + 1
                 continue
         for indent, to, k, source, j, count in runs:
-            if count >= FEW:
+            if count > 1:
                 lines.append(f"{indent}memcpy({to}+{k}, {source}+{j}, {count} * sizeof(casadi_real));\n")
             else:
                 lines += [f"{indent}{to}[{k + n}] = {source}[{j + n}];\n" for n in range(count)]

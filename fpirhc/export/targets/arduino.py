@@ -16,7 +16,7 @@ from pathlib import Path
 
 from fpirhc.errors import CompileError, InvalidValue, NotSupported
 from fpirhc.export.device import Device
-from fpirhc.export.target import Target
+from fpirhc.export.target import Target, device_of
 from fpirhc.export.targets.c import filled, layout_of, sources
 
 _FLAGS = ("-std=gnu99", "-Os", "-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections", "-fstack-usage")
@@ -63,13 +63,12 @@ class _Size:
 def _files(device: Device) -> Mapping[str, str | bytes]:
     if device.libm != "system":
         raise InvalidValue("the target arduino computes in float, and --libm own in double; leave --libm out")
-    own = {file: _NARROW * file.endswith(".c") + _in_float(text) for file, text in sources(device).items()}
+    own = _own(device)
     sizes = {board: size_on(own, device.name, board) for board in _BOARDS} if shutil.which("avr-gcc") else {}
-    lacking = {board.name: size.lacks(board) for board, size in sizes.items()}
+    lacking = _lacking(sizes)
     if sizes and all(lacking.values()):
         least = "; ".join(f"{board} lacks {what}" for board, what in lacking.items())
-        smaller = "fewer stages" if device.bare else "--bare, fewer stages"
-        raise NotSupported(f"'{device.title}' fits no board: {least}. Use {smaller}, or --to cortex-m")
+        raise NotSupported(f"'{device.title}' fits no board: {least}. Use {_smaller(device)}")
     sketch = filled(device, "arduino.ino", unit=device.problem.plant.time_unit)
     return {
         "library.properties": _properties(device),
@@ -78,6 +77,28 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         "layout.json": json.dumps(layout_of(device), indent=1),
         "sizes.txt": "".join(_line(board, size) for board, size in sizes.items()) or "avr-gcc is not installed\n",
     }
+
+
+def _own(device: Device) -> dict[str, str]:
+    return {file: _NARROW * file.endswith(".c") + _in_float(text) for file, text in sources(device).items()}
+
+
+def _lacking(sizes: Mapping[_Board, _Size]) -> dict[str, str]:
+    return {board.name: size.lacks(board) for board, size in sizes.items()}
+
+
+def _smaller(device: Device) -> str:
+    """What fits instead of a controller that fits no board; the one without its gate is tried."""
+    others = "fewer stages, or --to cortex-m"
+    if device.bare:
+        return others
+    bare = device_of(device.problem, device.controller, device.title, name=device.name, cycles=1, bare=True)
+    lacking = _lacking({board: size_on(_own(bare), bare.name, board) for board in _BOARDS})
+    fits = [board for board, lacks in lacking.items() if not lacks]
+    if fits:
+        return f"--bare, which fits the {fits[0]}, {others}"
+    board, lacks = list(lacking.items())[-1]
+    return f"{others}; with --bare the {board} still lacks {lacks}"
 
 
 TARGET = Target("arduino", "a library folder of the Arduino IDE, in float, with an example", _files, told="sizes.txt")
