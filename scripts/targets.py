@@ -172,8 +172,11 @@ def cortex_row(problem: str, title: str, states: Limited) -> list[str]:
     ]
     code, data = image.size(0), image.size(0x20000000)
     counts = emulated.counts
+    longest = int(np.argmax(counts))
+    tried = int(run["solve"][longest][3]) if "solve" in run.layout else 0
+    each = [f"{tried}", f"{counts[longest] / tried:.0f}"] if tried > 0 else ["", ""]
     return [_called(problem, title, states), f"{code / 1000:.0f}", f"{data / 1000:.0f}", f"{np.mean(counts):.0f}", f"{max(counts)}",
-            f"{apart:.1g}", *hashes]  # fmt: skip
+            *each, f"{apart:.1g}", *hashes]  # fmt: skip
 
 
 _REASONS = {
@@ -277,6 +280,8 @@ TABLES: dict[str, tuple[list[str], Callable[[], list[list[str]]]]] = {
             "data, kB",
             "instructions, mean",
             "most",
+            "iterations then",
+            "for each",
             "command",
             "commands in QEMU",
             "commands here",
