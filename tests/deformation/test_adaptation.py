@@ -11,6 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.deformation.wrappers.guarded import EVENTS
 from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.evaluate import Evaluator
 
 
 @cache
@@ -22,20 +23,38 @@ def stepping(deformation, size=1):
     return ca.Function("step", symbols, [ca.densify(request), ca.densify(layout.join(next_memory))]), layout
 
 
+class Scalar:
+    """A map of one coordinate with its memory, through buffers: thousands of cycles take no time."""
+
+    def __init__(self, deformation):
+        function, self.layout = stepping(deformation)
+        self._step = Evaluator(function)
+        self._step.arguments[3][:] = self.layout.start()
+
+    def __call__(self, *values):
+        """The next request, from request, response and desired response."""
+        for argument, value in zip(self._step.arguments, values, strict=False):
+            argument[0] = value
+        self._step.evaluate()
+        self._step.arguments[3][:] = self._step.results[1]
+        return float(self._step.results[0][0])
+
+    @property
+    def memory(self):
+        return self._step.results[1].copy()
+
+
 def run(deformation, plant, desired, noise=None):
     """Requests, true response errors and memories of the scalar loop f = plant(k, r)."""
-    step, layout = stepping(deformation)
-    memory, request = layout.start(), desired[0]
+    step, request = Scalar(deformation), float(desired[0])
     errors, requests, memories = [], [], []
     for k in range(1, len(desired)):
         response = plant(k, request)
         errors.append(response - desired[k])
-        measured = response + (noise[k] if noise is not None else 0.0)
-        request, memory = (v.full().ravel() for v in step(request, measured, desired[k], memory))
-        request = float(request[0])
+        request = step(request, response + (noise[k] if noise is not None else 0.0), desired[k])
         requests.append(request)
-        memories.append(memory)
-    return np.array(requests), np.array(errors), np.array(memories), layout
+        memories.append(step.memory)
+    return np.array(requests), np.array(errors), np.array(memories), step.layout
 
 
 CYCLES = 4500
@@ -182,11 +201,15 @@ def test_events_are_logged_in_a_run():
 
     problem = replace(task.problem, duration=2.0, measure_from=1.0)
     wild = fp.Sigmoid(gain=-30.0, scale=20.0)
-    run_ = fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Guarded(wild, 500.0)), seed=0)
+    run_ = fp.simulate(
+        problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Guarded(wild, 500.0)), seed=0, compiled=None
+    )
     assert run_.stop is None
     assert run_["adaptation_event"].max() > 0
     tuned = fp.Tuned(fp.Sigmoid(gain=-0.5), largest_gain=0.8)
-    calm = fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Guarded(tuned, 500.0)), seed=0)
+    calm = fp.simulate(
+        problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Guarded(tuned, 500.0)), seed=0, compiled=None
+    )
     assert not calm["adaptation_event"].any()
     assert calm["gain_factor"].max() > 1.0
     assert np.abs(calm["error"][1500:]).max() < 0.01

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from plants import linear, pendulum
-from test_adaptation import stepping
+from test_adaptation import Scalar
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
@@ -82,11 +82,9 @@ def test_uncertainty_still_finds_the_fixed_point():
 
 
 def _finds_the_fixed_point(deformation):
-    step, layout = stepping(deformation)
-    memory, requests = layout.start(), [1.0] * 8
+    step, requests = Scalar(deformation), [1.0] * 8
     for _ in range(600):
-        request, memory = step(requests[-1], 3 + 0.7 * requests[-1 - 5], 1.0, memory)
-        requests.append(float(request))
+        requests.append(step(requests[-1], 3 + 0.7 * requests[-1 - 5], 1.0))
     assert 3 + 0.7 * requests[-1] == pytest.approx(1.0, abs=1e-9)
 
 
@@ -132,11 +130,11 @@ def test_prediction_with_the_exact_model_undoes_the_dead_time():
         duration=1.5,
     )
     law = fp.ComputedTorque(fp.Exponential(rate=5.0, integral=False))
-    free = fp.simulate(problem, fp.ExactModel(law), seed=0)
+    free = fp.simulate(problem, fp.ExactModel(law), seed=0, compiled=None)
     for dead_time in (fp.DeadTime(inputs={"torque": 0.1}), fp.DeadTime(inputs={"torque": 0.06}, measurement=0.04)):
         late = replace(problem, dead_time=dead_time)
         predicted = fp.Predicted(law, inputs=dead_time.inputs["torque"], measurement=dead_time.measurement)
-        run = fp.simulate(late, fp.ExactModel(predicted), seed=0)
+        run = fp.simulate(late, fp.ExactModel(predicted), seed=0, compiled=None)
         measured_log = run["plant_state" if dead_time.measurement else "state"]
         shift = round(dead_time.inputs["torque"] / problem.period)
         np.testing.assert_allclose(measured_log[shift:], free["state"][:-shift], atol=2e-8)
@@ -166,7 +164,7 @@ LATE = replace(DUFFING.problem, duration=9.0, measure_from=4.0)  # 60 ms, rate x
 
 def rms_error(dead_time: float, controller: Controller) -> float:
     problem = replace(LATE, dead_time=fp.DeadTime(inputs={"Q": dead_time}))
-    return fp.measure(problem, fp.simulate(problem, controller, seed=0)).rms_error["q"]
+    return fp.measure(problem, fp.simulate(problem, controller, seed=0, compiled=None)).rms_error["q"]
 
 
 def controllers(believed: float) -> dict[str, Controller]:
@@ -204,7 +202,9 @@ def test_misestimated_dead_time_degrades_gracefully(share):
     errors, moves = [], []
     for believed, uncertainty in ((0.06, 0), (share * 0.06, 18), (share * 0.06, 0)):
         deformation = fp.Increment(fp.Sigmoid(gain=-0.5), cycles=1e3 * believed, uncertainty=uncertainty)
-        run = fp.simulate(LATE, fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=believed), seed=0)
+        run = fp.simulate(
+            LATE, fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=believed), seed=0, compiled=None
+        )
         late = run.time >= LATE.measure_from
         errors.append(fp.measure(LATE, run).rms_error["q"])
         moves.append(np.abs(np.diff(run["command"][late, 0])).mean())
@@ -224,7 +224,9 @@ def test_receding_horizon_starts_where_its_command_acts():
         "late": (late, fp.ExactModel(rhc)),
         "predicted": (late, fp.ExactModel(fp.Predicted(rhc, inputs=0.1))),
     }
-    errors = {name: fp.measure(p, fp.simulate(p, c, seed=0)).rms_error["q"] for name, (p, c) in runs.items()}
+    errors = {
+        name: fp.measure(p, fp.simulate(p, c, seed=0, compiled=None)).rms_error["q"] for name, (p, c) in runs.items()
+    }
     assert errors["predicted"] < 2 * errors["free"] + 1e-3
     assert errors["late"] > 5 * errors["predicted"]
 
@@ -243,16 +245,14 @@ def test_bad_dead_times(dead_time, sentence):
 
 def with_unknown_delay(deformation, desired, delay, noise, seed=0):
     """Memories over the run of the scalar plant f = r + a slow disturbance, `delay` cycles late, with noise on the response."""
-    step, layout = stepping(deformation)
+    step, requests, errors, memories = Scalar(deformation), [0.0] * (delay + 1), [], []
     white = noise * np.random.default_rng(seed).standard_normal(len(desired))
-    memory, requests, errors, memories = layout.start(), [0.0] * (delay + 1), [], []
     for k, wish in enumerate(desired):
         response = requests[-1 - delay] + 0.3 * np.sin(0.01 * k)
-        request, memory = (v.full().ravel() for v in step(requests[-1], response + white[k], wish, memory))
-        requests.append(float(request[0]))
+        requests.append(step(requests[-1], response + white[k], wish))
         errors.append(response - wish)
-        memories.append(memory)
-    return np.array(errors), {n: np.array(memories)[:, layout.slice(n)] for n in layout.names}
+        memories.append(step.memory)
+    return np.array(errors), {n: np.array(memories)[:, step.layout.slice(n)] for n in step.layout.names}
 
 
 CYCLES = np.arange(4000)
@@ -345,7 +345,11 @@ def test_shipped_problems_tell_what_helps(name):
     """With the same prediction FPI lowers the error; a controller that knows nothing of the dead time is the worst."""
     task = fp.load_problem(name)
     errors = {
-        c: [*fp.measure(task.problem, fp.simulate(task.problem, task.controllers[c], seed=0)).rms_error.values()][-1]
+        c: [
+            *fp.measure(
+                task.problem, fp.simulate(task.problem, task.controllers[c], seed=0, compiled=None)
+            ).rms_error.values()
+        ][-1]
         for c in ("RHC", "RHC+FPI", "RHC not predicting")
     }
     assert errors["RHC+FPI"] < 0.8 * errors["RHC"]

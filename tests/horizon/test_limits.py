@@ -16,6 +16,7 @@ from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.horizon.rollout import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Named
 from fpirhc.task.limits import Limit
 
@@ -255,15 +256,17 @@ def test_priced_limits_have_the_optimum_of_a_problem_with_slacks():
     ocp, data, first = priced(3.0)
     plan, n = fp.solve(ocp, FIXED, first, data), ocp.stages
 
-    def states(v):
-        return ca.DM(rollout(ocp)(first, v[:n][None], data)[0]).full()[1, 1:]
+    rolled = Evaluator(rollout(ocp))
 
-    rows = {"type": "ineq", "fun": lambda v: np.concatenate([states(v) + 0.5 + v[n:], 0.5 + v[n:] - states(v), v[n:]])}
+    def room(v):
+        speeds = rolled(first, v[:n, None], data.T)[0][1:, 1]
+        return np.concatenate([speeds + 0.5 + v[n:], 0.5 + v[n:] - speeds, v[n:]])
+
     total = minimize(
-        lambda v: float(rollout(ocp)(first, v[:n][None], data)[1]) + 3.0 * ocp.step * v[n:].sum(),
+        lambda v: rolled(first, v[:n, None], data.T)[1].item() + 3.0 * ocp.step * v[n:].sum(),
         np.concatenate([plan.inputs[0] + 0.1, np.ones(n)]),
         method="SLSQP",
-        constraints=rows,
+        constraints={"type": "ineq", "fun": room},
         options={"ftol": 1e-12, "maxiter": 500},
     )
     assert known(plan.cost) + plan.slacks()["angle'"] == pytest.approx(total.fun, rel=1e-5)

@@ -106,7 +106,7 @@ def test_every_plan_is_that_of_an_independent_program_at_its_own_time(replan, ra
     problem = task(replan, limits=limits, cost=cost)
     assert problem.horizon is not None
     problem = replace(problem, horizon=replace(problem.horizon, lengths=lengths))
-    run = fp.simulate(problem, planning(), seed=0)
+    run = fp.simulate(problem, planning(), seed=0, compiled=None)
     every = cycles_per_plan(problem.horizon, PERIOD)
     assert every == {"stage": 4, "cycle": 1, 3: 3}[replan]
     command, states = run["command"][:, 0], run["state"]
@@ -121,10 +121,10 @@ def test_every_plan_is_that_of_an_independent_program_at_its_own_time(replan, ra
 def test_a_plan_at_a_boundary_of_stages_is_that_of_a_plan_per_stage():
     """Plans that are solved do not depend on how they were warm started: the same state and time give the same plan."""
     each, per_stage = (planning(fp.FixedPoint(iterations=30, tolerance=1e-10)) for _ in range(2))
-    one = fp.simulate(task("stage"), per_stage, seed=0)
-    later = fp.simulate(task("cycle"), each, seed=0)
+    one = fp.simulate(task("stage"), per_stage, seed=0, compiled=None)
+    later = fp.simulate(task("cycle"), each, seed=0, compiled=None)
     assert later["command"][0] == pytest.approx(one["command"][0], abs=1e-9)
-    again = fp.simulate(task(4), each, seed=0)
+    again = fp.simulate(task(4), each, seed=0, compiled=None)
     np.testing.assert_array_equal(again["command"], one["command"])
 
 
@@ -132,7 +132,7 @@ def test_a_plan_at_a_boundary_of_stages_is_that_of_a_plan_per_stage():
 def test_a_limited_rate_holds_from_cycle_to_cycle(fastest):
     rates = {"torque": (-fastest, fastest)} if np.isfinite(fastest) else {}
     limits = fp.Limits(inputs={"torque": (-6.0, 6.0)}, rates=rates)
-    run = fp.simulate(task(limits=limits), planning(), seed=0)
+    run = fp.simulate(task(limits=limits), planning(), seed=0, compiled=None)
     largest = np.abs(np.diff(run["command"][:, 0])).max() / PERIOD
     assert largest <= 1.001 * FASTEST if rates else largest > 2 * FASTEST
 
@@ -224,15 +224,15 @@ def test_stages_of_a_map_are_whole_steps():
 @pytest.mark.parametrize("name", sorted(OPTIMISERS.keys() - {"full space"}))  # which needs thousands of iterations
 def test_every_optimiser_follows_the_same_plans(name):
     problem = task(limits=fp.Limits())
-    expected = fp.simulate(problem, planning(), seed=0)["command"]
-    found = fp.simulate(problem, planning(OPTIMISERS[name]), seed=0)["command"]
+    expected = fp.simulate(problem, planning(), seed=0, compiled=None)["command"]
+    found = fp.simulate(problem, planning(OPTIMISERS[name]), seed=0, compiled=None)["command"]
     np.testing.assert_allclose(found, expected, atol=2e-2)
 
 
 def test_on_an_exact_model_one_iteration_from_the_interpolated_plan_is_as_good_as_a_solved_plan():
     problem = task(mass=1.0, believed=1.0)
-    solved = fp.simulate(problem, planning(), seed=0)["command"]
-    one = fp.simulate(problem, planning(fp.FixedPoint(iterations=1, tolerance=1e-6)), seed=0)["command"]
+    solved = fp.simulate(problem, planning(), seed=0, compiled=None)["command"]
+    one = fp.simulate(problem, planning(fp.FixedPoint(iterations=1, tolerance=1e-6)), seed=0, compiled=None)["command"]
     np.testing.assert_allclose(one, solved, atol=1e-3)
 
 
@@ -313,7 +313,7 @@ def test_a_run_has_its_cost_per_cycle_whatever_the_stages_are():
     """The signal is the stage cost over one cycle at the states that were reached, whose rate no length of a stage changes."""
     horizons = fp.Horizon(STAGES, STEP, replan="cycle", lengths=GROWING), fp.Horizon(STAGES, STEP)
     for horizon in horizons:
-        run = fp.simulate(task(horizon=horizon), planning(), seed=0)
+        run = fp.simulate(task(horizon=horizon), planning(), seed=0, compiled=None)
         angle, rate = run["state"].T
         q, v = 0.6 * np.sin(1.5 * run.time), 0.9 * np.cos(1.5 * run.time)
         expected = WEIGHTS["angle"] * (angle - q) ** 2 + WEIGHTS["angle'"] * (rate - v) ** 2

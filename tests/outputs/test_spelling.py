@@ -192,9 +192,8 @@ REPLANNING = {
 
 @pytest.mark.parametrize("way", REPLANNING)
 @pytest.mark.parametrize("name", PLANTS)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_adaptive_plans_on_a_plant_are_those_on_the_plant_in_its_outputs(name: str, seed: int, way: str) -> None:
-    wrong = np.random.default_rng(seed).uniform(0.6, 1.6, 3)
+def test_adaptive_plans_on_a_plant_are_those_on_the_plant_in_its_outputs(name: str, way: str) -> None:
+    wrong = np.random.default_rng(1).uniform(0.6, 1.6, 3)
     run = agree(*both(PLANTS[name](wrong)), fp.RecedingHorizon(OPTIMISER, WHOLE, REPLANNING[way]))
     assert np.abs(run["command_shift"]).max() > 0.1
 

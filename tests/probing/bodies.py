@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import casadi as ca
 import numpy as np
 
 import fpirhc as fp
+from fpirhc.symbolic.evaluate import Evaluator
 
 PERIOD = 1e-2
 RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2))
@@ -25,18 +27,31 @@ class Body:
     def reset(self, seed: int) -> np.ndarray:
         n = len(self.gains)
         self.random, self.queue = np.random.default_rng(seed), [np.zeros(n)] * self.dead
-        self.q, self.v, self.acting = np.zeros(n), np.zeros(n), np.zeros(n)
+        self.moving = Evaluator(cycle(tuple(map(tuple, self.gains)), self.lag))
         return np.zeros(3 * n)
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
         self.queue.append(command)
-        now, h = self.queue.pop(0), PERIOD / 10
-        for i in range(10):
-            self.acting = now + (self.acting - now) * (np.exp(-h / self.lag) if self.lag else 0.0)
-            push = np.sin(1.3 * (time + i * h) + np.arange(len(now)))
-            a = self.gains @ self.acting - 0.5 * self.v - 2 * np.sin(self.q) + push
-            self.q, self.v = self.q + h * self.v + h * h / 2 * a, self.v + h * a
-        return np.concatenate([self.q, self.v, a + self.noise * self.random.standard_normal(len(a))])
+        (now, moving, acting), (moved, response) = self.moving.arguments, self.moving.results
+        now[:], acting[:] = time, self.queue.pop(0)
+        self.moving.evaluate()
+        moving[:] = moved
+        noise = self.noise * self.random.standard_normal(len(response))
+        return np.concatenate([moved[: 2 * len(response)], response + noise])
+
+
+@cache
+def cycle(gains: tuple[tuple[float, ...], ...], lag: float) -> ca.Function:
+    """Function (time, [q, v, acting command], command) -> (the same a cycle later, response), in ten steps."""
+    n, h = len(gains), PERIOD / 10
+    time, moving, now = ca.SX.sym("t"), ca.SX.sym("x", 3 * n), ca.SX.sym("u", n)
+    q, v, acting = ca.vertsplit(moving, n)
+    for i in range(10):
+        acting = now + (acting - now) * (np.exp(-h / lag) if lag else 0.0)
+        push = ca.sin(1.3 * (time + i * h) + np.arange(n))
+        a = ca.mtimes(ca.DM(gains), acting) - 0.5 * v - 2 * ca.sin(q) + push
+        q, v = q + h * v + h * h / 2 * a, v + h * a
+    return ca.Function("cycle", [time, moving, now], [ca.vertcat(q, v, acting), a])
 
 
 def body_problem(gains: float | list[list[float]], dead: int = 0, lag: float = 0.0, noise: float = 0.0) -> fp.Problem:

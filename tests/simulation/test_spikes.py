@@ -19,6 +19,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.path import true_response
+from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.tracking.base import Tracking
 
 PROBLEM = replace(two_masses(), duration=6.0)
@@ -75,16 +76,17 @@ def _wide() -> dict[str, tuple[float, float]]:
 
 def motion(stepper: fp.Stepper, spike: Spike | None, cycles: int) -> np.ndarray:
     """Positions of the two masses, shape (cycles, 2)."""
-    advance, response = PROBLEM.integrator.step(PLANT, PROBLEM.period), true_response(PROBLEM).function
-    assert response is not None
+    function = true_response(PROBLEM).function
+    assert function is not None
+    advance, response = Evaluator(PROBLEM.integrator.step(PLANT, PROBLEM.period)), Evaluator(function)
     memory, x, u, calm = stepper.start(), np.array(PROBLEM.start_state), np.zeros(2), np.zeros(2)
     positions = []
     for k in range(cycles):
-        sample = {"state": x, "realised": np.asarray(response(x, u, PLANT.exact, calm).full()).ravel()}
+        sample = {"state": x, "realised": response(x, u, PLANT.exact, calm)[0]}
         if spike is not None and k == spike.cycle:
             sample[spike.what] = np.full_like(sample[spike.what], spike.size)
         u, memory = stepper.step(k * PROBLEM.period, sample["state"], sample["realised"], memory)
-        x = np.asarray(advance(x, u, PLANT.exact, calm).full()).ravel()
+        (x,) = advance(x, u, PLANT.exact, calm)
         positions.append(x[:2])
     return np.array(positions)
 

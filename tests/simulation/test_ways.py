@@ -84,8 +84,8 @@ LONG = """
 from dataclasses import replace
 import fpirhc as fp
 task = fp.load_problem("two_mass")
-run = fp.simulate(replace(task.problem, duration=600.0), task.controllers["CTC+FPI (eq 6)"], seed=0)
-assert run.cycles == 600_000 and run.stop is None
+run = fp.simulate(replace(task.problem, duration=200.0), task.controllers["CTC+FPI (eq 6)"], seed=0)
+assert run.cycles == 200_000 and run.stop is None
 fp.measure(task.problem, run)
 # ru_maxrss would begin with the size of the process that started this one.
 print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
