@@ -1,4 +1,4 @@
-"""Three bodies that no rule of the probe was made on: a cart with a load that swings, a ship's heading, an oven.
+"""Five bodies that no rule of the probe was made on: a cart with a load that swings, a ship's heading, an oven, a fan, a tank.
 
 Each is a body outside behind a simple, wrong model, with an actuator of its own. `benchmarks/probing.py` runs them.
 """
@@ -105,6 +105,58 @@ class Oven:
         return np.array([self.air + 0.03 * self.random.standard_normal()])
 
 
+@dataclass
+class Fan:
+    """A fan at the end of a beam: thrust of its speed squared, a motor of 120 ms, a counterweight, a gust that comes and goes.
+
+    The model is a beam of .06 kg m^2 that the thrust turns. Measured are angle, rate and, with a noise of .2 rad/s^2, its change.
+    """
+
+    period: float = 2e-2
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Begin level and at rest, at the speed that carries the beam."""
+        self.random, self.angle, self.rate = np.random.default_rng(seed), 0.0, 0.0
+        self.speed = math.sqrt(1.2)  # of thrust 1 N
+        return np.zeros(3)
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Hold the command for a cycle."""
+        h, gust = self.period / FINER, 0.15 * math.sin(0.9 * time) * math.cos(0.37 * time)
+        for _ in range(FINER):
+            self.speed += h / 0.12 * (math.sqrt(max(float(command[0]), 0.0)) - self.speed)
+            moment = 0.4 * (self.speed**2 + gust) - 0.48 * math.cos(self.angle) - 0.25 * math.sin(self.angle)
+            change = (moment - 0.05 * self.rate - 0.02 * math.tanh(self.rate / 0.01)) / 0.085
+            self.rate += h * change
+            self.angle += h * self.rate
+        return np.array([self.angle, self.rate, change + 0.2 * self.random.standard_normal()])
+
+
+@dataclass
+class Tank:
+    """Water in a cone over a pipe of 3 s and a pump of 4 s, which somebody else drains too. The model is a cylinder.
+
+    The level is measured with a noise of .3 mm in steps of .1 mm.
+    """
+
+    period: float = 1.0
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Begin at .4 m."""
+        self.random, self.level, self.pumped, self.late = np.random.default_rng(seed), 0.4, 0.5, [0.5] * 3
+        return np.array([self.level])
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Hold the command for a cycle."""
+        self.late.append(min(max(float(command[0]), 0.0), 2.0))
+        asked, h, drained = self.late.pop(0), self.period / FINER, 0.1 if 150 < time < 260 else 0.0
+        for _ in range(FINER):
+            self.pumped += h / 4.0 * (asked - self.pumped)
+            area = math.pi * (0.08 + 0.15 * self.level) ** 2
+            self.level += h * 1e-3 * (self.pumped - 0.7 * math.sqrt(max(self.level, 0.0)) - drained) / area
+        return np.array([1e-4 * round(1e4 * (self.level + 3e-4 * self.random.standard_normal()))])
+
+
 def known(value: float, unit: str) -> fp.Parameter:
     """Return a parameter of a model whose plant is outside."""
     return fp.Parameter(value, value, unit)
@@ -178,5 +230,51 @@ def oven() -> fp.Problem:
     )
 
 
-BODIES: dict[str, Callable[[], fp.Problem]] = {"cart": cart, "ship": ship, "oven": oven}
+def fan() -> fp.Problem:
+    """Return the task to raise and to lower the beam by .3 rad in 5 s."""
+    plant = fp.Plant(
+        {"pitch": "rad"},
+        {"thrust": "N"},
+        {"J": known(0.06, "kg m^2"), "L": known(0.4, "m"), "weight": known(1.0, "N")},
+        lambda q, v, u, p: {"pitch": p.L * (u.thrust - p.weight) / p.J},
+    )
+    return fp.Problem(
+        plant=plant,
+        reality=fp.ExternalPlant(Fan(), measures=of_second_order("pitch", "rad")),
+        reference=fp.Trajectory(lambda t: {"pitch": 0.3 * ca.sin(2 * math.pi / 5 * t) ** 2}),
+        start={"pitch": 0.0},
+        period=2e-2,
+        duration=15.0,
+        measure_from=2.5,
+        limits=fp.Limits(inputs={"thrust": (0.0, 4.0)}),
+        horizon=fp.Horizon(stages=20, step=8e-2),
+        cost=fp.Quadratic(states={"pitch": 100.0, "pitch'": 5.0}, deviation={"thrust": 1.0}),
+    )
+
+
+def tank() -> fp.Problem:
+    """Return the task to swing about .5 m."""
+    plant = fp.Plant(
+        {"level": "m"},
+        {"flow": "l/s"},
+        {"A": known(0.07, "m^2"), "c": known(0.7, "l/s")},
+        lambda q, u, p: {"level": 1e-3 * (u.flow - p.c * ca.sqrt(ca.fmax(q.level, 1e-3))) / p.A},
+        order=1,
+    )
+    return fp.Problem(
+        plant=plant,
+        reality=fp.ExternalPlant(Tank(), measures={"level": "m"}),
+        sensing=fp.Sensing(estimator=fp.PositionDifference()),
+        reference=fp.Trajectory(lambda t: {"level": 0.4 + 0.1 * (1 - ca.cos(2 * math.pi / 120 * t))}),
+        start={"level": 0.4},
+        period=1.0,
+        duration=500.0,
+        measure_from=60.0,
+        limits=fp.Limits(inputs={"flow": (0.0, 2.0)}),
+        horizon=fp.Horizon(stages=20, step=4.0),
+        cost=fp.Quadratic(states={"level": 1e4}, deviation={"flow": 1.0}),
+    )
+
+
+BODIES: dict[str, Callable[[], fp.Problem]] = {"cart": cart, "ship": ship, "oven": oven, "fan": fan, "tank": tank}
 CONTROLLER = fp.RecedingHorizon(OPTIMISER)
