@@ -133,6 +133,7 @@ class Cases(Checked):
             matching |= new
         return tuple(name for name in self.names if name in matching)
 
+    @checked_call
     def problem(self, name: str, problem: Problem) -> Problem:
         """Return the problem in a case.
 

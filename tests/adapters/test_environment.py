@@ -75,3 +75,9 @@ def test_set_points_are_those_of_a_run():
         seen, *_ = env.step(command)
         assert np.array_equal(seen, [*state, *reference])
     assert np.ptp(run["reference"][:, 0]) > 0.1
+
+
+@pytest.mark.parametrize("seed", ["a", -1, 1.5, True])
+def test_a_wrong_seed_is_named_with_what_was_expected(seed):
+    with pytest.raises(fp.FpirhcError, match=r"reset\.seed: expected a whole number of at least 0 or None, got"):
+        as_env(task("two_link_arm")[0]).reset(seed=seed)

@@ -697,7 +697,7 @@ def test_a_plain_form_without_margins_is_told_of_a_form_that_has_them():
 )
 def test_a_form_that_leaves_a_right_model_alone_is_not_told_to_use_one(null, said):
     """Errors: 1 without adaptation, more with it; what it makes of a right model says whether the form is to blame."""
-    answer = _no_gain("", {"without": 1.0, "with": 1.2, "null": null}, elsewhere=False)
+    answer = _no_gain("", {"without": 1.0, "with": 1.2, "null": null})
     assert answer.verdict == "no"
     assert said in answer.change
 

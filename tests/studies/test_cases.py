@@ -420,6 +420,16 @@ def test_wrong_tables(wrong, task):
         fp.Cases.from_csv(written(text).resolve()).check(task.problem)
 
 
+def test_a_right_case_is_refused_beside_wrong_ones(task):
+    """Names are checked at the first use, whichever case it is of, and all mistakes are told together."""
+    cases = fp.Cases({"right": {}, "weak": {"exact.bb": 1.0}, "far": {"start.z": 0.1}})
+    with pytest.raises(InvalidProblem, match="2 mistakes") as error:
+        cases.problem("right", task.problem)
+    assert all(name in str(error.value) for name in ("'exact.bb'", "'start.z'"))
+    with pytest.raises(InvalidField, match="the values of 'name' and 'problem' are swapped"):
+        cases.problem(task.problem, "right")
+
+
 def test_all_mistakes_of_a_table_are_told_together(task):
     """A wrong column once, however many rows it has, and every wrong number."""
     text = "case,exact.c,exact.b\nweak,1,9\nstiff,1,-1\nfar,2,1\n"

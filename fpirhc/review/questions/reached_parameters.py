@@ -10,12 +10,14 @@ it counts is the change of the response,
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.by_run import by_run
 from fpirhc.review.grid import ReviewGrid, each, inner_places
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.task.problem import Problem
@@ -24,14 +26,13 @@ REACHED = "Does the deformation reach the wrong parameters?"
 
 
 def reaches_parameters(case: Case) -> Answer:
-    """Return which wrong parameters are in the controlled response, and which are not."""
+    """Return which wrong parameters are in the controlled response, and which are not; beside a reality two runs answer."""
     plant = case.problem.plant
     names = plant.parameter.elements
     wrong = _wrong(plant, case.believed)
     if not wrong and case.grid.elsewhere:
-        return Answer(
-            REACHED, Verdict.UNKNOWN, "what differs is the reality, and no parameter of the model's own plant"
-        )
+        runs = by_run(case, REACHED, "what differs is the reality, and no parameter of the model's own plant")
+        return runs if runs.verdict == Verdict.YES else replace(runs, verdict=Verdict.UNKNOWN)
     if not wrong:
         return Answer(REACHED, Verdict.YES, "every parameter of the model is right", "", {"wrong": 0.0, "reached": 0.0})
     present = _present(plant)

@@ -158,18 +158,16 @@ def pays(case: Case) -> Answer:
     if max(without, adapted) <= ROUNDING * nominal_size(nominal) and not case.grid.elsewhere:
         return Answer(PAYS, Verdict.UNKNOWN, f"{text}: there is no error to lower", "", numbers)
     if not adapted < without:
-        return _no_gain(text, numbers, elsewhere=case.grid.elsewhere)
+        why = "for the exact values of the model's own parameters, which move nothing beside a reality"
+        return by_run(case, PAYS, f"{text}, {why}") if case.grid.elsewhere else _no_gain(text, numbers)
     if null > _HARM * without:
         change = "Adaptation would do harm with a slightly better model: use a form that leaves a right model alone."
         return Answer(PAYS, Verdict.UNKNOWN, text, change, numbers)
     return Answer(PAYS, Verdict.YES, text, "", numbers)
 
 
-def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer:
+def _no_gain(text: str, numbers: dict[str, float]) -> Answer:
     """The answer where adaptation does not lower the predicted error."""
-    if elsewhere:
-        text += ", for the exact values of the model's own parameters, which move nothing beside a reality"
-        return Answer(PAYS, Verdict.UNKNOWN, text, "Run it and compare.", numbers)
     if numbers["null"] <= _HARM * numbers["without"]:
         change = "Leave the deformation out: it leaves a right model alone, so another form does not help."
     else:
