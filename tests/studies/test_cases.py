@@ -426,8 +426,9 @@ def test_a_right_case_is_refused_beside_wrong_ones(task):
     with pytest.raises(InvalidProblem, match="2 mistakes") as error:
         cases.problem("right", task.problem)
     assert all(name in str(error.value) for name in ("'exact.bb'", "'start.z'"))
+    name: Any = "right"
     with pytest.raises(InvalidField, match="the values of 'name' and 'problem' are swapped"):
-        cases.problem(task.problem, "right")
+        cases.problem(task.problem, name)
 
 
 def test_all_mistakes_of_a_table_are_told_together(task):
