@@ -451,5 +451,7 @@ def _check_finite(
         if not np.isfinite(value):
             hint = "" if cost.uses_rate else "; say CustomCost(rate=True) if it uses input_before"
             hint += "" if cost.uses_feedforward else "; say CustomCost(feedforward=True) if it uses feedforward"
+            if not np.isfinite(states).all():
+                hint = ": the states that would keep the outputs there grow without bound"
             mistakes.add(f"term '{name}' is {value} on the reference {where}{hint}")
     mistakes.raise_if_any()

@@ -91,7 +91,9 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     every = {k: points.at(k) for k in points.feasible(sought)}
     strongest = np.max([_fed_back(one) for one in every.values()], axis=0)
     places = tuple(k for k, one in every.items() if (_fed_back(one) >= _SMALL * strongest).all())
-    if not places or not (strongest.all() or all(points.asked.inside(points.quiet(k)) for k in places)):
+    # Commands on their way through a dead time are fed back even where the next one has no slope.
+    felt = bool(strongest.all()) and not any(grid.problem.dead_time.inputs.values())
+    if not places or not (felt or any(points.asked.inside(points.quiet(k)) for k in places)):
         raise NoAnswer("the command stands at a limit all along the reference")
     learns = controller.learns and points.asked.keeps_learned
     return Loops(places, tuple(every[k] for k in places), None, learns=learns)

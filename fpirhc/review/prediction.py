@@ -1,6 +1,6 @@
-"""The effect of adaptation on the response, predicted along the model's own run, and that run itself.
+"""The effect of adaptation on the response, predicted along the run of a right model, and that run itself.
 
-The model's run has no disturbances and no noise, so that every change by adaptation is harm. Theory: docs/theory-questions.md.
+This run has no disturbances and no noise, so that every change by adaptation is harm. Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fpirhc.errors import FpirhcError, NoAnswer
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import known_exactly, with_exact_parameters
 from fpirhc.plant.plant import Plant
-from fpirhc.review.grid import each
+from fpirhc.review.grid import each, inner_places
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.model_as_plant import ModelAsPlant, loop_of, shortened
 from fpirhc.simulation.run import Run
@@ -39,13 +39,14 @@ _CALL = 25  # cycles of the recursion in one call
 
 @dataclass(frozen=True, eq=False)
 class NominalRun:
-    """The model's own run, along which responses are predicted; build it with `nominal_run`."""
+    """The run of a right model, along which responses are predicted; build it with `nominal_run`."""
 
     problem: Problem  # the problem
     controller: Controller  # the controller, with its deformation
     states: np.ndarray  # states of the run, shape (cycles + 1, nx)
     desired: np.ndarray  # desired responses, shape (cycles, n)
     believed: np.ndarray  # parameters of the model, shape (np,)
+    of_model: tuple[np.ndarray, np.ndarray] | None = None  # the same where the model is the plant; None: those above
 
     @property
     def cycles(self) -> int:
@@ -55,7 +56,14 @@ class NominalRun:
     @cached_property
     def plant(self) -> Plant:
         """What moved, with its own parameters as the exact ones."""
-        return _own_plant(self.problem.plant, self.believed)
+        plant = self.problem.plant
+        return exactly(plant, self.believed) if self.of_model is None else known_exactly(plant)
+
+    @cached_property
+    def null(self) -> NominalRun:
+        """The run along which the model is the plant."""
+        states, desired = self.of_model or (self.states, self.desired)
+        return replace(self, states=states, desired=desired, of_model=None)
 
     @cached_property
     def right(self) -> Problem:
@@ -75,11 +83,6 @@ class NominalRun:
         return each(plant.equations.output, self.states, *rows)
 
 
-def _own_plant(plant: Plant, parameters: np.ndarray) -> Plant:
-    """What a nominal run moves: a model with these parameters, or the plant itself, whose outputs a model does not show."""
-    return known_exactly(plant) if plant.outputs else exactly(plant, parameters)
-
-
 @dataclass(frozen=True, eq=False)
 class ResponseErrors:
     """Predictions of the recursion along a nominal run, in units of the response."""
@@ -90,26 +93,37 @@ class ResponseErrors:
 
 
 def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = True) -> NominalRun:
-    """Return the run of the controller without its deformation on its own model, without disturbances and noise."""
+    """Return the run of the controller without its deformation and with a right model, without disturbances and noise.
 
-    def run() -> Run:
-        own = _own_plant(problem.plant, controller.plant_model(problem).parameters(problem.plant))
+    Where states move by themselves, or outputs are controlled, the plant runs under the controller that knows it: a wrong model
+    has them elsewhere. Else a right model moves alike, whichever it is, and the model runs as its own plant.
+    """
+
+    def run(own: Plant) -> Run:
         model = replace(problem, plant=own, disturbances={}, sensing=Sensing())
         return simulate(model, without_deformation(resolved(problem, controller)), seed=0, compiled=compiled)
 
     return nominal_of(problem, controller, run)
 
 
-def nominal_of(problem: Problem, controller: Controller, run: Callable[[], Run]) -> NominalRun:
-    """Return the nominal run from the run of the controller on its model, which is made where there is a prediction."""
+def nominal_of(problem: Problem, controller: Controller, run: Callable[[Plant], Run]) -> NominalRun:
+    """Return the nominal run from runs of the controller on plants that it knows, made where there is a prediction."""
     check_prediction(problem, controller)
     ready = resolved(problem, controller)
     ready.check(problem)
-    made = run()
-    if made.stop is not None or made.cycles < 2:
-        raise NoAnswer(f"no prediction: the model's own run ended early: {made.stop}")
     believed = ready.plant_model(problem).parameters(problem.plant)
-    return NominalRun(problem, ready, made["state"], made["desired"][:-1], believed)
+    of_model = _moved("the model's own run", run(exactly(problem.plant, believed)))
+    if not inner_places(problem):
+        return NominalRun(problem, ready, *of_model, believed)
+    own = _moved("the run with the right model", run(known_exactly(problem.plant)))
+    return NominalRun(problem, ready, *own, believed, of_model)
+
+
+def _moved(which: str, run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """States and desired responses of a run."""
+    if run.stop is not None or run.cycles < 2:
+        raise NoAnswer(f"no prediction: {which} ended early: {run.stop}")
+    return run["state"], run["desired"][:-1]
 
 
 def response_errors(
@@ -119,7 +133,7 @@ def response_errors(
 
     Args:
         deformation: the deformation; None: the controller's; Identity() is no adaptation.
-        exact: exact parameters, shape (np,); None: the plant's; the believed ones give the null run.
+        exact: exact parameters, shape (np,); None: the plant's.
     """
     map_ = nominal.controller.deformation if deformation is None else deformation
     parameters = nominal.problem.plant.exact if exact is None else np.asarray(exact, dtype=float)
@@ -152,6 +166,11 @@ def _errors(nominal: NominalRun, deformation: Deformation, exact: np.ndarray) ->
 def errors_without_adaptation(nominal: NominalRun) -> ResponseErrors:
     """Return the response errors of the controller without its deformation."""
     return response_errors(nominal, deformation=Identity())
+
+
+def null_errors(nominal: NominalRun) -> ResponseErrors:
+    """Return the response errors of the controller where the model is the plant, along its own run."""
+    return response_errors(nominal.null, exact=nominal.believed)
 
 
 def _recursion(nominal: NominalRun, deformation: Deformation) -> tuple[Composite, Evaluator]:
@@ -304,9 +323,9 @@ class NominalRuns:
     def _nominal(self, controller: Controller) -> NominalRun | str:
         problem = shortened(self.problem, CYCLES)
         try:
-            if problem.plant.outputs or not replace(problem.sensing, sensors={}).ideal:
+            if inner_places(problem) or not replace(problem.sensing, sensors={}).ideal:
                 return nominal_run(problem, controller, compiled=False)
-            return nominal_of(problem, controller, lambda: self.bare(controller))
+            return nominal_of(problem, controller, lambda _: self.bare(controller))
         except FpirhcError as error:
             return str(error)
 

@@ -110,6 +110,11 @@ class Case:
                 self._tried[name] = f"it cannot be tried ({error})"
         return self._tried[name]
 
+    def counted(self, deformation: Deformation) -> ErrorPair | None:
+        """Return the errors with a deformation on the plant where errors count; None where the run of `trial` shows them."""
+        trials = self.runs.trials(self.grid.real or self.problem, self.controller)
+        return None if self.grid.outside else trials.counted(self.controller.with_deformation(deformation))
+
     def harm(self, deformation: Deformation) -> str:
         """Return what runs on the plant and on the model show against a deformation, in a sentence; empty where it does no harm.
 

@@ -28,6 +28,7 @@ from fpirhc.review.prediction import (
     errors_without_adaptation,
     exactly,
     nominal_run,
+    null_errors,
     response_errors,
 )
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
@@ -132,7 +133,7 @@ def predict_response(
     nominal = nominal_run(problem, controller, compiled=compiled)
     adapted = response_errors(nominal)
     widest, reason = _widest(nominal, adapted, mismatch, seed)
-    null = response_errors(nominal, exact=nominal.believed)
+    null = null_errors(nominal)
     return Prediction(nominal, adapted, errors_without_adaptation(nominal), null, widest, reason)
 
 

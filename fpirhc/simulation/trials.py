@@ -219,6 +219,18 @@ class Trials:
             real = errors_of(self._later, (self._plain_later, loop.run(seed=0, variant=self._later)), names)
         return real, null
 
+    def counted(self, controller: Controller) -> ErrorPair | None:
+        """Return the errors on the plant where errors count, which a short run may not reach; None where it reaches them.
+
+        Raises:
+            FpirhcError: every error that the controller raises about the problem.
+        """
+        if self._later is None or not self.problem.equations_known:
+            return None
+        loop = loop_of(self.problem, controller)
+        runs = self._plain_later, loop.run(seed=0, variant=self._later)
+        return errors_of(self._later, runs, weighed(self.problem, loop.controller))
+
 
 CYCLES = 300  # of a run
 _REASONS: Latest[list[str]] = Latest(8)  # the same values run alike

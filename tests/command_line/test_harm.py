@@ -153,7 +153,7 @@ def test_review_puts_every_no_first_with_what_to_do(file, capsys):
     assert all(one["what"].endswith(".") for one in facts["to_do"])
     assert sum(line.startswith("  no      ") for line in lines) == 2 * len(wanted)
     [null] = [one["what"] for one in facts["to_do"] if "right model alone" in one["question"]]
-    assert null.startswith("The model-referenced form passes: rms error of y ")
+    assert null.startswith("The model-referenced form passes: in a run of at most 1000 cycles the rms error of y is ")
 
 
 def test_a_review_without_a_no_begins_with_its_answers(file, capsys):

@@ -732,3 +732,23 @@ def test_a_simulator_of_somebody_else_is_recommended_no_gain():
     )
     assert one.change == "fpirhc probe measures them and recommends a gain."
     assert math.isnan(one.numbers["recommended"])
+
+
+def test_a_form_is_not_changed_for_errors_of_the_start():
+    """The first second speaks for the model-referenced form of van_der_pol; from 3 s on it is five times worse."""
+    task = fp.load_problem("van_der_pol")
+    one = asked(task.problem, task.controllers["RHC+FPI"], "form of the iteration")
+    assert one.verdict == "yes"
+    own, other = (
+        float(words.split()[0]) for words in one.evidence.split("rms error of q is ")[1].split(" m as it is, ")
+    )
+    assert other > 2 * own
+    assert "in at most 1000 cycles in which errors count" in one.evidence
+
+
+def test_a_command_at_a_limit_has_no_margins_behind_a_dead_time():
+    """A PID law whose integral is empty asks for less than the pump's least target; commands on their way hide nothing of it."""
+    task = fp.load_problem("anaesthesia_people")
+    one = asked(task.problem, task.controllers["PID"], "enough margin")
+    assert one.verdict == "unknown"
+    assert "the command stands at a limit all along the reference" in one.evidence

@@ -541,6 +541,11 @@ def test_commands_at_their_limits_are_a_cause_from_a_fifth_of_the_cycles_on():
     assert with_limits(0.9, 0.5, reference=np.arange(CYCLES) / CYCLES) == (
         f"{head}50 %): both swing to and fro where the reference does not. Mend the loop without adaptation first; see its review."
     )
+    alone = entry("RHC", measured={"at_limit": {"": 0.5}}, reference=np.arange(CYCLES) / CYCLES)
+    ramp = {"reference": np.arange(CYCLES) / CYCLES, "command": np.arange(CYCLES)}
+    assert no_difference(plain=alone, measured={"at_limit": {"": 0.9}}, **ramp) == (
+        f"{head}50 %): RHC swings to and fro where the reference does not. Mend the loop without adaptation first; see its review."
+    )
     assert with_limits(0.9, 0.5, reference=np.full(CYCLES, 115.0)) == (
         f"{head}50 %), where no adaptation can act: disturbances and noise ask for more than the limits allow, or the loop swings "
         "by itself; its review says whether it is stable."

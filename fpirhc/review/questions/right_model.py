@@ -25,7 +25,14 @@ from fpirhc.plant.chain import response_units
 from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.by_run import by_run
-from fpirhc.review.prediction import TRIED, NominalRun, ResponseErrors, errors_without_adaptation, response_errors
+from fpirhc.review.prediction import (
+    TRIED,
+    NominalRun,
+    ResponseErrors,
+    errors_without_adaptation,
+    null_errors,
+    response_errors,
+)
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.simulation.model_as_plant import with_believed_way
 from fpirhc.simulation.trials import SLIGHT, ErrorPair
@@ -55,12 +62,14 @@ def right_form(
     deformation: Deformation,
     harm: Callable[[Deformation], str],
     error: Callable[[Deformation], Mapping[str, Tried]] | None = None,
+    counted: Callable[[Deformation], Mapping[str, Tried]] = lambda _: {},
 ) -> Answer:
     """Whether the form in use is the recommended one, or runs show that it is as good; advice, so never no.
 
     Args:
         harm: what runs show against a deformation; empty where it does no harm.
         error: errors of a run with a deformation by coordinate, none without a run; None: nothing is run.
+        counted: the same where errors count, asked where a run speaks against the form in use; none where that run reaches so far.
     """
     form, why = recommended_form(problem)
     used = form_of(deformation)
@@ -77,16 +86,35 @@ def right_form(
     if proposed is None or error is None:
         change = "Try another form." if proposed is None else f"Try {as_written(proposed)}."
         return Answer(FORM, Verdict.UNKNOWN, text, change)
-    own, other = error(deformation), error(proposed)
-    sizes = [math.hypot(*(one.share for one in tried.values())) if tried else math.nan for tried in (own, other)]
-    if math.isfinite(sum(sizes)):
-        moved = {name: (own[name].share - other[name].share) * (sizes[0] - sizes[1]) for name in own}
-        of = max(moved, key=lambda name: moved[name])  # a coordinate that says what all of them together say
-        as_it_is = f"the rms error of {of} is {own[of].size} as it is, {other[of].size} with the {form} form"
-        text += f"; in a run of at most {TRIED} cycles {as_it_is}"
-    if math.isfinite(sizes[0]) and sizes[0] <= SIMILAR * sizes[1]:
+    both, when = (error(deformation), error(proposed)), f"a run of at most {TRIED} cycles"
+    if not _as_good(*both) and (later := (counted(deformation), counted(proposed))) != ({}, {}):
+        both, when = later, f"at most {TRIED} cycles in which errors count"
+    text += _beside(*both, when, form)
+    if _as_good(*both):
         return Answer(FORM, Verdict.YES, text)
     return Answer(FORM, Verdict.UNKNOWN, text, f"Try {as_written(proposed)}.")
+
+
+def _sizes(own: Mapping[str, Tried], other: Mapping[str, Tried]) -> tuple[float, float]:
+    """Both errors over all coordinates, as shares of the ranges; NaN without a run."""
+    a, b = (math.hypot(*(one.share for one in tried.values())) if tried else math.nan for tried in (own, other))
+    return a, b
+
+
+def _as_good(own: Mapping[str, Tried], other: Mapping[str, Tried]) -> bool:
+    """Whether runs show the first errors to be no larger than the second ones."""
+    sizes = _sizes(own, other)
+    return math.isfinite(sizes[0]) and sizes[0] <= SIMILAR * sizes[1]
+
+
+def _beside(own: Mapping[str, Tried], other: Mapping[str, Tried], when: str, form: str) -> str:
+    """Both errors of a coordinate that says what all of them together say; empty without runs."""
+    sizes = _sizes(own, other)
+    if not math.isfinite(sum(sizes)):
+        return ""
+    moved = {name: (own[name].share - other[name].share) * (sizes[0] - sizes[1]) for name in own}
+    of = max(moved, key=lambda name: moved[name])
+    return f"; in {when} the rms error of {of} is {own[of].size} as it is, {other[of].size} with the {form} form"
 
 
 class Tried(NamedTuple):
@@ -99,11 +127,12 @@ class Tried(NamedTuple):
 def _tried_error(case: Case, deformation: Deformation) -> Mapping[str, Tried]:
     """The errors of a run on the plant by coordinate; none without a run."""
     trial = case.trial(deformation)
-    pair = None if isinstance(trial, str) else trial[0]
-    if pair is None:
-        return {}
-    every = pair.adapted.items()
-    return {n: Tried(e / max(pair.ranges[n], 1e-300), f"{e:.3g}{pair.unit(n)}") for n, e in every}
+    return _by_coordinate(None if isinstance(trial, str) else trial[0])
+
+
+def _by_coordinate(pair: ErrorPair | None) -> Mapping[str, Tried]:
+    every = {} if pair is None else pair.adapted
+    return {n: Tried(e / max(pair.ranges[n], 1e-300), f"{e:.3g}{pair.unit(n)}") for n, e in every.items() if pair}
 
 
 PLAIN, INCREMENT, REFERENCED = "plain", "increment", "model-referenced"
@@ -148,9 +177,10 @@ def pays(case: Case) -> Answer:
         return by_run(case, PAYS, nominal)
     without = rms(nominal, errors_without_adaptation(nominal))
     adapted = rms(nominal, response_errors(nominal))
-    null = rms(nominal, response_errors(nominal, exact=nominal.believed))
+    null = rms(nominal, null_errors(nominal))
     sizes = [_with_unit(case, e, nominal_size(nominal)) for e in (without, adapted, null)]
-    text = f"predicted rms response error: {sizes[0]} without adaptation, {sizes[1]} with it, {sizes[2]} with a right model"
+    error = "predicted rms response error while nothing is off the reference"
+    text = f"{error}: {sizes[0]} without adaptation, {sizes[1]} with it, {sizes[2]} with a right model"
     numbers = {"without": without, "with": adapted, "null": null}
     if case.diverges:
         change = "The prediction leaves the outer loop out, and this one does not converge: see the convergence."
@@ -207,7 +237,7 @@ def leaves_right_model_alone(case: Case) -> Answer:
     # The model's own run, without simulation, knows nothing of a lag or a dead time that the deformation believes.
     foreseen = with_believed_way(case.problem, case.controller.deformation) is case.problem
     nominal = case.nominal if foreseen and not isinstance(case.nominal, str) else None
-    predicted = None if nominal is None else rms(nominal, response_errors(nominal, exact=nominal.believed))
+    predicted = None if nominal is None else rms(nominal, null_errors(nominal))
     numbers, text = {}, ""
     if nominal is not None and predicted is not None:
         numbers = {"response_without": 0.0, "response_with": predicted}
@@ -271,9 +301,9 @@ def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, 
         others += not isinstance(trial, str)
         if not isinstance(trial, str) and not case.harm(form):
             null, worst = trial[1], runs.worst
-            sentences.append(
-                f"The {name} form passes: rms error of {worst} {null.adapted[worst]:.3g}{null.unit(worst)}."
-            )
+            before, after = (f"{e[worst]:.3g}{null.unit(worst)}" for e in (null.without, null.adapted))
+            run = f"in a run of at most {TRIED} cycles the rms error of {worst} is {before} without adaptation, {after} with it"
+            sentences.append(f"The {name} form passes: {run}.")
             numbers["with_form"] = null.adapted[worst]
             break
     grows = bool(case.loops.loops) and case.loops.radii.max() >= 1
@@ -303,8 +333,8 @@ def _period(case: Case, runs: ErrorPair, predicted: float) -> float | None:
     nominal, added = case.nominal, runs.added(runs.worst)
     if isinstance(nominal, str) or not math.isfinite(added):
         return None
-    faster = _faster(nominal, _SHORTER)
-    error = rms(faster, response_errors(faster, exact=faster.believed))
+    faster = _faster(nominal.null, _SHORTER)
+    error = rms(faster, null_errors(faster))
     share = predicted * SLIGHT / added / error
     return min(case.problem.period, case.problem.period / _SHORTER * share)
 
@@ -327,6 +357,14 @@ QUESTIONS = (
     ControllerQuestion(pays, PAYS, order=14),
     RIGHT_MODEL,
     ControllerQuestion(
-        lambda c: right_form(c.problem, c.controller.deformation, c.harm, partial(_tried_error, c)), FORM, order=13
+        lambda c: right_form(
+            c.problem,
+            c.controller.deformation,
+            c.harm,
+            partial(_tried_error, c),
+            lambda deformation: _by_coordinate(c.counted(deformation)),
+        ),
+        FORM,
+        order=13,
     ),
 )

@@ -244,9 +244,10 @@ def limit_cause(plain: Entry, adaptive: Entry) -> str:
             f"{fact}, where no adaptation can act: disturbances and noise ask for more than the limits allow, or the loop swings "
             "by itself; its review says whether it is stable."
         )
-    if before >= _OFTEN and _swings(plain) and _swings(adaptive):
+    if before >= _OFTEN and _swings(plain):
         advice = "Mend the loop without adaptation first; see its review."
-        return f"{fact}: both swing to and fro where the reference does not. {advice}"
+        who = "both swing" if _swings(adaptive) else f"{plain.name} swings"
+        return f"{fact}: {who} to and fro where the reference does not. {advice}"
     if before >= _OFTEN:
         return f"{fact}, where no adaptation can act: slow the reference down or ask for less, or widen limits that are a choice."
     return f"{fact}, where no adaptation can act: it asks for too much, or oscillates; the command in the report shows which."
