@@ -169,8 +169,13 @@ def errors_without_adaptation(nominal: NominalRun) -> ResponseErrors:
 
 
 def null_errors(nominal: NominalRun) -> ResponseErrors:
-    """Return the response errors of the controller where the model is the plant, along its own run."""
-    return response_errors(nominal.null, exact=nominal.believed)
+    """Return what adaptation adds to the response errors where the model is the plant, along its own run.
+
+    Without adaptation there are none, but at a limit of the commands.
+    """
+    one, right = nominal.null, nominal.believed
+    with_it, without = (response_errors(one, deformation=map_, exact=right) for map_ in (None, Identity()))
+    return replace(with_it, error=with_it.error - without.error, force=with_it.force - without.force)
 
 
 def _recursion(nominal: NominalRun, deformation: Deformation) -> tuple[Composite, Evaluator]:

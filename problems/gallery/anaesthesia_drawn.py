@@ -1,34 +1,50 @@
 """Depth of anaesthesia in a hundred people who are drawn from a published distribution: a blind test.
 
-Pump, task and controllers are those of `anaesthesia_people`; nothing was chosen here. The people were drawn with one seed, the file
-was kept, and only then were the controllers run.
+Pump, task and controllers are those of `anaesthesia_people`; nothing was chosen here but in the two rows that say so. The people
+were drawn with one seed, the file was kept, and only then were the controllers run.
 
 Age, height, weight and sex are those of a row of anaesthesia_people.csv. Everything else has the distribution of Eleveld et al.
 (Br. J. Anaesth. 120, 2018, tables 2 and 3, with opioids, arterial samples): volumes and clearances have log-normal factors of
 variance 0.610, 0.565, 0.597, 0.265, 0.346 and 0.209, and a clearance between compartments grows with the person's own volume,
 
     C50 = 3.08 exp(-0.00635 (age - 35)) mg/l, variance 0.242,     ke0 = 0.146 (weight / 70)^-0.25 / min, variance 0.702,
-    E0 = Emax = 93,     steepness 1.47, beyond C50 1.89,     dead time 15 s + exp(0.0517 age) s.
+    E0 = Emax = 93,     steepness 1.89, beyond C50 1.47,     dead time 15 s + exp(0.0517 age) s.
 
-Their drug moves slower than the pump believes, their curves spread twice as far as those of the measured people, and beyond C50
-they are steeper.
+Their drug moves slower than the pump believes, and their curves spread twice as far as those of the measured people.
 
-The one run, `python benchmarks/patients.py anaesthesia_drawn`: the worst patient's share of the time from 40 to 60 in %, the lowest
-bis of anybody with the induction, the mean share in %, and how many of the hundred are in the range for less than 90 % of the time.
-Each is the least and the most of five seeds of the noise:
+The paper is not at hand; these are the numbers of transcriptions. A first version had the two steepnesses exchanged. The rows
+"tuned here" are no blind test: of some dozens of PID laws and of cascades in a loop of numpy, they kept most of the first fifty in
+the range, each with the model's curve as it is.
 
-    five seeds                         worst  lowest        mean          below 90 %
-    pump alone                         0      3.1 to 3.1    29.2 to 29.2  93 to 93
-    PID                                0      20.8 to 21.2  83.4 to 83.7  42 to 44
-    RHC offset-free                    0      15.6 to 17.5  78.7 to 78.8  49 to 52
-    cascade in mg/l, model-referenced  0      7.9 to 8.3    83.6 to 83.9  43 to 47
-    cascade                            0      17.5 to 18.3  80.3 to 80.5  52 to 54
-    cascade in mg/l                    0      14.9 to 15.7  81.7 to 82.0  47 to 51
+`python benchmarks/patients.py anaesthesia_drawn --seeds 3`: the worst patient's share of the time from 40 to 60 in %, the lowest
+bis of anybody with the induction, the mean share in %, and how many of the fifty are in the range for less than 90 % of the time.
+Each is the least and the most of three seeds of the noise:
 
-No controller passes. Each loses somebody altogether, and holds about half of the people for nine tenths of the time; of the
-measured ones it held nearly all. Of the two that draw there, the PID law is the safer one here: its lowest bis is 21 and not
-15, and fewer people leave the range. The cascade in mg/l relies on the model's curve, and a person who needs half the
-concentration gives it twice the gain. Settings that were chosen on the measured people are not for such a spread.
+    D001 to D050                        worst         lowest        mean          below 90 %
+    pump alone                          0.0 to 0.0    6.3 to 6.3    25.7 to 25.7  49 to 49
+    PID                                 19.3 to 24.2  23.4 to 23.6  84.5 to 85.1  20 to 22
+    RHC offset-free                     18.0 to 21.2  20.5 to 21.3  80.4 to 81.0  23 to 24
+    cascade in mg/l, model-referenced   29.0 to 29.7  12.5 to 12.8  85.8 to 86.1  20 to 22
+    cascade                             7.5 to 8.0    22.1 to 22.5  80.4 to 80.9  23 to 25
+    cascade in mg/l                     26.2 to 26.8  19.4 to 20.0  83.2 to 83.7  22 to 24
+    PID, tuned here                     28.8 to 29.8  19.3 to 21.0  89.3 to 89.4  12 to 14
+    cascade in mg/l, tuned here         29.7 to 30.5  18.1 to 18.9  88.7 to 89.1  17 to 17
+
+    D051 to D100                        worst         lowest        mean          below 90 %
+    pump alone                          0.0 to 0.0    7.2 to 7.2    33.1 to 33.1  45 to 45
+    PID                                 0.0 to 0.0    23.9 to 24.3  81.0 to 81.4  24 to 25
+    RHC offset-free                     0.0 to 0.0    22.1 to 22.4  76.8 to 77.0  28 to 29
+    cascade in mg/l, model-referenced   0.0 to 0.0    23.1 to 23.5  81.4 to 81.5  25 to 26
+    cascade                             0.0 to 0.0    21.1 to 21.5  79.2 to 79.3  27 to 29
+    cascade in mg/l                     0.0 to 0.0    23.8 to 24.3  79.6 to 79.8  28 to 28
+    PID, tuned here                     0.0 to 0.0    25.8 to 26.3  86.7 to 86.8  13 to 15
+    cascade in mg/l, tuned here         0.0 to 0.0    26.4 to 27.0  86.2 to 86.4  15 to 17
+
+No controller passes, and none that was tuned here does. D078 stays at 64 with the pump's largest target, 12 mg/l. In twelve people
+the effect site lags by more than 20 min, in D066 by 79: they are late, or their first doses were too large. A larger gain than that
+of the measured people keeps more people in the range, and takes the most sensitive ones of the first half lower: a person who needs
+half the concentration gives the loop twice the gain. Of the two that draw on the measured people, the PID law is the safer one in
+the first half and as safe in the second, and it keeps more people in the range.
 
 For the patient of medians, as in `anaesthesia_people`:
 
@@ -39,8 +55,11 @@ For the patient of medians, as in `anaesthesia_people`:
     cascade in mg/l, model-referenced      3.5
     cascade                                  4
     cascade in mg/l                        3.5
+    PID, tuned here                        3.3
+    cascade in mg/l, tuned here            3.2
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +91,7 @@ def drawn(random, rows):
     own = {
         "C50": 3.08 * np.exp(-0.00635 * (age - 35)) * times.pop("C50"),
         "ke0": 0.146 * (weight / 70) ** -0.25 * times.pop("ke0"),
-        **{"eleveld": 1.0, "E0": 93.0, "Emax": 93.0, "steepness": 1.47, "times_above": 1.89 / 1.47},
+        **{"eleveld": 1.0, "E0": 93.0, "Emax": 93.0, "steepness": 1.89, "times_above": 1.47 / 1.89},
         **{f"times_{name}": factor for name, factor in times.items()},
     }
     late = (15 + np.exp(0.0517 * age)) / 60  # min
@@ -81,7 +100,21 @@ def drawn(random, rows):
 
 random = np.random.default_rng(SEED)
 rows = list(people.cases.changes.values())
-cases = fp.Cases({f"D{k:03}": {**drawn(random, rows), "group": "drawn"} for k in range(1, PEOPLE + 1)})
-problem, controllers = people.problem, people.controllers
+cases = fp.Cases(
+    {
+        f"D{k:03}": {**drawn(random, rows), "group": "tuned" if 2 * k <= PEOPLE else "unseen"}
+        for k in range(1, PEOPLE + 1)
+    }
+)
+problem = people.problem
+controllers = {
+    **people.controllers,
+    "PID, tuned here": fp.PID({"bis": -0.07}, {"bis": -0.0235}, bumpless=False),
+    "cascade in mg/l, tuned here": replace(
+        people.controllers["cascade in mg/l"],
+        deformation=fp.Filtered(fp.Affine(gain=-1.6), pole=0.85),
+        paired=fp.ThroughModel(lag=3.0, dead_time=0.65, plain=True),
+    ),
+}
 headline, headline_metric = people.headline, people.headline_metric
 metrics, pictures = people.metrics, people.pictures
