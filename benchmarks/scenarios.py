@@ -1,10 +1,12 @@
 """What a record of a scenario costs, and how much faster scenarios run in two processes: whole commands, from start to report.
 
-    python benchmarks/scenarios.py [--write] [--records]     --write puts the tables into docs/performance.md
-                                                             --records measures records alone, in seconds
+    python benchmarks/scenarios.py [--write] [--records] [--memory]     --write puts the tables into docs/performance.md
+                                                                        --records measures records alone, in seconds
+                                                                        --memory measures large studies alone, in minutes
 
 A record is one run of one controller in one scenario, with its metrics: processor time, the smallest of many, of single runs and of
-runs side by side; bytes of memory are those of a thousand more records that are read from a file.
+runs side by side; bytes of memory are those of a thousand more records that are read from a file. The memory of a study is the
+largest one that a command holds, in a process of its own.
 
 Libraries are compiled before anything is timed. In every round the four ways take turns, so that whatever else the machine does
 falls on all: one process, two processes, two workers of a local Dask cluster, and, for what the machine can give, the same work
@@ -15,6 +17,7 @@ itself costs, also on a machine with other work.
 from __future__ import annotations
 
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -38,6 +41,7 @@ ROUNDS = 3
 RECORDS = 25  # that are timed
 SOME, MORE = 40, 80  # times that they are read in the smaller and the larger file
 TURNS, BLOCK = 4, 64  # of scenarios side by side; the first one compiles
+LARGE = "fishery", ("CTC", "CTC+FPI"), (1_000, 10_000, 100_000)  # studies whose memory is measured
 STUDIES = (("two_mass", ("CTC", "CTC+FPI (eq 6)"), 2000), ("van_der_pol", ("RHC", "RHC+FPI", "RHC exact model"), 600))
 
 
@@ -101,6 +105,26 @@ def study(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ...
     )
 
 
+def memory(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """One row: what a whole study holds, and what it takes."""
+    with tempfile.TemporaryDirectory() as folder:
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        child = subprocess.Popen(command(name, controllers, count, 1, Path(folder)), stdout=subprocess.DEVNULL)
+        _, status, own = os.wait4(child.pid, 0)
+        now = resource.getrusage(resource.RUSAGE_CHILDREN)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        assert child.returncode == 0
+    seconds = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
+    rows = count * len(controllers)
+    return (
+        f"{name}: {', '.join(controllers)}",
+        f"{count}",
+        f"{own.ru_maxrss / 1024:.0f}",
+        f"{1e3 * seconds / rows:.2f}",
+        f"{seconds:.0f}",
+    )
+
+
 def record(name: str, controller: str) -> tuple[str, ...]:
     """One row: what a record costs."""
     task = fp.load_problem(name)
@@ -110,7 +134,7 @@ def record(name: str, controller: str) -> tuple[str, ...]:
         begin = time.process_time()
         made.append(bench.record(number, controller))
         taken.append(time.process_time() - begin)
-    lanes, together = Bench(task, Conditions(seed=0, use=COMPARING, percent=10.0, compiled=True), side_by_side=True), []
+    lanes, together = Bench(task, Conditions(seed=0, use=COMPARING, percent=10.0, compiled=True, side_by_side=True)), []
     for turn in range(TURNS):
         begin = time.process_time()
         some = list(lanes.records(range(turn * BLOCK, (turn + 1) * BLOCK), controller))
@@ -144,6 +168,17 @@ def held(records: list[dict[str, Any]]) -> int:
 
 def main() -> None:
     """Measure and print."""
+    if "--memory" in sys.argv:
+        heads_of_studies = (
+            "a study",
+            "scenarios",
+            "largest memory, MB",
+            "ms of processor time a record",
+            "s of processor time",
+        )
+        name, controllers, counts = LARGE
+        write_table("study memory", heads_of_studies, [memory(name, controllers, count) for count in counts])
+        return
     heads = ("a record", "ms", "ms side by side", "times faster", "bytes of memory", "bytes in the file")
     write_table("records", heads, [record(name, one) for name, names, _ in STUDIES for one in names[:2]])
     if "--records" in sys.argv:

@@ -29,7 +29,7 @@ typedef char search_fits[sizeof(Search) == ROOM * sizeof(casadi_real) ? 1 : -1];
 #define scale (s->metric)
 #define FIRST_GAMMA (s->first_gamma)
 #else
-static const Number scale[NU] = SCALE;
+TABLE Number scale[NU] = SCALE;
 #endif
 
 /* The middle of the limits of an input; 0 without one of them. */
@@ -210,9 +210,9 @@ INLINE void box_policy(In slope, In matrix, In low, In high, Out v, Truth* free,
       substitute(free, lower, pivots, target);
       for (i = 0; i < NU; ++i) move[i] = between(EITHER(free[i], target[i], move[i]), low[i], high[i]);
       for (i = 0; i < NU; ++i) {
-        casadi_real half = ALL(0);
-        for (j = 0; j < NU; ++j) half += matrix[j * NU + i] * move[j];
-        value += (slope[i] + 0.5 * half) * move[i];
+        casadi_real halved = ALL(0);
+        for (j = 0; j < NU; ++j) halved += matrix[j * NU + i] * move[j];
+        value += (slope[i] + 0.5 * halved) * move[i];
       }
       if (ANY(value < lowest)) {
         for (i = 0; i < NU; ++i) v[i] = EITHER(value < lowest, move[i], v[i]);
@@ -325,9 +325,13 @@ INLINE void remember(const Search* s, const Plan* best, Truth good, Truth posed,
 
 /* The new memory may lie where the old one lies, which is read as a whole before. */
 INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
+#ifdef __OPENCL_VERSION__
+#define GIVEN(k) arg[k]
+#else
   static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
-  In s0 = arg[0] ? arg[0] : nothing, data = arg[1] ? arg[1] : nothing, memory = arg[4] ? arg[4] : nothing;
-  In lower = arg[2] ? arg[2] : nothing, upper = arg[3] ? arg[3] : nothing;
+#define GIVEN(k) (arg[k] ? arg[k] : nothing)
+#endif
+  In s0 = GIVEN(0), data = GIVEN(1), lower = GIVEN(2), upper = GIVEN(3), memory = GIVEN(4);
   Search* restrict s = (Search*)w;
   Plan *best = s->plans, *plan = s->plans + 1;
   int i, tried;

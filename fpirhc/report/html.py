@@ -67,9 +67,10 @@ _LYAPUNOV = (
 )
 _CONTRACTION = "Predicted contraction factor against the gain, and the response error's decay"
 _MISMATCH = (
-    "One point per scenario and controller; lines join medians of scenarios with similar mismatch, crosses at the upper edge "
-    "are runs that ended early. Mismatch: rms over the parameters of the relative distance between the model and the drawn "
-    "plant. Error: rms error divided by the reference's range, root mean square over the coordinates."
+    "One point per scenario and controller, of thousands every second, fourth and so on; lines join medians of scenarios with "
+    "similar mismatch, crosses at the upper edge are runs that ended early. Mismatch: rms over the parameters of the relative "
+    "distance between the model and the drawn plant. Error: rms error divided by the reference's range, root mean square over the "
+    "coordinates."
 )
 _LIMITS = (
     "One point per run, crosses are failed ones: above the dashed line by their error, at the upper edge they ended early, below "
@@ -230,7 +231,8 @@ def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
 def render_scenarios(comparison: ScenarioComparison) -> str:
     """Return the page's text."""
     figure = mismatch_figure(comparison) if comparison.summaries else None
-    kept = {name: [one.get("pictures", {}) for one in some] for name, some in comparison.records.items()}
+    of = comparison.records if comparison.pictures else {}
+    kept = {name: [one.get("pictures", {}) for one in some] for name, some in of.items()}
     own = [image for wanted in comparison.pictures if (image := _of_cases(wanted, kept))]
     return render_charted(comparison.view, figure, "Error against mismatch", _MISMATCH, own)
 

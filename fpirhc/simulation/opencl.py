@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Protocol
 
@@ -12,22 +13,36 @@ import numpy as np
 from fpirhc.errors import DeviceFailed, InvalidName, NoCode, NotInstalled, nearest, package
 
 
-def loaded_kernel(source: str, device: str) -> Callable[..., int]:
-    """Build the kernel `run_lanes` and return it as a function of (plants, cycles, first, own, start, begun, reads, results, log).
+@dataclass(frozen=True)
+class Kernel:
+    """A kernel on a device."""
+
+    run: Callable[..., int]  # of (plants, cycles, first, own, start, begun, reads, results, log)
+    private: int  # bytes that a plant has beside the registers, as the device's compiler tells
+
+
+def loaded_kernel(source: str, device: str) -> Kernel:
+    """Build the kernel `run_lanes`.
 
     Args:
         device: part of the name of a device; '': the first graphics processor, else the first device.
     """
     cl = package("pyopencl", "opencl", "a device")
     chosen = _device(cl, device)
-    context = cl.Context([chosen])
-    queue = cl.CommandQueue(context)
+    try:
+        context = cl.Context([chosen])
+        queue = cl.CommandQueue(context)
+    except cl.Error as error:
+        raise DeviceFailed(
+            f"device '{chosen.name.strip()}' does not start ({_reason(error)}): end what else uses it, or leave the device out"
+        ) from None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of compilers about code that they compile
             kernel = cl.Program(context, source).build().run_lanes
-    except cl.RuntimeError as error:
-        raise NoCode(f"the compiler of '{chosen.name}' failed: {str(error).strip().splitlines()[0]}") from None
+        private = kernel.get_work_group_info(cl.kernel_work_group_info.PRIVATE_MEM_SIZE, chosen)
+    except cl.Error as error:
+        raise NoCode(f"the compiler of '{chosen.name.strip()}' failed: {_reason(error)}") from None
 
     def run(plants: int, cycles: int, first: int, own: int, *arrays: np.ndarray) -> int:
         *given, results, log = arrays
@@ -41,12 +56,18 @@ def loaded_kernel(source: str, device: str) -> Callable[..., int]:
                     cl.enqueue_copy(queue, values, there)
         except cl.Error as error:
             raise DeviceFailed(
-                f"device '{chosen.name.strip()}' failed with {plants} plants ({str(error).strip().splitlines()[0]}): run fewer "
+                f"device '{chosen.name.strip()}' failed with {plants} plants ({_reason(error)}): run fewer "
                 "plants at once, or leave the device out"
             ) from None
         return 1
 
-    return run
+    return Kernel(run, int(private))
+
+
+def _reason(error: Exception) -> str:
+    """The line that says it: the first with an error of the device's compiler, else the first one."""
+    lines = str(error).strip().splitlines()
+    return next((line for line in lines if "error:" in line), lines[0] if lines else type(error).__name__).strip()
 
 
 class _Device(Protocol):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -87,7 +88,8 @@ class Sums:
             sums: last memories, shape (runs, size).
             log: what was kept, shape (runs, cycles, kept.size).
         """
-        columns, outside = self.columns(problems[0], sums)
+        arrays, outside = self.columns(problems[0], sums)
+        columns = {name: {e: v.tolist() for e, v in some.items()} for name, some in arrays.items()}  # None where masked
         runs = [
             Run(one.name, "", seed, one.period, self.kept, rows, None, True, {})
             for one, seed, rows in zip(problems, seeds, log, strict=True)
@@ -101,14 +103,13 @@ class Sums:
         pairs = zip(self._streamed, rest, strict=True)
         return {m.name: one.result(part, run) for (m, one), part in pairs}, outside[:, -1] != 0
 
-    def _row(self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, np.ndarray]], run: Run) -> Values:
+    def _row(self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, list[Any]]], run: Run) -> Values:
         """The metrics of the k-th run; `run` has what was kept of it."""
         of_logs = measure(problem, run, self._of_logs).values
         row: Values = {}
         for metric in self.metrics:
             if metric.name in columns:
-                numbers = {e: v[k] for e, v in columns[metric.name].items()}
-                row[metric.name] = {e: v.item() for e, v in numbers.items() if v is not np.ma.masked}
+                row[metric.name] = {e: v[k] for e, v in columns[metric.name].items() if v[k] is not None}
             elif metric.name in of_logs:
                 row[metric.name] = dict(of_logs[metric.name])
         return row

@@ -19,11 +19,13 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.simulation.lanes import run_many
+from fpirhc.simulation.lanes import Lanes
+from fpirhc.simulation.metrics import Metrics
 from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.simulation.sums import Values
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.operating_limits import FAILS, Judge, Point, bracket
-from fpirhc.studies.scenarios.bench import ranges
+from fpirhc.studies.scenarios.bench import ranges, relative_error
 from fpirhc.studies.scenarios.draws import SEARCHING
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number
@@ -203,13 +205,13 @@ class _Plants:
         streams = [np.random.SeedSequence(seed, spawn_key=(SEARCHING, k)).spawn(2) for k in range(draws)]
         self._shares = np.array([np.random.default_rng(own).random(len(self._parameters)) for own, _ in streams])
         self._noise = [int(noise.generate_state(1)[0]) for _, noise in streams]
-        self._errors = np.zeros(draws)
+        self._errors, self._metrics = np.zeros(draws), [m for m in task.metrics if m.name == "rms_error"]
         self._loop = self._built()
 
     def worst_drawn(self, percent: int) -> Point:
         """Return the first drawn plant of the box that fails, or the one with the largest error; of 0 % the problem's own."""
-        if percent and self._alike:
-            chosen = self._worst_of_lanes(percent)
+        if percent and self._lanes is not None:
+            chosen = self._worst_of_lanes(self._lanes, percent)
             if chosen is not None:
                 return chosen
         worst = Point(percent, 0.0, "")
@@ -224,30 +226,25 @@ class _Plants:
         return worst
 
     @cached_property
-    def _alike(self) -> bool:
-        """Whether plants differ in their parameters alone, and fail by their errors alone, so that they may run side by side."""
-        problem, steady = self._problem, not self._problem.disturbances and self._problem.sensing.ideal
-        return steady and self._compiled and problem.reality is None and not problem.limits.states
+    def _lanes(self) -> Lanes | None:
+        """For plants side by side, where they fail by their errors alone."""
+        problem = self._problem
+        if not self._compiled or problem.reality is not None or problem.limits.states:
+            return None
+        lanes = Lanes(self._loop, self._metrics)
+        return None if lanes.why else lanes
 
-    def _worst_of_lanes(self, percent: int) -> Point | None:
-        """The same by plants side by side; None where they cannot run so, or rounding decides which one fails first."""
-        sizes = ranges(self._problem)
+    def _worst_of_lanes(self, lanes: Lanes, percent: int) -> Point | None:
+        """The same by plants side by side; None where rounding decides which one fails first, or a plant cannot run."""
         for begin in range(0, len(self._shares), _SIDE_BY_SIDE):
             places = range(begin, min(begin + _SIDE_BY_SIDE, len(self._shares)))
-            exact = np.array([self._exact(percent, self._shares[k]) for k in places])
             try:
-                for one in exact:
-                    self._problem.with_exact(one)
-                many = run_many(self._loop, exact)
+                plants = [self._problem.with_exact(self._exact(percent, self._shares[k])) for k in places]
+                pairs = zip(plants, (self._noise[k] for k in places), strict=True)
+                runs = [lanes.one_run(self._loop, problem, noise, exact_alone=True) for problem, noise in pairs]
             except FpirhcError:  # the loop one after the other names the plant
                 return None
-            if not many.lanes or many.rms_error.keys() != sizes.keys():
-                self.__dict__["_alike"] = False
-                return None
-            shares = np.array([many.rms_error[name] / size for name, size in sizes.items()])
-            errors = np.sqrt(np.mean(shares**2, axis=0))
-            errors[list(many.stops)] = math.inf
-            self._errors[places] = errors
+            self._errors[places] = errors = np.array([self._error(one) for one in lanes.values(runs)])
             failing = np.flatnonzero(~(errors <= self._judge.fails))
             if failing.size:
                 k = begin + int(failing[0])
@@ -256,6 +253,16 @@ class _Plants:
         worst = int(np.argmax(self._errors))
         largest = self._point(percent, self._shares[worst], self._noise[worst])
         return None if largest.why else largest
+
+    def _error(self, values: Values | None) -> float:
+        """The relative error of a run; infinite where it ends early."""
+        if values is None:
+            return math.inf
+        return relative_error(Metrics(values, {}, {m.name: m for m in self._metrics}), self._sizes)
+
+    @cached_property
+    def _sizes(self) -> dict[str, float]:
+        return ranges(self._problem)
 
     def search(self, percent: int) -> tuple[float, Counterexample | None]:
         """Return the largest error that a search in the box meets, and a plant that fails, if it meets one."""

@@ -349,8 +349,7 @@ class _Runner:
             task,
             name,
             list(self._now),
-            conditions,
-            side_by_side=cells >= SIDE_BY_SIDE,
+            replace(conditions, side_by_side=cells >= SIDE_BY_SIDE),
             judged=is_of_judgements(aim.metric),
         )
 

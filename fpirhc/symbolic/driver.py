@@ -41,6 +41,7 @@ WORDS = """#if defined(__GNUC__)
 typedef int Truth;
 typedef long long Mask; /* a truth as wide as a number */
 typedef casadi_real Number; /* of a table */
+#define TABLE static const
 #define YES 1
 #define NO 0
 #define NOT(m) (!(m))

@@ -13,6 +13,7 @@ typedef double V __attribute__((vector_size(8 * LANES)));
 typedef long long M __attribute__((vector_size(8 * LANES)));
 typedef M Truth, Mask;
 typedef double Number;
+#define TABLE static const
 #define casadi_real V
 #define casadi_int long long
 #define YES (~(M){})

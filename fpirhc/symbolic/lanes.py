@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import platform
+import re
 from collections.abc import Sequence
 from functools import cache
 from importlib import resources
@@ -20,6 +21,7 @@ from fpirhc.symbolic.driver import SIGNATURE, driver_of, entry_of, is_driver
 from fpirhc.symbolic.flat_code import FlatCode
 from fpirhc.symbolic.native import shared_library
 
+_TABLE = re.compile(r"\bflat_table_\d+\b")
 _KNOWN = {*SIDE_BY_SIDE.operations, ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST}
 
 
@@ -30,16 +32,22 @@ def written_in_lanes(*functions: ca.Function) -> tuple[tuple[str, ...], list[Cal
     """
     own = _File(SIDE_BY_SIDE)
     inner = [own.flat.callee(function, always=True) for function in functions]
-    return (own.text(), *map(_driver_file, own.drivers)), inner
+    files = [(name, _File(SIDE_BY_SIDE)) for name in own.drivers]
+    drivers = [(file.driver(name), file) for name, file in files]
+    return (own.text(), *(file.text() + text for text, file in drivers)), inner
 
 
-def written_for_devices(*functions: ca.Function) -> tuple[str, list[Callee]]:
-    """Return Functions in OpenCL C, and how they are called: scalar code alone."""
+def written_for_devices(*functions: ca.Function) -> tuple[tuple[str, ...], list[Callee]]:
+    """Return Functions as pieces of one file of OpenCL C, and how they are called.
+
+    The pieces behind the first one are the loops of optimisers, and come last: their sizes are defined by short names.
+    """
     own = _File(DEVICE)
     inner = [own.flat.callee(function, always=True) for function in functions]
-    if own.flat.tables:
-        raise NoCode("the loop has tables, which are not written for devices")
-    return own.text(), inner
+    drivers = [own.driver(name) for name in tuple(own.drivers)]
+    if sum(bool(driver_of(name).leaves) for name in own.drivers) > 1:
+        raise NoCode("the loop has several optimisers, whose loops are not written for devices together")
+    return (own.text(), *drivers), inner
 
 
 def lanes_library(sources: Sequence[str]) -> tuple[ctypes.CDLL, int]:
@@ -78,7 +86,7 @@ class _File:
     def _outside(self, function: ca.Function) -> Callee:
         """How that is called which is no graph."""
         name = function.name()
-        if is_driver(name) and driver_of(name).side_by_side and self._words.side_by_side:
+        if is_driver(name) and driver_of(name).side_by_side:
             if name not in self.drivers:
                 self.drivers.append(name)
             entry, room, in_place = entry_of(name)
@@ -90,23 +98,35 @@ class _File:
         where = "lanes" if self._words.side_by_side else "devices"
         raise NoCode(f"the loop has a part that is not written for {where}: {name}")
 
+    def driver(self, name: str) -> str:
+        """The loops of an optimiser, around leaves that are among the functions of this file.
+
+        Raises:
+            NoCode: they are not written for lanes.
+        """
+        driver, others = driver_of(name), len(self.drivers)
+        leaves = {key: self.flat.callee(leaf, always=True) for key, leaf in driver.leaves.items()}
+        if len(self.drivers) > others or any(leaf.room for leaf in leaves.values()):
+            raise NoCode(f"the loop has a part that is not written for lanes: a stage of {name}")
+        names = {key: leaf.name for key, leaf in leaves.items()}
+        before = "".join(f"#undef {one}\n" for one in (*driver.constants, *names, "ENTRY", "ROOM"))
+        return f"{before}#define ENTRY {entry_of(name)[0]}\n{driver.around(names)}"
+
     def text(self) -> str:
         """The functions that are written so far, with what they need."""
-        tables = [f"static const casadi_real flat_table_{k}{table}\n" for k, table in enumerate(self.flat.tables)]
+        tables = {
+            f"flat_table_{k}": f"const casadi_real flat_table_{k}{one}\n" for k, one in enumerate(self.flat.tables)
+        }
         declared = [f"int {entry_of(name)[0]}{SIGNATURE};\n" for name in self.drivers]
-        return "".join(
-            [_prelude("lanes.c" if self._words.side_by_side else "opencl.c"), *tables, *declared, *self.flat.texts]
-        )
-
-
-def _driver_file(name: str) -> str:
-    """The loops of an optimiser, around leaves that are written for lanes."""
-    driver, own = driver_of(name), _File(SIDE_BY_SIDE)
-    leaves = {key: own.flat.callee(leaf, always=True) for key, leaf in driver.leaves.items()}
-    if own.drivers or any(leaf.room for leaf in leaves.values()):
-        raise NoCode(f"the loop has a part that is not written for lanes: a stage of {name}")
-    around = driver.around({key: leaf.name for key, leaf in leaves.items()})
-    return f"#define ENTRY {entry_of(name)[0]}\n{own.text()}{around}"
+        if self._words.side_by_side:
+            shared = [f"static {table}" for table in tables.values()]
+            return "".join([_prelude("lanes.c"), *shared, *declared, *self.flat.texts])
+        # In OpenCL constants of a file have addresses of another kind, which no function of numbers takes.
+        texts = [
+            head + "{\n" + "".join(tables[name] for name in dict.fromkeys(_TABLE.findall(body))) + body
+            for head, _, body in (text.partition("{\n") for text in self.flat.texts)
+        ]
+        return "".join([_prelude("opencl.c"), *declared, *texts])
 
 
 @cache

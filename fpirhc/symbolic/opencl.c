@@ -3,13 +3,22 @@
 #pragma OPENCL FP_CONTRACT OFF
 #define LANES 1
 #define GLOBAL __global
-typedef double V, casadi_real;
-typedef long casadi_int;
-typedef int M;
+#define FINITE (DBL_MAX / 134217728)
+#define TINY (DBL_MIN * 67108864)
+#define OF_TYPE(of_double, of_float) (of_double)
+#define PORTABLE
+#define INLINE static inline
+#define NOT_UNROLLED
+#define TABLE __constant
+typedef double V, Number, casadi_real;
+typedef long casadi_int, Mask;
+typedef int M, Truth;
 #define YES 1
 #define NO 0
 #define NOT(m) (!(m))
 #define ANY(m) (m)
+#define EVERY(m) (m)
+#define EITHER(m, a, b) ((m) ? (a) : (b))
 #define ALL(a) (a)
 static double truth(int m) { return m ? 1.0 : 0.0; }
 static double fetched(__global const double* from) { return *from; }

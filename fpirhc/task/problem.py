@@ -241,7 +241,7 @@ class Problem(Checked):
         object.__setattr__(other, "plant", with_exact_parameters(self.plant, exact))
         for name in _OF_EXACT:
             other.__dict__.pop(name, None)
-        _check_inverse(other, mistakes)
+        _check_inverse(other, mistakes, ("exact",))
         mistakes.raise_if_any()
         return other
 
@@ -500,25 +500,21 @@ def _check_reference(problem: Problem) -> None:
             raise InvalidProblem(f"{where} {', '.join(wrong)}; give a motion that has these values")
 
 
-def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
+def _check_inverse(problem: Problem, mistakes: Mistakes, asked: Sequence[str] = ("approximate", "exact")) -> None:
     """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
     plant = problem.plant
-    exact = () if problem.reality else (("exact", plant.exact),)  # with a reality these values move nothing
-    for which, values in (("approximate", plant.approximate), *exact):
+    known = {"approximate": plant.approximate}
+    known |= {} if problem.reality else {"exact": plant.exact}  # with a reality these values move nothing
+    sets = [(which, known[which]) for which in asked if which in known]
+    for which, values in sets:
         why = unsolved(plant, problem.start_state, problem.inputs_before, values)
         if why:
             mistakes.add(f"algebraic states at the start ({which} parameters): {why}")
     if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
         return
-    x, u, p = plant.symbols()
-    response = plant.equations.controlled_response(x, u, p)
-    gain_of = _GAINS.of(
-        (plant.equations,),
-        (),
-        lambda: ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response]),
-    )
+    gain_of = _GAINS.of((plant.equations,), (), lambda: _gain(plant))
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
-    for which, values in (("approximate", plant.approximate), *exact):
+    for which, values in sets:
         gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
         if not np.all(np.isfinite(free)):
             name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
@@ -532,6 +528,13 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
                 f"the response ({which} parameters) is not invertible at the start ({state}): input '{weakest}' has no "
                 f"independent effect there{_remedy(problem, gain_of, values, weakest)}"
             )
+
+
+def _gain(plant: Plant) -> ca.Function:
+    """Function (state, inputs, parameters) -> (gain of the response, response)."""
+    x, u, p = plant.symbols()
+    response = plant.equations.controlled_response(x, u, p)
+    return ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
 
 
 def _remedy(problem: Problem, gain_of: ca.Function, values: np.ndarray, weakest: str) -> str:

@@ -135,6 +135,8 @@ def test_tuning_says_that_the_best_settings_do_harm(file, capsys):
     assert re.match(LOSES, red(before)[0])
     assert re.match(FAILS, red(before)[1])
     [saved] = Path("results").rglob("tuning.json")
+    assert main(["tune", "line.py", "--trials", "2", "--no-compile", "--json"]) == 0
+    assert capsys.readouterr().out == saved.read_text()
     assert len(json.loads(saved.read_text())["controllers"]["CTC+gentle"]["harm"]) == 2
 
 

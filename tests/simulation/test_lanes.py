@@ -149,7 +149,7 @@ def some_device() -> str:
     return able[0] if able else pytest.skip("there is no OpenCL device with double precision")
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if not name.startswith("plans")])
+@pytest.mark.parametrize("name", [name for name in CASES if name != "plans"])
 def test_a_device_has_the_errors_of_the_lanes(name):
     """Its functions round otherwise again; statuses are the same, and so is a plant that runs away."""
     ready, device = fp.simulator(*CASES[name]), some_device()
@@ -164,29 +164,38 @@ def test_a_device_has_the_errors_of_the_lanes(name):
 
 
 def test_what_a_device_cannot_run_is_told():
-    """A loop with plans runs one after the other there; a name that no device has is wrong."""
+    """A loop with plans under limits of states runs one after the other there; a name that no device has is wrong."""
     device = some_device()
-    ready = fp.simulator(replace(TWO_MASS.problem, duration=0.5, measure_from=0.1), TWO_MASS.controllers["RHC"])
+    limited = replace(TWO_MASS.problem, duration=0.5, measure_from=0.1, limits=fp.Limits(states={"q1": (-10.0, 10.0)}))
+    ready = fp.simulator(limited, TWO_MASS.controllers["RHC"])
     many = run_many(ready, plants(ready, 2), device=device)
     assert many.lanes == 0
-    assert many.why.startswith("the loop has a part that is not written for devices: fpirhc_fixed_point_")
+    assert many.why.startswith("the loop has a part that is not written for devices: fpirhc_plan")
     with pytest.raises(InvalidName, match="no OpenCL device is called 'abacus'"):
         run_many(fp.simulator(*CASES["map"]), plants(fp.simulator(*CASES["map"]), 2), device="abacus")
 
 
 def test_a_device_that_fails_is_named(monkeypatch):
-    """What a driver says while it runs is one sentence, with what to do."""
+    """What a driver says while it starts and while it runs is one sentence, with what to do."""
     device = some_device()
     cl = pytest.importorskip("pyopencl")
 
     def exhausted(*_args):
-        raise cl.MemoryError("clEnqueueReadBuffer failed: OUT_OF_RESOURCES\nand more")
+        raise cl.MemoryError("OUT_OF_RESOURCES\nand more")
 
-    monkeypatch.setattr(cl, "enqueue_copy", exhausted)
-    ready = fp.simulator(replace(TWO_MASS.problem, duration=0.5, measure_from=0.1), ADAPTIVE)
-    told = r"failed with 2 plants \(.*OUT_OF_RESOURCES\): run fewer plants at once, or leave the device out"
-    with pytest.raises(DeviceFailed, match=told):
-        run_many(ready, plants(ready, 2), device=device)
+    short = replace(TWO_MASS.problem, duration=0.5, measure_from=0.1)
+    for name, told in (
+        ("Context", r"does not start \(OUT_OF_RESOURCES\): end what else uses it, or leave the device out"),
+        (
+            "enqueue_copy",
+            r"failed with 2 plants \(OUT_OF_RESOURCES\): run fewer plants at once, or leave the device out",
+        ),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(cl, name, exhausted)
+            ready = fp.simulator(short, ADAPTIVE)
+            with pytest.raises(DeviceFailed, match=told):
+                run_many(ready, plants(ready, 2), device=device)
 
 
 def test_a_device_needs_its_package(monkeypatch):

@@ -63,8 +63,18 @@ def test_a_search_of_a_box_without_draws_in_its_corner_finds_the_plant_that_fail
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-def test_plants_side_by_side_have_the_box_of_plants_one_after_the_other(monkeypatch):
-    """What a sentence says is run by itself then, less than the draws of one box, and the search, which is as long as one."""
+@pytest.mark.parametrize("noisy", [False, True])
+def test_plants_side_by_side_have_the_box_of_plants_one_after_the_other(noisy, monkeypatch):
+    """What a sentence says is run by itself then, less than the draws of one box, and the search, which is as long as one.
+
+    Every plant has its own noise; the plant as it stands is run with all of it.
+    """
+    task = pump()
+    if noisy:
+        shaken = replace(
+            task.problem, disturbances={"y": fp.Noise(1e-3)}, sensing=fp.Sensing({"y": fp.Sensor(fp.Noise(1e-3))})
+        )
+        task = replace(task, problem=shaken)
     asked: list[float] = []
     point = Judge.point
 
@@ -73,9 +83,9 @@ def test_plants_side_by_side_have_the_box_of_plants_one_after_the_other(monkeypa
         return point(self, value, *run)
 
     monkeypatch.setattr(Judge, "point", noted)
-    found = robust_boxes(pump(), risk=0.1, confidence=0.9)
-    assert len(asked) < 2 * found.draws
-    alone = robust_boxes(pump(), risk=0.1, confidence=0.9, compiled=False)
+    found = robust_boxes(task, risk=0.1, confidence=0.9)
+    assert len(asked) < (2 + noisy) * found.draws
+    alone = robust_boxes(task, risk=0.1, confidence=0.9, compiled=False)
     assert len(asked) > 4 * found.draws
     for one, other in zip(found.boxes, alone.boxes, strict=True):
         assert (one.percent, one.fails_at, one.why) == (other.percent, other.fails_at, other.why)

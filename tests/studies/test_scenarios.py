@@ -30,12 +30,14 @@ from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import is_late, scaled
-from fpirhc.studies.scenarios import paired
+from fpirhc.studies.scenarios import paired, running
 from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error
 from fpirhc.studies.scenarios.cluster import DEATHS, Workers
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
-from fpirhc.studies.scenarios.ledger import Ledger, Records
-from fpirhc.studies.scenarios.paired import median_interval, middle, share_interval, summarise, verdict
+from fpirhc.studies.scenarios.ledger import Ledger
+from fpirhc.studies.scenarios.paired import median_interval, middle, share_interval, verdict
+from fpirhc.studies.scenarios.quantiles import Quantiles
+from fpirhc.studies.scenarios.running import summarise
 
 LINE = line_text(
     "period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}", bounds="(0.5, 2.4)", more=EXACT
@@ -155,7 +157,7 @@ def test_a_prepared_loop_runs_what_a_fresh_one_runs(dead_time, task):
 def test_interval_covers_the_median_as_often_as_it_says():
     """95 % intervals of the median of 25 log-normal numbers hold the true one in about 95 of 100 samples."""
     random = np.random.default_rng(0)
-    intervals = [median_interval(random.lognormal(size=25), seed=k) for k in range(200)]
+    intervals = [median_interval(Quantiles(random.lognormal(size=25)), seed=k) for k in range(200)]
     covered = np.mean([i.low <= 1.0 <= i.high for i in intervals])
     assert 0.90 <= covered <= 0.99
     assert all(i.low <= i.median <= i.high for i in intervals)
@@ -313,7 +315,7 @@ def test_records_reach_the_disk_in_groups(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_records_in_columns_are_what_they_were(seed):
+def test_records_of_a_file_are_what_they_were(seed, tmp_path):
     """Every value with its type and place, whatever forms follow each other; parts of all, and equality as of lists."""
     random_ = random.Random(seed)
     pool: list[Any] = [
@@ -341,45 +343,31 @@ def test_records_in_columns_are_what_they_were(seed):
             return {f"k{k}": value(depth - 1) for k in range(random_.randrange(4))}
         return random_.choice([*pool, f"text {random_.random()}", random_.random()])
 
-    wanted = [{f"n{k}": value(2) for k in range(random_.randrange(1, 6))} for _ in range(3000)]
-    records = Records()
-    for one in wanted:
-        records.append(one)
+    wanted = [{f"n{k}": value(2) for k in range(random_.randrange(1, 6))} for _ in range(300)]
+    with Ledger(tmp_path / "l.jsonl", {}) as ledger:
+        for one in wanted:
+            ledger.append(one)
+    records = ledger.records
     assert repr(records) == repr(wanted)
     assert records == wanted
     assert records[5:50:7] == wanted[5:50:7]
     assert records.at([7, 3]) == [wanted[7], wanted[3]]
-    assert (records[-1], len(records), records != wanted[1:]) == (wanted[-1], 3000, True)
+    assert (records[-1], len(records), records != wanted[1:]) == (wanted[-1], 300, True)
 
 
-def test_a_record_takes_two_hundred_bytes(tmp_path):
-    """Read from a file, with the twenty-five numbers and texts that two masses have."""
-    numbers, header = random.Random(0), {"of": "this"}
-    metrics = {
-        name: dict.fromkeys(("q1", "q2"), 0.0) for name in ("rms", "max", "iae", "settling", "effort", "variation")
-    }
-    with Ledger(tmp_path / "l.jsonl", header) as ledger:
+def test_a_record_takes_eight_bytes(tmp_path):
+    """Those of its place in the file, with the growth of an array; nothing else of it stays."""
+    with Ledger(tmp_path / "l.jsonl", {}) as ledger:
         for k in range(2000):
-            own = {name: {e: numbers.random() for e in both} for name, both in metrics.items()}
-            own |= {"cycles": {"": 10000}, "at_limit": {"": 0.0}, "status": {"OK": 10000, "HELD": 0, "INFEASIBLE": 0}}
-            one = {
-                "scenario": k,
-                "name": f"{k}",
-                "group": "",
-                "controller": "RHC",
-                "mismatch": 0.3,
-                "outcome": "finished",
-            }
-            ledger.append({**one, "error": numbers.random(), "metrics": own, "lasted": 1.0, "stop": None})
+            ledger.append({"scenario": k, "name": f"{k}", "metrics": {"rms": {"q1": k / 7}, "status": {"OK": k}}})
     tracemalloc.start()
     try:
-        with Ledger(tmp_path / "l.jsonl", header) as ledger:
+        with Ledger(tmp_path / "l.jsonl", {}) as ledger:
             assert len(ledger.records) == 2000
-            taken, most = tracemalloc.get_traced_memory()
+            taken, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert (taken - 1000 * 200) / 2000 < 200  # a thousand texts are remembered, however many records there are
-    assert most < 10 * 2**20
+    assert taken < 12 * 2000 + 10_000
 
 
 def test_other_results_damage_and_other_users_are_refused(tmp_path):
@@ -606,13 +594,72 @@ def _children(parent: int) -> list[int]:
     return collected
 
 
+_ORDERS: dict[str, Any] = {
+    "random": lambda numbers: np.random.default_rng(0).permutation(numbers),
+    "rising": np.sort,
+    "falling": lambda numbers: np.sort(numbers)[::-1],
+    "inwards": lambda numbers: np.stack([np.sort(numbers), np.sort(numbers)[::-1]], axis=1).ravel()[: len(numbers)],
+}
+
+
+@pytest.mark.parametrize("order", _ORDERS)
+@pytest.mark.parametrize("room", [8, 64])
+def test_a_quantile_is_no_further_away_than_it_says(order, room):
+    """Of numbers in any order, with infinite ones; the bound is small beside the count, and the memory beside the numbers."""
+    numbers = np.random.default_rng(1).normal(size=10_000)
+    numbers[:300], numbers[300:400] = np.inf, -np.inf
+    numbers = _ORDERS[order](numbers)
+    told, true = Quantiles(numbers, room=room), np.sort(numbers)
+    for place in range(0, 10_000, 37):
+        value = told.at(place)
+        first, last = np.searchsorted(true, value, "left"), np.searchsorted(true, value, "right") - 1
+        assert first - told.error <= place <= last + told.error
+    assert told.error <= 10_000 * np.log2(10_000 / room) / room
+    assert sum(map(len, told._buffers)) <= room * (1 + np.log2(10_000 / room))
+
+
+def test_few_numbers_are_told_exactly():
+    """As long as they fit into one buffer."""
+    numbers = np.random.default_rng(2).normal(size=64)
+    told = Quantiles(numbers, room=64)
+    assert (told.error, told.median) == (0, np.median(numbers))
+    assert [told.at(k) for k in range(64)] == np.sort(numbers).tolist()
+
+
+def test_the_summary_of_many_scenarios_is_that_of_all(monkeypatch):
+    """Counts and worst cases to the last scenario, medians and the ends of intervals within the places that it says."""
+    random_ = np.random.default_rng(3)
+    before, after = random_.lognormal(size=(2, 6000))
+    after[17] = np.inf
+    pair = [_records(name, [None if np.isinf(e) else e for e in some]) for name, some in (("A", before), ("B", after))]
+    exact = summarise("B", pair[1], pair[0], seed=0)
+    monkeypatch.setattr(running, "Quantiles", lambda room=256: Quantiles(room=min(room, 256)))
+    monkeypatch.setattr(running, "_SHOWN", 100)
+    told = summarise("B", pair[1], pair[0], seed=0)
+    assert (exact.median, exact.scenarios.size) == (np.median(after), 3000)
+    for name in ("count", "worst_scenario", "first_ended", "outcomes", "statuses", "better", "equal", "worst_metrics"):
+        assert getattr(told, name) == getattr(exact, name), name
+    assert exact.rank_error < 0.001 < told.rank_error < 0.02
+    assert told.scenarios.tolist() == list(range(0, 6000, 64))
+    assert told.errors.tolist() == after[::64].tolist()
+    assert abs(np.mean(after < told.median) - 0.5) <= told.rank_error
+    assert abs(np.mean(after < after[told.median_scenario]) - 0.5) < 0.05
+    assert told.difference is not None
+    assert exact.difference is not None
+    differences = np.sort(after - before)
+    places = [np.searchsorted(differences, end) / 6000 for end in (told.difference.low, told.difference.high)]
+    wider = [np.searchsorted(differences, end) / 6000 for end in (exact.difference.low, exact.difference.high)]
+    assert wider[0] - 2 * told.rank_error <= places[0] <= wider[0]
+    assert wider[1] <= places[1] <= wider[1] + 2 * told.rank_error
+
+
 @pytest.mark.parametrize("seed", [0, 20])
 def test_the_ends_of_all_resamples_are_those_of_many(seed, monkeypatch):
     """The binomial distribution of a resample's median beside 4000 resamples: within two places of the sorted values."""
     values = np.sort(np.random.default_rng(seed).normal(size=2001))
-    exact = paired.median_interval(values, seed=0)
+    exact = paired.median_interval(Quantiles(values), seed=0)
     monkeypatch.setattr(paired, "_MANY", 10**9)
-    drawn = paired.median_interval(values, seed=0)
+    drawn = paired.median_interval(Quantiles(values), seed=0)
     for one, other in ((exact.low, drawn.low), (exact.high, drawn.high)):
         assert abs(int(np.searchsorted(values, one)) - int(np.searchsorted(values, other))) <= 2
     assert exact.median == drawn.median

@@ -70,7 +70,7 @@ def test_records_are_those_of_ordinary_runs(name: str) -> None:
     """Every metric, in every scenario with its own parameters and its own noise."""
     task, controller, close = STUDIES[name]
     conditions = Conditions(seed=5, use=COMPARING, percent=10.0, compiled=True)
-    bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
+    bench, ordinary = Bench(task, replace(conditions, side_by_side=True)), Bench(task, conditions)
     records = list(bench.records(range(11), controller))
     assert not bench.apart
     for number in (0, 4, 7, 8, 10):
@@ -79,7 +79,7 @@ def test_records_are_those_of_ordinary_runs(name: str) -> None:
 
 def test_a_record_does_not_depend_on_its_neighbours() -> None:
     """Bit by bit: so it is the same whoever computes it, and with whatever others."""
-    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True), side_by_side=True)
+    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
     together = list(bench.records(range(12), "RHC+FPI"))
     assert next(bench.records([9], "RHC+FPI")) == together[9]
     assert list(bench.records([11, 3], "RHC+FPI")) == [together[11], together[3]]
@@ -93,7 +93,7 @@ def test_a_run_that_ends_early_is_the_ordinary_one_and_its_neighbours_stay() -> 
     task = replace(task, controllers={"wild": controller})
     path, conditions = "deformation.map.gain", Conditions(0, COMPARING, 5.0, True)
     live = {"wild": (path,)}
-    bench, ordinary = Bench(task, conditions, live, side_by_side=True), Bench(task, conditions, live)
+    bench, ordinary = Bench(task, replace(conditions, side_by_side=True), live), Bench(task, conditions, live)
     gains = [-0.5, -9.0, -0.7]
     records = list(bench.records([0, 0, 0], "wild", [{path: gain} for gain in gains]))
     assert [one["outcome"] for one in records] == ["finished", "ended early", "finished"]
@@ -109,7 +109,7 @@ def test_a_metric_of_whole_runs_and_a_solver_are_told() -> None:
     limited = short(TWO_MASS, limits=fp.Limits(states={"q1": (-9.0, 9.0)}))
     conditions = Conditions(0, COMPARING, 5.0, True)
     for task, name, why in ((own, "CTC", "the metric 'middle' reads whole runs"), (limited, "RHC", "not written")):
-        bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
+        bench, ordinary = Bench(task, replace(conditions, side_by_side=True)), Bench(task, conditions)
         assert list(bench.records([0, 1], name)) == [ordinary.record(k, name) for k in (0, 1)]
         assert why in bench.apart[name]
 
@@ -122,7 +122,7 @@ def test_cases_of_one_loop_are_measured_each_by_its_own_problem() -> None:
     changes = {f"{k}": {"exact.m1": 1.0 + 0.01 * k, "measure_from": 0.5 + k % 2} for k in range(16)}
     task = replace(short(TWO_MASS), metrics=(*TWO_MASS.metrics, weight), cases=fp.Cases(changes))
     conditions = Conditions(0, COMPARING, 0.0, True, named=True)
-    bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
+    bench, ordinary = Bench(task, replace(conditions, side_by_side=True)), Bench(task, conditions)
     records = list(bench.records(range(16), "CTC"))
     assert not bench.apart
     for number in (0, 1, 14, 15):
@@ -131,7 +131,7 @@ def test_cases_of_one_loop_are_measured_each_by_its_own_problem() -> None:
 
 def test_one_case_that_cannot_be_summed_up_leaves_the_others_alone() -> None:
     """It runs as an ordinary run, and the records of the others are the same to the bit."""
-    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True), side_by_side=True)
+    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
     together = list(bench.records(range(4), "CTC"))
     lanes = next(iter(bench._lanes.values()))
     plain, odd = lanes._sums.start, bench._scenario(2).problem
@@ -161,7 +161,7 @@ def test_a_loop_without_lanes_is_built_once_for_every_run_at_most(monkeypatch: p
         short(TWO_MASS),
         metrics=(fp.Metric("middle", lambda _, run: float(np.median(run["error.q1"]))), *TWO_MASS.metrics),
     )
-    bench = Bench(own, Conditions(0, COMPARING, 5.0, True), side_by_side=True)
+    bench = Bench(own, Conditions(0, COMPARING, 5.0, True, side_by_side=True))
     for block in bench.blocks("CTC", range(4)):
         list(bench.records(block, "CTC"))
     assert bench.apart
@@ -172,14 +172,14 @@ def test_what_a_figure_reads_is_kept() -> None:
     """Figures of a problem file are functions of one signal, of which every cycle is kept."""
     task = replace(short(TWO_MASS), metrics=(*TWO_MASS.metrics, fp.figures.InBand("state.q1", -1.0, 1.0)))
     conditions = Conditions(0, COMPARING, 5.0, True)
-    bench, ordinary = Bench(task, conditions, side_by_side=True), Bench(task, conditions)
+    bench, ordinary = Bench(task, replace(conditions, side_by_side=True)), Bench(task, conditions)
     [record] = bench.records([3], "CTC")
     assert not bench.apart
     assert_equal(record, ordinary.record(3, "CTC"), SMOOTH)
 
 
 def test_scenarios_side_by_side_are_those_one_after_the_other(tmp_path: Path) -> None:
-    """Statistics, and the records of two processes bit by bit."""
+    """Statistics, and the records of two processes bit by bit; what was begun one by one goes on so, and says it."""
     settings: dict[str, Any] = {"count": 70, "percent": 10.0, "seed": 2, "controllers": ["CTC", "CTC+FPI (eq 6)"]}
     task = TWO_MASS
     lanes = compare_scenarios(task, folder=tmp_path / "lanes", **settings)
@@ -188,6 +188,10 @@ def test_scenarios_side_by_side_are_those_one_after_the_other(tmp_path: Path) ->
     for name, some in plain.records.items():
         for record, expected in zip(lanes.records[name], some, strict=False):
             assert_equal(record, expected, SMOOTH)
+    begun = compare_scenarios(task, folder=tmp_path / "plain", **settings)
+    assert set(begun.apart) == {"CTC", "CTC+FPI (eq 6)"}
+    assert [one[:12] for one in begun.records.values()] == list(plain.records.values())
+    assert begun.records["CTC"][69] == Bench(task, Conditions(2, COMPARING, 10.0, True)).record(69, "CTC")
     compare_scenarios(task, folder=tmp_path / "two", processes=2, **settings)
     one, two = (sorted((tmp_path / f / LEDGER).read_text().splitlines()) for f in ("lanes", "two"))
     assert one == two
@@ -219,7 +223,7 @@ def test_costs_of_a_search_are_those_of_single_runs(tmp_path: Path) -> None:
 
 def test_lanes_keep_to_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs take turns where their noise needs more room, and are the same."""
-    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True), side_by_side=True)
+    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
     together = list(bench.records(range(20), "CTC"))
     monkeypatch.setattr("fpirhc.simulation.lanes._ROOM", 1)
     assert list(bench.records(range(20), "CTC")) == together

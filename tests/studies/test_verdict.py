@@ -280,24 +280,24 @@ def summary(name: str, interval: tuple[float, float] | None) -> Summary:
     """A controller whose error differs from the baseline's by this interval."""
     difference = None if interval is None else ConfidenceInterval(sum(interval) / 2, *interval)
     errors = np.full(5, 0.1)
-    return Summary(
-        name,
-        errors,
-        errors,
-        errors,
-        0.1,
-        0.1,
-        0,
-        "0",
-        {"rms_error": {}},
-        {},
-        {"finished": 5},
-        {},
-        difference,
-        1.0,
-        2,
-        0,
-    )
+    figures: dict[str, Any] = {
+        "errors": errors,
+        "values": errors,
+        "mismatch": errors,
+        "rank_error": 0.0,
+        "median": 0.1,
+        "worst": 0.1,
+    }
+    places: dict[str, Any] = {
+        "median_scenario": 0,
+        "worst_scenario": 0,
+        "worst_name": "0",
+        "first_ended": None,
+        "scenarios": np.arange(5),
+    }
+    counts: dict[str, Any] = {"count": 5, "outcomes": {"finished": 5}, "statuses": {}, "better": 2, "equal": 0}
+    metrics: dict[str, Any] = {"metrics": {"rms_error": {}}, "worst_metrics": {}}
+    return Summary(name=name, difference=difference, ratio=1.0, **figures, **places, **counts, **metrics)
 
 
 @pytest.mark.parametrize(

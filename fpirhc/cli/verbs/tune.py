@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from fpirhc.cli.options import (
     add_cases,
     add_controllers,
+    add_json,
     add_mismatch,
     add_out,
     add_problem,
@@ -42,6 +43,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     compiling.add_argument("--compile", action="store_const", const=True, dest="compiled", help=text)
     text = "compile no loop"
     compiling.add_argument("--no-compile", action="store_const", const=False, dest="compiled", help=text)
+    add_json(parser, "the table: what tuning.json holds")
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -57,7 +59,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     name += f"_by_{options.metric}" if options.metric else ""
     name += f"_population{options.population}" if options.population > 1 else ""
     folder = results_folder(options.out, task.name, name)
-    with resumable(folder / LEDGER), progress_bars() as progress:
+    with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:
         tuning = tune(
             task,
             trials=options.trials,
@@ -73,7 +75,10 @@ def _run(options: argparse.Namespace) -> ExitCode:
             progress=progress,
         )
     write_tuned(tuning.facts(), folder / "tuning.json")
-    _show(tuning, folder / "tuning.json")
+    if options.json:
+        print((folder / "tuning.json").read_text(encoding="utf-8"), end="")
+    else:
+        _show(tuning, folder / "tuning.json")
     return ExitCode.FINISHED
 
 

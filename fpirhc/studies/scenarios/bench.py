@@ -34,7 +34,7 @@ from fpirhc.studies.comparison.causes import error_left_alone
 from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
 from fpirhc.task.problem import Problem
 
-FORMAT = 5  # of records
+FORMAT = 6  # of records
 _BLOCK = 64  # scenarios that run side by side
 SIDE_BY_SIDE = 64  # scenarios from which it pays to compile a loop for lanes
 
@@ -49,6 +49,9 @@ class Conditions:
     # whether runs use compiled C; None: only those of loops with live settings, which are compiled once
     compiled: bool | None
     named: bool = False  # whether they are the cases of the problem file
+    side_by_side: bool = (
+        False  # whether runs are side by side where they can be: equal to rounding, see `Bench.records`
+    )
 
 
 def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
@@ -101,7 +104,6 @@ class Bench:
 
     Args:
         live: paths of the settings that `record` may change, by name of the controller.
-        side_by_side: whether runs are side by side where they can be, see `records`.
         judged: whether runs have the signals that judge them, which take longer than the run.
 
     Raises:
@@ -114,11 +116,10 @@ class Bench:
         conditions: Conditions,
         live: Mapping[str, Sequence[str]] | None = None,
         *,
-        side_by_side: bool = False,
         judged: bool = False,
     ) -> None:
         self._judging = judged
-        self._live, self._side_by_side = live or {}, side_by_side and conditions.compiled is not False
+        self._live, self._side_by_side = live or {}, conditions.side_by_side and conditions.compiled is not False
         self.apart: dict[str, str] = {}
         self._task, self._conditions = task, conditions
         self._scenarios = scenarios(task, conditions)
@@ -148,13 +149,13 @@ class Bench:
         for place, (number, own) in enumerate(jobs):
             yield found[place] if place in found else self.record(number, name, own)
 
-    def blocks(self, name: str, numbers: Sequence[int]) -> Iterator[Sequence[int]]:
+    def blocks(self, name: str, numbers: Sequence[int] | np.ndarray) -> Iterator[list[int]]:
         """Yield the scenarios in pieces for `records`: single ones where a controller's runs are one after the other."""
-        if self._side_by_side and numbers and self._scenarios.has_many_alike(numbers[0]):
+        if self._side_by_side and len(numbers) and self._scenarios.has_many_alike(int(numbers[0])):
             with contextlib.suppress(FpirhcError):  # it is said by the first record
-                self._lanes_of(name, self._scenario(numbers[0]))
+                self._lanes_of(name, self._scenario(int(numbers[0])))
         size = _BLOCK if self._side_by_side and name not in self.apart else 1
-        yield from (numbers[at : at + size] for at in range(0, len(numbers), size))
+        yield from (list(map(int, numbers[at : at + size])) for at in range(0, len(numbers), size))
 
     def _groups(
         self, name: str, jobs: Sequence[tuple[int, Mapping[str, float] | None]]
@@ -170,10 +171,10 @@ class Bench:
                 if found is None:
                     continue
                 lanes, ready = found
-                problem, memory = ready.first_memory(scenario.problem, settings)
-                key = id(lanes), problem.cycles, first_measured(problem)
-                group = groups.setdefault(key, (lanes, []))
-                group[1].append(_InLanes(place, scenario, OneRun(problem, memory, scenario.seed)))
+                alone = self._scenarios.differ_in_exact_alone and not settings
+                run = lanes.one_run(ready, scenario.problem, scenario.seed, settings, exact_alone=alone)
+                key = id(lanes), run.problem.cycles, first_measured(run.problem)
+                groups.setdefault(key, (lanes, []))[1].append(_InLanes(place, scenario, run))
         return list(groups.values())
 
     def _lanes_of(self, name: str, scenario: Scenario) -> tuple[Lanes, Simulator] | None:
@@ -320,28 +321,20 @@ class Trials:
         name: of the controller.
         paths: of the settings.
         conditions: of the scenarios.
-        side_by_side: as of `Bench`.
         judged: as of `Bench`.
     """
 
     def __init__(
-        self,
-        task: Task,
-        name: str,
-        paths: Sequence[str],
-        conditions: Conditions,
-        *,
-        side_by_side: bool = False,
-        judged: bool = False,
+        self, task: Task, name: str, paths: Sequence[str], conditions: Conditions, *, judged: bool = False
     ) -> None:
         self._task, self._name, self._paths = replace(task, controllers={name: task.controllers[name]}), name, paths
-        self._conditions, self._side_by_side, self._judged = conditions, side_by_side, judged
+        self._conditions, self._judged = conditions, judged
         self._rebuilt: tuple[dict[str, float], Bench] | None = None
 
     @cached_property
     def _bench(self) -> Bench:
         live = {self._name: self._paths}
-        return Bench(self._task, self._conditions, live, side_by_side=self._side_by_side, judged=self._judged)
+        return Bench(self._task, self._conditions, live, judged=self._judged)
 
     @property
     def apart(self) -> str:
@@ -373,7 +366,8 @@ class Trials:
         if self._rebuilt is None or self._rebuilt[0] != settings:
             changed = with_settings(self._task.controllers[self._name], settings)
             task = replace(self._task, controllers={self._name: changed})
-            self._rebuilt = dict(settings), Bench(task, self._conditions, judged=self._judged)
+            alone = replace(self._conditions, side_by_side=False)
+            self._rebuilt = dict(settings), Bench(task, alone, judged=self._judged)
         return self._rebuilt[1]
 
 

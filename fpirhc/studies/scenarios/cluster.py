@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import itertools
 import json
 import logging
 import math
@@ -21,7 +22,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from functools import lru_cache
 from pathlib import Path
@@ -31,8 +32,31 @@ from fpirhc.errors import FpirhcError, InvalidValue, WorkerDied, package
 from fpirhc.studies.scenarios.worker import Study, answered, study
 from fpirhc.symbolic.native import machine_facts
 
+_NONE = object()  # no job is left
 AHEAD = 2  # jobs that a worker has at once, so that it never waits for the next one
 DEATHS = 5  # workers that die at one job before the study ends
+
+
+class _Jobs:
+    """Jobs that several threads take one after the other; the next one is known, so that it is seen when the last one is taken."""
+
+    def __init__(self, jobs: Iterator[Any]) -> None:
+        self._jobs, self._next, self._count, self._one_at_a_time = jobs, next(jobs, _NONE), 0, threading.Lock()
+
+    def taken(self, most: int) -> list[Any]:
+        """Take so many jobs, or those that are left."""
+        some: list[Any] = []
+        with self._one_at_a_time:
+            while len(some) < most and self._next is not _NONE:
+                some.append(self._next)
+                self._next = next(self._jobs, _NONE)
+            self._count += len(some)
+        return some
+
+    def are_done(self, answers: int) -> bool:
+        """Whether so many answers are those of all jobs."""
+        with self._one_at_a_time:
+            return self._next is _NONE and answers == self._count
 
 
 class Workers:
@@ -68,42 +92,41 @@ class Workers:
         for thread in self._threads:
             thread.join()
 
-    def answers(self, jobs: Sequence[Any], own: Callable[[Any], Any] | None = None) -> Iterator[Any]:
+    def answers(self, jobs: Iterable[Any], own: Callable[[Any], Any] | None = None) -> Iterator[Any]:
         """Yield the answer of every job as it comes, in no particular order.
 
         Args:
-            jobs: the jobs.
+            jobs: the jobs, each of which is asked for when somebody can begin it.
             own: function that answers a job. With it this process is one of the `count`, which saves the start of another.
         """
-        waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        answered: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        for job in jobs:
-            waiting.put(job)
-        for k in range(min(self._count, len(jobs)) - (own is not None)):
+        others = iter(jobs)
+        first = list(itertools.islice(others, self._count))
+        waiting, answered = _Jobs(itertools.chain(first, others)), queue.SimpleQueue[Any]()
+        for k in range(len(first) - (own is not None)):
             self._threads.append(threading.Thread(target=self._drive, args=(k, waiting, answered), daemon=True))
             self._threads[-1].start()
-        for _ in jobs:
+        for done in itertools.count():
+            if waiting.are_done(done):
+                return
             answer = self._next(waiting, answered, own)
             if isinstance(answer, Exception):
                 raise answer
             yield answer
 
-    def _next(
-        self, waiting: queue.SimpleQueue[Any], answered: queue.SimpleQueue[Any], own: Callable[[Any], Any] | None
-    ) -> Any:
+    def _next(self, waiting: _Jobs, answered: queue.SimpleQueue[Any], own: Callable[[Any], Any] | None) -> Any:
         """The answer of another process if there is one, else one of this process; with no job left, the next that comes."""
         if own is None or not answered.empty():
             return answered.get()
-        mine = _taken(waiting, 1)
+        mine = waiting.taken(1)
         return own(mine[0]) if mine else answered.get()
 
-    def _drive(self, k: int, waiting: queue.SimpleQueue[Any], answered: queue.SimpleQueue[Any]) -> None:
+    def _drive(self, k: int, waiting: _Jobs, answered: queue.SimpleQueue[Any]) -> None:
         """Keep worker `k` busy until no job is left."""
         pending: deque[Any] = deque()
         process, deaths = None, 0
         try:
             while not self._stopping.is_set():
-                new = _taken(waiting, AHEAD - len(pending))
+                new = waiting.taken(AHEAD - len(pending))
                 pending += new
                 if not pending:
                     break
@@ -166,16 +189,6 @@ def _popen(module: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True, encoding="utf-8"
     )
-
-
-def _taken(waiting: queue.SimpleQueue[Any], most: int) -> list[Any]:
-    taken: list[Any] = []
-    while len(taken) < most:
-        try:
-            taken.append(waiting.get_nowait())
-        except queue.Empty:
-            break
-    return taken
 
 
 def _send(process: subprocess.Popen[str], values: Sequence[Any]) -> None:
@@ -260,24 +273,25 @@ class Cluster:
         with contextlib.suppress(Exception):  # a scheduler that is gone cannot be left in good order
             self._stack.close()
 
-    def answers(self, jobs: Sequence[Job], own: Callable[[Job], Any] | None = None) -> Iterator[Any]:
+    def answers(self, jobs: Iterable[Job], own: Callable[[Job], Any] | None = None) -> Iterator[Any]:
         """Yield the answer of every job as it comes, in no particular order."""
         del own  # this process has the ledger to write
         try:
-            for answers in self._chunks(deque(jobs)):
+            for answers in self._chunks(iter(jobs)):
                 yield from answers
         except (OSError, TimeoutError, CancelledError) as error:
             raise _lost("the cluster does not answer any more", error) from None
 
-    def _chunks(self, waiting: deque[Job]) -> Iterator[list[Any]]:
+    def _chunks(self, jobs: Iterator[Job]) -> Iterator[list[Any]]:
         """Answers of one task after the other; tasks get longer until their transport does not count."""
         size, running = 1, 0
         pool = self._dask.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
-        while waiting or running:
-            while waiting and running < self._room():
-                chunk = [waiting.popleft() for _ in range(min(size, len(waiting)))]
+        while True:
+            while running < self._room() and (chunk := list(itertools.islice(jobs, size))):
                 pool.add(self._client.submit(run_jobs, self._opening, self._content, self._greeting, chunk, pure=False))
                 running += 1
+            if not running:
+                return
             future, result = next(pool)
             running -= 1
             if future.status != "finished":

@@ -120,6 +120,11 @@ class Scenarios(ABC):
     def options(self, number: int) -> tuple[str, ...]:
         """Return the options of `fpirhc run` that run a scenario once more."""
 
+    @property
+    def differ_in_exact_alone(self) -> bool:
+        """Whether exact parameters are all in which the problems of the scenarios differ."""
+        return False
+
     def automatic(self, controller: Controller) -> Controller:
         """Return the controller with those settings that it has whatever the scenario is."""
         return controller
@@ -155,6 +160,10 @@ class RandomScenarios(Scenarios):
 
     def automatic(self, controller: Controller) -> Controller:
         return resolved(self.of, controller) if self._draws_dead_times else controller
+
+    @property
+    def differ_in_exact_alone(self) -> bool:
+        return not self._draws_dead_times
 
     @cached_property
     def _shared(self) -> Shared | None:

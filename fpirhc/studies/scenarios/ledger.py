@@ -16,120 +16,40 @@ import sys
 import time
 import zlib
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Self, overload
 
 from fpirhc.errors import InvalidField, OutputError
 from fpirhc.fields.checked import Checked, field_names
 
-_SMALL = (("b", 2**7), ("i", 2**31), ("q", 2**63))  # types of whole numbers, and their ends
-_MEMORY = 1000  # texts that are looked for before they are stored once more
-
-Place = tuple[str, ...]
-Form = tuple[tuple[Place, str], ...]  # of every entry: its place, and the type of its column; "" for None
-
-
-class _Table:
-    """The columns of all records that have the same entries."""
-
-    def __init__(self, form: Form) -> None:
-        self.form = form
-        self._columns = [array(kind) for _, kind in form if kind]
-        self.size = 0
-
-    def append(self, values: Sequence[Any]) -> None:
-        for column, value in zip(self._columns, values, strict=True):
-            column.append(value)
-        self.size += 1
-
-    def row(self, number: int) -> Iterator[Any]:
-        return (column[number] for column in self._columns)
-
-
-class _Texts:
-    """Texts one after the other, the usual ones once."""
-
-    def __init__(self) -> None:
-        self._all, self._places = bytearray(), dict[str, int]()
-
-    def place(self, text: str) -> int:
-        if text not in self._places:
-            if len(self._places) >= _MEMORY:
-                self._places.pop(next(iter(self._places)))
-            self._places[text] = len(self._all)
-            self._all += text.encode() + b"\0"
-        return self._places[text]
-
-    def at(self, place: int) -> str:
-        return self._all[place : self._all.index(b"\0", place)].decode()
-
-
-class _Store:
-    """Tables of all forms that came."""
-
-    def __init__(self) -> None:
-        self._tables: dict[Form, int] = {}
-        self._of: list[_Table] = []
-        self._texts = _Texts()
-        self._table, self._row = array("I"), array("I")
-
-    def append(self, record: Mapping[str, Any]) -> int:
-        entries = [(path, *self._stored(value)) for path, value in _leaves(record, ())]
-        form = tuple((path, kind) for path, kind, _ in entries)
-        if form not in self._tables:
-            self._tables[form] = len(self._of)
-            self._of.append(_Table(form))
-        table = self._tables[form]
-        self._table.append(table)
-        self._row.append(self._of[table].size)
-        self._of[table].append([value for _, kind, value in entries if kind])
-        return len(self._row) - 1
-
-    def _stored(self, value: Any) -> tuple[str, Any]:
-        """The type of the value's column, and what stands there; "I" and "L" are places of texts and of other values' JSON."""
-        if value is None:
-            return "", None
-        if isinstance(value, float):
-            return "d", value
-        if isinstance(value, str) and "\0" not in value:
-            return "I", self._texts.place(value)
-        if isinstance(value, int) and not isinstance(value, bool):
-            for kind, end in _SMALL:
-                if -end <= value < end:
-                    return kind, value
-        return "L", self._texts.place(json.dumps(value))
-
-    def read(self, place: int) -> dict[str, Any]:
-        table, record = self._of[self._table[place]], dict[str, Any]()
-        values = table.row(self._row[place])
-        for path, kind in table.form:
-            value: Any = next(values) if kind else None
-            if kind in ("I", "L"):
-                text = self._texts.at(value)
-                value = text if kind == "I" else json.loads(text)
-            inside = record
-            for name in path[:-1]:
-                inside = inside.setdefault(name, {})
-            inside[path[-1]] = value
-        return record
-
 
 class Records(Sequence[Mapping[str, Any]]):
-    """Records in their order; each is a new dictionary, equal to the one that was appended."""
+    """Records of a file in their order; each is read where it is asked for: what stays in memory is its place, eight bytes.
 
-    def __init__(self) -> None:
-        self._store, self._places = _Store(), array("I")
+    Args:
+        path: of the file.
+        places: of the records' lines, in bytes from the start.
+    """
 
-    def append(self, record: Mapping[str, Any]) -> None:
-        """Add a record: names with numbers, texts, None, lists, or such mappings."""
-        self._places.append(self._store.append(record))
+    def __init__(self, path: Path, places: Iterable[int] = ()) -> None:
+        self._path, self._places = path, array("Q", places)
 
-    def at(self, places: Sequence[int]) -> Records:
-        """Return some of the records, which share the columns of all."""
-        some = Records()
-        some._store, some._places = self._store, array("I", (self._places[k] for k in places))
-        return some
+    def append(self, place: int) -> None:
+        """Add the record of the line that starts there."""
+        self._places.append(place)
+
+    def at(self, numbers: Iterable[int]) -> Records:
+        """Return some of the records."""
+        return Records(self._path, (self._places[k] for k in numbers))
+
+    def __iter__(self) -> Iterator[Mapping[str, Any]]:
+        with self._path.open("rb") as file:
+            for place in self._places:
+                file.seek(place)
+                record = _parsed(self._path, file.readline())
+                record.pop(_SUM, None)
+                yield record
 
     @overload
     def __getitem__(self, place: int) -> Mapping[str, Any]: ...
@@ -138,7 +58,7 @@ class Records(Sequence[Mapping[str, Any]]):
     def __getitem__(self, place: int | slice) -> Mapping[str, Any] | Records:
         if isinstance(place, slice):
             return self.at(range(len(self))[place])
-        return self._store.read(self._places[place])
+        return next(iter(self.at([place])))
 
     def __len__(self) -> int:
         return len(self._places)
@@ -154,16 +74,6 @@ class Records(Sequence[Mapping[str, Any]]):
 
     def __repr__(self) -> str:
         return repr(list(self))
-
-
-def _leaves(value: Mapping[str, Any], path: Place) -> Iterator[tuple[Place, Any]]:
-    """Every entry that is no mapping with names, with its path."""
-    for name, one in value.items():
-        here = (*path, name)
-        if isinstance(one, Mapping) and one and all(isinstance(key, str) for key in one):
-            yield from _leaves(one, here)
-        else:
-            yield here, one
 
 
 _SUM = "sum"  # entry with the checksum of a line
@@ -183,7 +93,7 @@ class Ledger:
 
     def __init__(self, path: Path, header: Mapping[str, Any], record: type[Checked] | None = None) -> None:
         self._path, self._record = path, record
-        self._waiting, self._forced = 0, time.monotonic()
+        self._waiting, self._forced, self._end = 0, time.monotonic(), 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open(
@@ -200,8 +110,7 @@ class Ledger:
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write one record; every so often, wait until all are on the disk."""
-        self._write(record)
-        self.records.append(record)
+        self.records.append(self._write(record))
 
     def close(self) -> None:
         """Force all to the disk and close the file; another process may open it then."""
@@ -216,17 +125,20 @@ class Ledger:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _write(self, value: Mapping[str, Any]) -> None:
-        line = _text({**value, _SUM: _sum(value)}).encode() + b"\n"
+    def _write(self, value: Mapping[str, Any]) -> int:
+        """The place where the line begins."""
+        line, place = _text({**value, _SUM: _sum(value)}).encode() + b"\n", self._end
         try:
             written = self._file.write(line)
             while written < len(line):
                 written += self._file.write(line[written:])
         except OSError as error:
             raise self._full(error) from None
+        self._end += len(line)
         self._waiting += 1
         if self._waiting >= _GROUP or time.monotonic() - self._forced >= _WAIT:
             self._force()
+        return place
 
     def _force(self) -> None:
         """Wait until everything that was written is on the disk."""
@@ -244,9 +156,9 @@ class Ledger:
 
     def _read(self, header: dict[str, Any]) -> Records:
         """The records, one line after the other; a torn last line is cut off."""
-        records, whole, summed = Records(), 0, True
+        records, summed = Records(self._path), True
         for number, text in enumerate(self._whole_lines(), 1):
-            line = self._parsed(number, text)
+            line = _parsed(self._path, text, f", line {number}")
             if number == 1:
                 summed = _SUM in line
             else:
@@ -261,11 +173,11 @@ class Ledger:
             if number == 1 and line != header:
                 raise OutputError(_refusal(self._path, line, header))
             if number > 1:
-                records.append(line)
-            whole += len(text)
-        if whole != self._file.seek(0, os.SEEK_END):
-            self._file.truncate(whole)
-        if not whole:
+                records.append(self._end)
+            self._end += len(text)
+        if self._end != self._file.seek(0, os.SEEK_END):
+            self._file.truncate(self._end)
+        if not self._end:
             self._write(header)
             self._force()
             _sync_folder(self._path.parent)
@@ -290,15 +202,6 @@ class Ledger:
                 f"'{self._path}', line {number} is damaged: {error.text}; remove the line, and its result is computed again"
             ) from None
 
-    def _parsed(self, number: int, text: bytes) -> dict[str, Any]:
-        try:
-            value = json.loads(text)
-        except ValueError:
-            value = None
-        if not isinstance(value, dict):
-            raise OutputError(f"'{self._path}', line {number} is damaged; remove the file to begin again")
-        return value
-
 
 def header_of(path: Path) -> dict[str, Any]:
     """Return the conditions of the results in a file."""
@@ -318,6 +221,23 @@ def header_of(path: Path) -> dict[str, Any]:
     if not whole:
         raise OutputError(f"'{path}', line 1 is damaged; run this part again")
     return header
+
+
+def begun_with(path: Path, name: str, other: Any) -> Any:
+    """Return a condition of the results that a file holds; another value where it holds none that can be read."""
+    with contextlib.suppress(OutputError):
+        return header_of(path).get(name, other)
+    return other
+
+
+def _parsed(path: Path, text: bytes, where: str = "") -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = None
+    if not isinstance(value, dict):
+        raise OutputError(f"'{path}'{where} is damaged; remove the file to begin again")
+    return value
 
 
 def _text(value: Mapping[str, Any]) -> str:

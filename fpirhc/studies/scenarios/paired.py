@@ -1,18 +1,18 @@
-"""Statistics of each controller over many paired scenarios: medians, paired differences, worst cases, failures."""
+"""What is said of each controller over many paired scenarios: medians, paired differences, worst cases, failures."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fpirhc.by_name import FoundByName
-from fpirhc.simulation.metrics import Metric, known_metrics
 from fpirhc.studies.comparison.changes import Outcome
+from fpirhc.studies.scenarios.quantiles import Quantiles
 from fpirhc.studies.tuning.objective import Objective
 from fpirhc.summary import in_percent
 
@@ -26,13 +26,20 @@ class Summary(FoundByName):
     """
 
     name: str  # name of the controller
-    errors: np.ndarray  # relative errors by scenario, shape (n,)
-    values: np.ndarray  # of the figure of the comparison by scenario, shape (n,)
-    mismatch: np.ndarray  # mismatch of the model by scenario, shape (n,)
+    count: int  # number of scenarios
+    # numbers of those scenarios that are kept: all, or of thousands every second, fourth and so on, shape (k,)
+    scenarios: np.ndarray
+    errors: np.ndarray  # their relative errors, shape (k,)
+    values: np.ndarray  # their figures of the comparison, shape (k,)
+    mismatch: np.ndarray  # their mismatches of the model, shape (k,)
+    # by which share of the scenarios a median may be away from the middle, see `Quantiles`
+    rank_error: float
     median: float  # median of the values
+    median_scenario: int  # number of a scenario with the median, or with the nearest value that is kept
     worst: float  # worst value
     worst_scenario: int  # number of the scenario with the worst value
     worst_name: str  # its name; the number as text where scenarios are random
+    first_ended: int | None  # number of the first scenario that ended early
     # median over the scenarios, by metric and element; a run without the number counts as worse than any other
     metrics: Mapping[str, Mapping[str, float]]
     # the worst number over the scenarios, by metric and element, of metrics with a better direction
@@ -66,78 +73,7 @@ class Summary(FoundByName):
     @property
     def failure_share(self) -> tuple[float, float]:
         """The exact interval of the share of failures, see `share_interval`."""
-        return share_interval(self.failures, self.errors.size)
-
-
-def summarise(
-    name: str,
-    records: Sequence[Record],
-    baseline: Sequence[Record] | None,
-    seed: int,
-    metrics: Sequence[Metric] | None = None,
-    figure: Objective | None = None,
-) -> Summary:
-    """Return the summary of one controller's records against the baseline's of the same scenarios, in the same order.
-
-    Args:
-        baseline: the baseline's records; None for the baseline itself.
-        figure: by which controllers are compared; None: the relative error.
-    """
-    figure, known = figure or Objective(), known_metrics() if metrics is None else metrics
-    values = np.array([figure.value(r) for r in records])
-    before = values if baseline is None else np.array([figure.value(r) for r in baseline])
-    worst = int(np.argmax(values))
-    return Summary(
-        name=name,
-        errors=np.array([Objective().value(r) for r in records]),
-        values=values,
-        mismatch=np.array([r["mismatch"] for r in records]),
-        median=float(middle(values)),
-        worst=float(values[worst]),
-        worst_scenario=int(records[worst]["scenario"]),
-        worst_name=str(records[worst].get("name", records[worst]["scenario"])),
-        metrics=_over(records, known, lambda values, _: float(middle(values))),
-        worst_metrics=_over(
-            records,
-            [metric for metric in known if metric.better != "neither"],
-            lambda values, larger: float(values.min() if larger else values.max()),
-        ),
-        outcomes=dict(Counter(str(r["outcome"]) for r in records)),
-        statuses=dict(sum((Counter(r["metrics"]["status"]) for r in records), Counter())),
-        difference=None if baseline is None else median_interval(_differences(values, before), seed),
-        ratio=float(middle(_ratios(values, before))),
-        better=int(np.sum(values < before)),
-        equal=0 if baseline is None else int(np.sum(values == before)),
-    )
-
-
-def _over(
-    records: Sequence[Record], metrics: Sequence[Metric], one_of: Callable[[np.ndarray, bool], float]
-) -> dict[str, dict[str, float]]:
-    """One of all scenarios' numbers, for every number that some scenario has; `one_of` is given whether larger ones are better."""
-    larger = {m.name: m.better == "larger" for m in metrics}
-    columns: dict[str, dict[str, np.ndarray]] = {name: {} for name in larger}
-    for k, record in enumerate(records):  # once, because a record is made of columns anew
-        for name, numbers in record["metrics"].items():
-            for element, value in numbers.items() if name in columns else ():
-                if element not in columns[name]:
-                    columns[name][element] = np.full(len(records), -np.inf if larger[name] else np.inf)
-                if value is not None:
-                    columns[name][element][k] = value
-    return {name: {e: one_of(v, larger[name]) for e, v in one.items()} for name, one in columns.items() if one}
-
-
-def _differences(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Differences of errors; where both runs failed, the difference is zero."""
-    with np.errstate(invalid="ignore"):
-        differences = after - before
-    return np.where(np.isnan(differences), 0.0, differences)
-
-
-def _ratios(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratios = after / before
-    return np.where(np.isnan(ratios), 1.0, ratios)
+        return share_interval(self.failures, self.count)
 
 
 def noun(named: bool) -> str:
@@ -175,11 +111,10 @@ def verdict(
 def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> str:
     difference = one.difference
     assert difference is not None
-    count = one.errors.size
     numbers = (
         f"median difference of {figure.subject} {figure.difference(difference.median)}, 95 % interval "
         f"{figure.interval(difference.low, difference.high)}; "
-        f"{figure.better} in {one.better} of {count} {what}{f', equal in {one.equal}' if one.equal else ''}"
+        f"{figure.better} in {one.better} of {one.count} {what}{f', equal in {one.equal}' if one.equal else ''}"
     )
     times = f"{one.ratio:.3g} times its {figure.noun}"
     worse = "larger" if figure.better == "smaller" else "smaller"
@@ -192,7 +127,7 @@ def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> 
 
 def _failed(one: Summary, what: str) -> str:
     parts = [f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished"]
-    said = f"{one.name} fails in {one.failures} of {one.errors.size} {what} ({', '.join(parts)})"
+    said = f"{one.name} fails in {one.failures} of {one.count} {what} ({', '.join(parts)})"
     if what == noun(True):
         return f"{said}."
     low, high = map(in_percent, one.failure_share)
@@ -207,7 +142,7 @@ def _nowhere(none: Sequence[Summary], what: str) -> list[str]:
     verb = "fail" if len(none) > 1 else "fails"
     most = in_percent(none[0].failure_share[1])
     return [
-        f"{names} {verb} in none of {none[0].errors.size} {what}: in at most {most} of what is drawn so, with 95 % confidence."
+        f"{names} {verb} in none of {none[0].count} {what}: in at most {most} of what is drawn so, with 95 % confidence."
     ]
 
 
@@ -245,38 +180,41 @@ class ConfidenceInterval:
     high: float  # upper end of the interval
 
 
-def median_interval(values: np.ndarray, seed: int) -> ConfidenceInterval:
-    """Return the median of `values`, shape (n,), and its percentile bootstrap interval.
+def median_interval(values: Quantiles, seed: int) -> ConfidenceInterval:
+    """Return the median of `values` and its percentile bootstrap interval.
 
     Infinite values are allowed: they lie beyond all others. The interval is that of the population's median; with fewer than
     about ten values it is too narrow. Of many values the ends are those of infinitely many resamples: the median of one is at most
-    the k-th value with the probability P(X >= n / 2), X binomial with n trials of k / n.
+    the k-th value with the probability P(X >= n / 2), X binomial with n trials of k / n. They are further out by the places by
+    which a value that is told may be wrong.
 
     References:
         B. Efron, R. J. Tibshirani, An Introduction to the Bootstrap, Chapman and Hall, 1993, chapter 13.
     """
-    if values.size > _MANY:
-        low, high = np.sort(values)[[*_ends_of_all_resamples(values.size)]]
-        return ConfidenceInterval(float(middle(values)), float(low), float(high))
-    random = np.random.default_rng(np.random.SeedSequence(seed))
-    rows = max(1, _AT_ONCE // values.size)
+    if values.count > _MANY:
+        low, high = _ends_of_all_resamples(values.count)
+        return ConfidenceInterval(values.median, values.at(low - values.error), values.at(high + values.error))
+    random, numbers = np.random.default_rng(np.random.SeedSequence(seed)), values.numbers
+    rows = max(1, _AT_ONCE // numbers.size)
     samples: list[np.ndarray] = []
     for at in range(0, RESAMPLES, rows):
-        size = (min(rows, RESAMPLES - at), values.size)
-        samples.append(middle(values[random.integers(values.size, size=size)]))
+        size = (min(rows, RESAMPLES - at), numbers.size)
+        samples.append(middle(numbers[random.integers(numbers.size, size=size)]))
     medians = np.sort(np.concatenate(samples))
     tail = round((1 - LEVEL) / 2 * RESAMPLES)
-    return ConfidenceInterval(float(middle(values)), float(medians[tail]), float(medians[-1 - tail]))
+    return ConfidenceInterval(values.median, float(medians[tail]), float(medians[-1 - tail]))
 
 
 def _ends_of_all_resamples(size: int) -> tuple[int, int]:
     """Places, from 0, of the sorted values between which the median of a resample lies with probability `LEVEL`."""
     from scipy.special import bdtrc
 
-    shares = np.arange(1, size) / size
-    at_most = np.asarray(bdtrc(math.ceil(size / 2) - 1, size, shares))
-    low, high = np.searchsorted(at_most, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return int(low), int(high)
+    def at_most(k: int) -> float:
+        return float(bdtrc(math.ceil(size / 2) - 1, size, k / size))
+
+    shares = (1 - LEVEL) / 2, (1 + LEVEL) / 2
+    low, high = (bisect_left(range(1, size), share, key=at_most) for share in shares)
+    return low, high
 
 
 def middle(values: np.ndarray) -> np.ndarray:

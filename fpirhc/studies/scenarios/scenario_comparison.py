@@ -16,7 +16,7 @@ from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.scenarios.paired import Record, Summary, noun
 from fpirhc.studies.tuning.objective import Objective
 from fpirhc.studies.view import Study, View, status_shares
-from fpirhc.summary import Column, Table, line, written_out
+from fpirhc.summary import Column, Table, in_percent, line, written_out
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -109,6 +109,11 @@ def _view(comparison: ScenarioComparison) -> View:
         f"{comparison.count} {noun(comparison.named)} of seed {comparison.seed}{'' if comparison.named else drawn}, errors from "
         f"t = {comparison.measure_from:g} {comparison.time_unit} on."
     )
+    rank_error = max((one.rank_error for one in comparison.summaries), default=0.0)
+    if rank_error:
+        conditions += (
+            f" Medians are from {in_percent(0.5 - rank_error)} to {in_percent(0.5 + rank_error)} of the order."
+        )
     # The first sentences are about the rivals, in their order.
     outcomes = [one.outcome for one in comparison.summaries[1:]]
     return comparison.viewed(
@@ -198,7 +203,7 @@ def _beside(one: Summary, figure: Objective) -> list[str]:
     if d is None:
         return ["baseline", "", ""]
     apart = f"{figure.difference(d.median)} ({figure.interval(d.low, d.high)})"
-    return [apart, written_out(one.ratio), f"{one.better} of {one.values.size}"]
+    return [apart, written_out(one.ratio), f"{one.better} of {one.count}"]
 
 
 def _number(column: Number, of: Mapping[str, Mapping[str, float]]) -> str:
@@ -238,6 +243,8 @@ def _summary(one: Summary) -> dict[str, Any]:
         "failure_share": one.failure_share,
         "statuses": one.statuses,
         "worst_metrics": one.worst_metrics,
+        "rank_error": one.rank_error,
+        "shown_scenarios": one.scenarios.tolist(),
         "errors": one.errors.tolist(),
         "values": one.values.tolist(),
         "mismatch": one.mismatch.tolist(),

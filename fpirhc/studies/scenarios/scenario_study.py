@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,16 +31,18 @@ from fpirhc.studies.scenarios.bench import (
     scenario_numbers,
     scenarios,
 )
-from fpirhc.studies.scenarios.cluster import Cluster, Workers
+from fpirhc.studies.scenarios.cluster import Cluster, Job, Workers
 from fpirhc.studies.scenarios.draws import COMPARING
-from fpirhc.studies.scenarios.ledger import Ledger, header_of
-from fpirhc.studies.scenarios.paired import Record, Summary, noun, summarise, verdict
+from fpirhc.studies.scenarios.ledger import Ledger, Records, begun_with, header_of
+from fpirhc.studies.scenarios.paired import Summary, noun, verdict
+from fpirhc.studies.scenarios.running import summarise
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import with_tuned
 from fpirhc.studies.view import Progress, circumstances
 
 LEDGER = "scenarios.jsonl"
+_BEGUN = "the results that the folder held before are such runs; another --out begins anew, side by side"
 
 
 @checked_call
@@ -101,15 +104,17 @@ def compare_scenarios(
     task = with_tuned(task, tuned or {})
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
-    conditions = Conditions(seed, COMPARING, float(percent), compiled, named=cases is not None)
+    many = compiled and len(numbers) * shard[1] >= SIDE_BY_SIDE
+    begun = bool(
+        begun_with(folder / LEDGER, "side_by_side", many)
+    )  # what was begun one by one is not mixed with the other
+    conditions = Conditions(seed, COMPARING, float(percent), compiled, named=cases is not None, side_by_side=begun)
     judged = is_of_judgements(figure.metric)
-    side_by_side = compiled and len(numbers) * shard[1] >= SIDE_BY_SIDE
-    bench, header = Bench(task, conditions, side_by_side=side_by_side, judged=judged), fingerprint(task, conditions)
+    bench, header = Bench(task, conditions, judged=judged), fingerprint(task, conditions)
     opening = {
         "path": str(task.path.resolve()),
         "tuned": tuned or {},
         "conditions": asdict(conditions),
-        "side by side": side_by_side,
         "judged": judged,
     }
     workers: Workers | Cluster | None = None
@@ -124,7 +129,7 @@ def compare_scenarios(
         count=len(numbers),
         named=conditions.named,
         figure=figure,
-        groups=_groups(records, seed, task.metrics, figure),
+        groups=_groups(records, seed, task.metrics, figure) if conditions.named else {},
         percent=float(percent),
         seed=seed,
         measure_from=task.problem.measure_from,
@@ -137,22 +142,22 @@ def compare_scenarios(
         tuning={n: note for n, note in (tuning or {}).items() if n in names},
         **circumstances(task, select(task, names), command, begin),
         pictures=task.pictures,
-        apart={n: why for n, why in bench.apart.items() if n in records},
-        to_look_at={} if tuned else _to_look_at(task, conditions, summaries, records),
+        apart=dict.fromkeys(records, _BEGUN)
+        if many > begun
+        else {n: w for n, w in bench.apart.items() if n in records},
+        to_look_at={} if tuned else _to_look_at(task, conditions, summaries),
     )
 
 
 def _to_look_at(
-    task: Task, conditions: Conditions, summaries: Sequence[Summary], records: Mapping[str, Sequence[Record]]
+    task: Task, conditions: Conditions, summaries: Sequence[Summary]
 ) -> dict[str, dict[str, tuple[str, ...]]]:
     """Options of the runs of the worst, the median and the first failing scenario of every controller."""
     every = scenarios(task, conditions)
     found: dict[str, dict[str, tuple[str, ...]]] = {}
     for one in summaries:
-        order, failed = np.argsort(one.values, kind="stable"), np.flatnonzero(~np.isfinite(one.values))
-        places = {"worst": order[-1], "median": order[(len(order) - 1) // 2]}
-        places |= {"first that ended early": failed[0]} if failed.size else {}
-        numbers = {what: int(records[one.name][int(place)]["scenario"]) for what, place in places.items()}
+        numbers = {"worst": one.worst_scenario, "median": one.median_scenario}
+        numbers |= {} if one.first_ended is None else {"first that ended early": one.first_ended}
         found[one.name] = {f"{what} ({every[k].name})": every.options(k) for what, k in numbers.items()}
     return found
 
@@ -176,17 +181,17 @@ def _completed(
     numbers: Sequence[int],
     names: Sequence[str],
     progress: Progress | None,
-) -> tuple[dict[str, Sequence[Record]], dict[str, str]]:
+) -> tuple[dict[str, Records], dict[str, str]]:
     """Run the jobs that the ledger lacks; return all records by controller in order, and the skipped with reasons."""
     records, places = ledger.records, {name: np.full(max(numbers) + 1, -1, dtype=np.int32) for name in names}
     for place, record in enumerate(records):
         if record["controller"] in places and record["scenario"] <= max(numbers):
             places[record["controller"]][record["scenario"]] = place
-    jobs: list[tuple[Sequence[int], str]] = []
-    for name in names:
-        jobs += [(block, name) for block in bench.blocks(name, [k for k in numbers if places[name][k] < 0])]
-    jobs.sort(key=lambda job: job[0][0])  # controllers take turns
-    done = {name: int((places[name][list(numbers)] >= 0).sum()) for name in names}
+    wanted = np.asarray(numbers, dtype=np.int32)
+    lacking = {name: wanted[places[name][wanted] < 0] for name in names}
+    done = {name: len(wanted) - len(lacking[name]) for name in names}
+    # Controllers take turns.
+    jobs = heapq.merge(*(_jobs(bench, name, lacking[name]) for name in names), key=lambda job: job[0][0])
     skipped: dict[str, str] = {}
     # Closed whatever happens: the workers end with it.
     with closing(_answers(bench, workers, jobs)) as answers:
@@ -200,12 +205,14 @@ def _completed(
             done[name] += 1
             if progress:
                 progress(name, done[name], len(numbers))
-    return {n: records.at(places[n][list(numbers)].tolist()) for n in names if n not in skipped}, skipped
+    return {n: records.at(places[n][wanted]) for n in names if n not in skipped}, skipped
 
 
-def _answers(
-    bench: Bench, workers: Workers | Cluster | None, jobs: Sequence[tuple[Sequence[int], str]]
-) -> Generator[dict[str, Any]]:
+def _jobs(bench: Bench, name: str, numbers: np.ndarray) -> Iterator[Job]:
+    return ((block, name) for block in bench.blocks(name, numbers))
+
+
+def _answers(bench: Bench, workers: Workers | Cluster | None, jobs: Iterable[Job]) -> Generator[dict[str, Any]]:
     """Records of the jobs in the order in which they come; without workers this process runs the jobs."""
     if workers is None:
         for numbers, name in jobs:
@@ -219,20 +226,23 @@ def _answers(
 
 
 def _groups(
-    records: Mapping[str, Sequence[Record]], seed: int, metrics: Sequence[Metric], figure: Objective
+    records: Mapping[str, Records], seed: int, metrics: Sequence[Metric], figure: Objective
 ) -> dict[str, tuple[Summary, ...]]:
     """The summaries of every group of scenarios; none where no scenario has a group."""
     names = sorted({str(r["group"]) for some in records.values() for r in some} - {""})
     return {
         name: _summaries(
-            {c: [r for r in some if r["group"] == name] for c, some in records.items()}, seed, metrics, figure
+            {c: some.at(k for k, r in enumerate(some) if r["group"] == name) for c, some in records.items()},
+            seed,
+            metrics,
+            figure,
         )
         for name in names
     }
 
 
 def _summaries(
-    records: Mapping[str, Sequence[Record]], seed: int, metrics: Sequence[Metric], figure: Objective
+    records: Mapping[str, Records], seed: int, metrics: Sequence[Metric], figure: Objective
 ) -> tuple[Summary, ...]:
     if not records:
         return ()
@@ -270,17 +280,16 @@ def merge_shards(folders: Sequence[Path], out: Path) -> Joined:
     """
     header = header_of(folders[0] / LEDGER)
     with Ledger(out / LEDGER, header, RecordFields) as whole:
-        known = {_key(record): record for record in whole.records}
-        twice = 0
+        known, twice = {_key(record): k for k, record in enumerate(whole.records)}, 0
         for folder in folders:
             header_of(folder / LEDGER)  # a folder without results is named, and gets none
             with Ledger(folder / LEDGER, header, RecordFields) as part:
                 for record in part.records:
                     key = _key(record)
                     if key not in known:
+                        known[key] = len(whole.records)
                         whole.append(record)
-                        known[key] = record
-                    elif _result(known[key]) == _result(record):
+                    elif _result(whole.records[known[key]]) == _result(record):
                         twice += 1
                     else:
                         name, number = key

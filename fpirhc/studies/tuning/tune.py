@@ -32,7 +32,7 @@ from fpirhc.studies.scenarios.bench import (
     scenario_numbers,
 )
 from fpirhc.studies.scenarios.draws import TUNING
-from fpirhc.studies.scenarios.ledger import Ledger
+from fpirhc.studies.scenarios.ledger import Ledger, begun_with
 from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import as_python
 from fpirhc.studies.view import Progress
@@ -156,7 +156,10 @@ def tune(
             raise InvalidValue(f"{what} {value}: expected at least 1")
     # One scenario may be without draws: it is the problem itself.
     numbers = scenario_numbers(task, None if cases is not None and count == 1 else count, percent, cases, same=True)
-    conditions = Conditions(seed, TUNING, float(percent), compiled, named=cases is not None)
+    # A generation is a call of its own, so its runs alone fill a register.
+    many = len(numbers) * population >= _REGISTER and trials * len(numbers) >= SIDE_BY_SIDE
+    many = begun_with(folder / LEDGER, "side_by_side", many)
+    conditions = Conditions(seed, TUNING, float(percent), compiled, named=cases is not None, side_by_side=many)
     aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
     header = {
         **fingerprint(task, conditions),
@@ -234,16 +237,7 @@ def _tuned(
     before = {path: current_setting(task.controllers[name], path) for path in spans}
     # A trial keeps its cost alone, so no other metric is measured.
     needed = [metric for metric in task.metrics if metric.name in ("rms_error", aim.metric.name if aim.metric else "")]
-    # A generation is a call of its own, so its runs alone fill a register.
-    side_by_side = len(numbers) * population >= _REGISTER and trials * len(numbers) >= SIDE_BY_SIDE
-    runs = Trials(
-        replace(task, metrics=needed),
-        name,
-        tuple(spans),
-        conditions,
-        side_by_side=side_by_side,
-        judged=is_of_judgements(aim.metric),
-    )
+    runs = Trials(replace(task, metrics=needed), name, tuple(spans), conditions, judged=is_of_judgements(aim.metric))
     study = optuna.create_study()
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
     generations = [range(at, min(at + population, trials)) for at in range(0, trials, population)]
