@@ -45,7 +45,7 @@ def change(problem: fp.Problem, without: Controller, adaptive: Controller) -> fl
     return float(np.abs(runs[1][key] - runs[0][key]).max() / np.abs(runs[0][key]).max())
 
 
-def short(problem: fp.Problem, cycles: int = 400) -> fp.Problem:
+def short(problem: fp.Problem, cycles: int = 150) -> fp.Problem:
     return replace(problem, duration=cycles * problem.period, measure_from=0.0)
 
 

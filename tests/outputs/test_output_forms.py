@@ -182,15 +182,6 @@ def test_every_form_lowers_the_error_of_a_wrong_model(name: str, kind: str) -> N
     assert max(errors["increment"], errors["model-referenced"]) < 0.2 * bare
 
 
-@pytest.mark.parametrize("kind", ["CTC", "RHC"])
-@pytest.mark.parametrize("name", PLANTS)
-def test_a_model_referenced_deformation_of_an_exact_model_is_zero(name: str, kind: str) -> None:
-    make, _, rate = PLANTS[name]
-    problem = replace(make(), duration=make().period * 60, measure_from=0.0)
-    run = simulated(problem, controllers(rate)[kind].with_deformation(FORMS["model-referenced"]))
-    assert np.abs(run["deformed"] - run["desired"]).max() < 1e-12 * (1 + np.abs(run["desired"]).max())
-
-
 FIGURES = {
     ("CTC", "increment"): 0.0175,
     ("CTC", "model-referenced"): 0.0200,

@@ -45,7 +45,7 @@ def task(estimator: Any, *, exact: bool = False, **changes: Any) -> fp.Problem:
         "reference": fp.Trajectory(lambda t: {"y": 0.5 * ca.sin(2 * t)}),
         "start": {"q": 0.0, "q'": 1.0},
         "period": 1e-3,
-        "duration": 0.3,
+        "duration": 0.15,
         "limits": fp.Limits(inputs={"u": (-60.0, 60.0)}),
         "sensing": fp.Sensing(estimator=estimator),
     }
