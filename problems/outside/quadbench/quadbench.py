@@ -65,7 +65,7 @@ problem = fp.Problem(
     duration=draws.LENGTH,
     # With less thrust than half of its weight the rotors have no room left to turn the vehicle.
     limits=fp.Limits(inputs={"thrust_x": (-12.0, 12.0), "thrust_y": (-12.0, 12.0), "thrust_z": (5.0, 30.0)}),
-    horizon=fp.Horizon(stages=20, step=5e-2),
+    horizon=fp.Horizon(stages=20, step=1e-2, lengths=tuple(1.15**k for k in range(20))),  # 1 s
     cost=fp.Quadratic(
         states={**dict.fromkeys(AXES, 100.0), **{f"{n}'": 5.0 for n in AXES}},
         deviation=dict.fromkeys(plant.inputs, 1.0),
