@@ -34,6 +34,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
 _LATEST: Latest[Composite] = Latest(4)
+_SHOWN: Latest[np.ndarray] = Latest(8)
 
 
 def compose_with_sensing(problem: Problem, controller: Controller) -> Composite:
@@ -116,7 +117,8 @@ def _first(problem: Problem, quantities: Sequence[str]) -> dict[str, float]:
 def _first_values(problem: Problem, quantities: Sequence[str]) -> np.ndarray:
     """Measured quantities at the start, of the plant that moves."""
     at = problem.real_start, problem.inputs_before, problem.real_parameters, np.zeros(len(problem.real_plant.names))
-    return np.asarray(problem.truth.function(quantities, seen=True)(*at).full()).ravel()
+    known = problem.truth.function(quantities, seen=True)
+    return _SHOWN.of((problem,), (tuple(quantities),), lambda: np.asarray(known(*at).full()).ravel())
 
 
 def _believing(problem: Problem) -> Believing | None:

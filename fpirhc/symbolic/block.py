@@ -32,9 +32,9 @@ def is_long(gap: Expression) -> Expression:
 
 def shares(gap: Expression, count: int, degree: int = 1) -> list[Expression]:
     """Return the shares w_1 ... w_count of the newest value in values that are 1 ... count cycles old."""
-    result = []
+    result, cycles = [], gap + 1
     for i in range(1, count + 1):
-        share = ca.fmax(0, gap + 1 - i) / (gap + 1)
+        share = ca.fmax(0, cycles - i) / cycles
         for j in range(2, degree + 1):
             share *= (gap + j - i) / (gap + j)
         result.append(share)
@@ -125,12 +125,12 @@ class Block:
         for key, signal in self._results.items():
             if key not in values:
                 raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, values)}")
-            value = matrix(values[key])
+            value = values[key] if isinstance(values[key], matrix) else matrix(values[key])
             if value.numel() != signal.size:
                 raise InvalidShape(
                     f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {signal.size}"
                 )
-            results.append(ca.densify(value.reshape((signal.size, 1))))
+            results.append(_dense_column(value))
         keys = list(self._results)
         name, columns = PREFIX + self.name, list(symbols.values())
         function = ca.Function(name, columns, results, list(symbols), keys, {"allow_free": True})
@@ -356,6 +356,11 @@ def every(block: Block, cycles: int) -> Block:
 
     name = f"{block.name}_every_{cycles}"
     return Block(name, block.inputs, block.writes, step, own, opaque=True, derived=block.derived)
+
+
+def _dense_column(value: Matrix) -> Matrix:
+    """Return all entries as a column; what is one already is not built anew, which costs more than most operations."""
+    return value if value.is_dense() and value.is_column() else ca.densify(value.reshape((value.numel(), 1)))
 
 
 def _settings(signals: Iterable[Signal]) -> Layout:
