@@ -72,7 +72,7 @@ def moved(plant: fp.Plant, order: int, /, **settings: Any) -> tuple[fp.Problem, 
     of = "outputs" if plant.outputs else "states"
     start = {n: 0.1 if k == 0 else 0.0 for k, n in enumerate(plant.state.elements)}
     usual: dict[str, Any] = {
-        "horizon": fp.Horizon(stages=12, step=5 * CYCLE),
+        "horizon": fp.Horizon(stages=6, step=10 * CYCLE),
         "cost": fp.Quadratic(**{of: {"y": 100.0}}, effort={"F": 1e-3}),
         "limits": fp.Limits(inputs={"F": (-60.0, 60.0)}),
     }

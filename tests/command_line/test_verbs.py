@@ -288,26 +288,12 @@ def recorded() -> None:
     Path("run.csv").write_text("time,y,y',y''\n" + rows)
 
 
-# name of the command: (what to do before, its words, the exit code), one after the other
 def in_parts() -> None:
     """One of two parts of a study of two scenarios."""
-    main(
-        [
-            "compare",
-            "line.py",
-            "--scenarios",
-            "2",
-            "--mismatch",
-            "10",
-            "--shard",
-            "1/2",
-            "--out",
-            "part",
-            "--no-compile",
-        ]
-    )
+    main(shlex.split("compare line.py --scenarios 2 --mismatch 10 --shard 1/2 --out part --no-compile"))
 
 
+# name of the command: (what to do before, its words, the exit code), one after the other
 JOURNEYS: dict[str, Any] = {
     "merge": [(in_parts, "part --out joined", 0), (None, "part", 2), (None, "nowhere --out joined", 3)],
     "list": [(None, "", 0), (None, "--alll", 2)],

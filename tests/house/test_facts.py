@@ -393,25 +393,10 @@ CONTRACTS = (
     "task.disturbance.Disturbance",
     "tracking.base.Tracking",
 )
-GENERIC = (
-    "baselines",
-    "cli",
-    "contraction",
-    "problem_files",
-    "report",
-    "review",
-    "scaffold",
-    "simulation",
-    "studies",
-    "task",
-)
-GENERIC_FILES: tuple[str, ...] = (
-    "controllers/base.py",
-    "controllers/contract.py",
-    "controllers/demands.py",
-    "controllers/check.py",
-)
-GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/base.py", "tracking/base.py")
+GENERIC = ("baselines", "cli", "contraction", "problem_files", "report", "review", "scaffold")
+GENERIC += ("simulation", "studies", "task")
+GENERIC_FILES = [f"controllers/{name}.py" for name in ("base", "contract", "demands", "check", "tracked")]
+GENERIC_FILES += ["deformation/base.py", "tracking/base.py"]
 # Values that generic code builds for itself; it asks nobody whether he is one.
 BUILDS = {
     "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map

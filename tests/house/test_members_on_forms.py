@@ -4,8 +4,9 @@ A form is a way to say a plant (coordinates of any order, outputs of states, a s
 plant and controller (dead time, estimators, beliefs, another plant, a body outside). The law of a pair: the run with a wrong
 model stays near its reference, and a Stepper that is given the run's measurements has the run's commands. A controller decides
 what a Stepper is composed of, so each is replayed on all forms; its parts are blocks in it, and are replayed on two forms each,
-in turn. A pair that is not served stands below with the sentence that its user reads; every other refusal is a defect. Members
-are found by search, so a new one is tried on all forms, and a new form with all members.
+in turn. Examples of one member share the forms, each with those of its turn. A pair that is not served stands below with the
+sentence that its user reads; every other refusal is a defect. Members are found by search, so a new one is tried on all forms, and
+a new form with all members.
 """
 
 from __future__ import annotations
@@ -96,13 +97,17 @@ LEARNERS = (
     fp.MovingHorizon({"m": UNCERTAIN}, noise={"y": 0.1}, window=10, time=1.0),
 )
 MEMBERS: dict[str, Callable[[int], Controller]] = dict(CONTROLLERS)
+OF_CLASS: dict[str, list[str]] = {name: [name] for name in CONTROLLERS}  # the examples of each member
 for family, found in (
     ("deformations", examples("deformations", MAP)),
     ("tracking laws", examples("tracking laws")),
     ("optimisers", examples("optimisers", PLAN)),
     ("estimators", LEARNERS),
 ):
-    MEMBERS |= {f"{type(e).__name__} {k}": partial(around, e, family) for k, e in enumerate(found)}
+    for k, example in enumerate(found):
+        name = f"{type(example).__name__} {k}"
+        MEMBERS[name] = partial(around, example, family)
+        OF_CLASS.setdefault(type(example).__name__, []).append(name)
 
 
 # Pairs that are not served, with the sentence that their user reads
@@ -168,8 +173,13 @@ def replayed(problem: fp.Problem, controller: Controller, run: fp.Run) -> np.nda
     return np.array(commands)
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("member", MEMBERS)
+def pairs() -> list[tuple[str, str]]:
+    """Every member on every form, its examples in turn, and every pair of the tables."""
+    turns = [(group[k % len(group)], form) for group in OF_CLASS.values() for k, form in enumerate(FORMS)]
+    return [*dict.fromkeys((*turns, *REFUSED, *FARTHER))]
+
+
+@pytest.mark.parametrize(("member", "form"), pairs())
 def test_a_member_serves_a_form_or_says_why_not(member: str, form: str) -> None:
     problem, order = FORMS[form]
     if words := REFUSED.get((member, form)):

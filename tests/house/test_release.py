@@ -37,18 +37,8 @@ def test_bill_of_materials_names_what_is_needed():
     document = bill()
     assert (document["bomFormat"], document["specVersion"]) == ("CycloneDX", "1.6")
     versions = {c["name"].lower().replace("_", "-"): c["version"] for c in document["components"]}
-    for name in (
-        "casadi",
-        "numpy",
-        "scipy",
-        "osqp",
-        "control",
-        "matplotlib",
-        "pandas",
-        "rich",
-        "jinja2",
-        "lazy-loader",
-    ):
+    needed = "casadi numpy scipy osqp control matplotlib pandas rich jinja2 lazy-loader"
+    for name in needed.split():
         assert versions[name] == distribution(name).version
     assert "sphinx" not in versions
     inside = (ROOT / "fpirhc" / "report" / "assets" / "uPlot.iife.min.js").read_text(encoding="utf-8")

@@ -60,12 +60,8 @@ def errors(path: Path, controller: str) -> dict[str, float]:
     return dict(fp.measure(task.problem, run).rms_error)
 
 
-@pytest.mark.parametrize(
-    "path", [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in LONG), id=p.stem) for p in FILES]
-)
-def test_a_table_is_what_runs_give(path):
+def has_the_numbers_of_its_runs(task: Task, path: Path) -> None:
     """Every judged quantity with its unit, in two digits; a run on another machine may differ in the last one."""
-    task = loaded(path)
     table = rows(task.description)
     assert table
     units = followed_units(task.problem.plant)
@@ -77,27 +73,33 @@ def test_a_table_is_what_runs_give(path):
             assert float(number) == pytest.approx(errors(path, controller)[name], rel=0.05), (controller, name)
 
 
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+def test_a_description_is_what_runs_give(path):
+    """Every measured number stands in its table, and what is compared first plans at one rate.
+
+    No error, and no result of tuning, is told outside a table, where nobody would notice that it is no longer so. Both of the
+    pair plan or neither does, and as often, so that no rate of plans is taken for an effect of adaptation.
+    """
+    task = loaded(path)
+    if path.stem not in LONG:
+        has_the_numbers_of_its_runs(task, path)
+    assert task.headline
+    pair = [task.controllers[name] for name in task.headline]
+    assert len({innermost(one).planner is None for one in pair}) == 1
+    assert len({plan_every(task.problem, one) for one in pair}) == 1
+    assert "easured (" not in task.description
+    assert "fpirhc tune" not in task.description
+    assert task.description.lower().count("rms error") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [p for p in FILES if p.stem in LONG], ids=lambda p: p.stem)
+def test_a_table_of_long_runs_is_what_they_give(path):
+    has_the_numbers_of_its_runs(loaded(path), path)
+
+
 def test_every_problem_has_a_baseline_or_a_reason_why_not():
     """`fpirhc check` fails for any other."""
     problems, _ = problems_here(ROOT.parent)
     assert [path.stem for path in problems if not baseline_path(path).exists()] == []
     assert len(problems) > 20
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
-def test_what_is_compared_first_plans_at_one_rate(path):
-    """Both of the pair plan or neither does, and as often, so that no rate of plans is taken for an effect of adaptation."""
-    task = loaded(path)
-    assert task.headline
-    pair = [task.controllers[name] for name in task.headline]
-    assert len({innermost(one).planner is None for one in pair}) == 1
-    assert len({plan_every(task.problem, one) for one in pair}) == 1
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
-def test_nothing_else_is_measured(path):
-    """No error, and no result of tuning, is told outside a table, where nobody would notice that it is no longer so."""
-    text = loaded(path).description
-    assert "easured (" not in text
-    assert "fpirhc tune" not in text
-    assert text.lower().count("rms error") == 1

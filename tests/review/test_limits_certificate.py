@@ -20,7 +20,7 @@ from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupporte
 from fpirhc.review.limits_certificate import LimitsCertificate
 from fpirhc.review.prediction import exactly
 
-DURATIONS = {"body": 2.0, "arm": 2.0, "tanks": 3.0, "quadrotor": 1.0}
+DURATIONS = {"body": 1.0, "arm": 1.0, "tanks": 1.5, "quadrotor": 0.5}
 
 
 def law(rate: float) -> fp.Exponential:

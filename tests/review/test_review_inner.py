@@ -79,13 +79,8 @@ def test_unstable_zero_dynamics_that_a_plan_holds_are_told_as_both():
         (19.0, True, 1 + 1e-9, False, "unknown"),  # a mode that neither grows nor decays
         (19.0, True, 1.0003, False, "unknown"),  # growth of 8 % over the 250 cycles of the run does not show
         (19.0, True, 1.01, False, "no"),
-        (
-            0.01,
-            True,
-            1.01,
-            False,
-            "unknown",
-        ),  # by themselves they grow by 5 % in the run, and no plan needs to hold them
+        # By themselves they grow by 5 % in the run, and no plan needs to hold them.
+        (0.01, True, 1.01, False, "unknown"),
         (19.0, True, 1.01, True, "unknown"),  # what learns changes the loop
         (1e-6, False, 1.01, False, "unknown"),  # neutral
         (19.0, False, 0.9, False, "no"),  # a law that does not see them holds none

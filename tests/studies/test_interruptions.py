@@ -25,7 +25,7 @@ from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import NotSupported
 from fpirhc.symbolic.evaluate import Evaluator
 
-COMMAND = [
+COMMAND = (
     "compare",
     "line.py",
     "--scenarios",
@@ -36,7 +36,7 @@ COMMAND = [
     "--controllers",
     "CTC",
     "CTC+FPI",
-]
+)
 PLANNED = """measure_from=0.5,
     horizon=fp.Horizon(stages=30, step=5e-3),
     cost=fp.Quadratic(states={'y': 1.0}, deviation={'u': 1e-3}),"""

@@ -150,19 +150,8 @@ def test_a_controller_that_cannot_serve_is_left_out_with_its_reason():
 
 
 def test_the_command_prints_and_saves_what_was_found(tmp_path, capsys):
-    arguments = [
-        "robust",
-        "two_mass",
-        "--controllers",
-        "CTC",
-        "--risk",
-        "0.3",
-        "--confidence",
-        "0.9",
-        "--out",
-        str(tmp_path),
-    ]
-    assert main(arguments) == 0
+    words = "robust two_mass --controllers CTC --risk 0.3 --confidence 0.9 --out"
+    assert main([*words.split(), str(tmp_path)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "CTC: no plant drawn from the box of" in printed
     facts = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
