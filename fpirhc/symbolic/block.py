@@ -125,7 +125,8 @@ class Block:
         for key, signal in self._results.items():
             if key not in values:
                 raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, values)}")
-            value = values[key] if isinstance(values[key], matrix) else matrix(values[key])
+            written = values[key]
+            value = written if isinstance(written, matrix) else matrix(written)
             if value.numel() != signal.size:
                 raise InvalidShape(
                     f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {signal.size}"

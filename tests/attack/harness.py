@@ -19,7 +19,7 @@ from fpirhc.status import Status
 _GONE = 1e12  # size of a state that no plant comes back from
 CYCLES, LATE = 80, 15  # cycles of a run, and of its end, in which a controller must act again
 SKIPPING = {Status.BAD_SAMPLE, Status.NON_FINITE, Status.SOLVER_FAILED, Status.RESTARTED}
-PROBLEMS = ("two_mass", "van_der_pol", "cart_pole", "delayed_mass", "noisy_motor", "two_link_arm")
+PROBLEMS: tuple[str, ...] = ("two_mass", "van_der_pol", "cart_pole", "delayed_mass", "noisy_motor", "two_link_arm")
 PROBLEMS += ("mass_spring_slots", "delayed_tanks", "three_link_arm", "chain_of_masses", "mrac_pendulum")
 
 

@@ -393,7 +393,7 @@ CONTRACTS = (
     "task.disturbance.Disturbance",
     "tracking.base.Tracking",
 )
-GENERIC = ("baselines", "cli", "contraction", "problem_files", "report", "review", "scaffold")
+GENERIC: tuple[str, ...] = ("baselines", "cli", "contraction", "problem_files", "report", "review", "scaffold")
 GENERIC += ("simulation", "studies", "task")
 GENERIC_FILES = [f"controllers/{name}.py" for name in ("base", "contract", "demands", "check", "tracked")]
 GENERIC_FILES += ["deformation/base.py", "tracking/base.py"]

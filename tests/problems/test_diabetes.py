@@ -22,7 +22,7 @@ TWO_DAYS = Path(__file__).parents[1] / "data" / "diabetes" / "two_days.csv"
 BEGINS = {172: 1, 214: 2, 291: 0, 369: 2, 638: 1, 669: 0, 709: 2, 784: 1, 828: 0}
 EATING = 5.0  # g/min
 # Of adolescent#001, in the order of the source: Gp, Gt, Ip, X, I1, Id, Il, two depots, Gs.
-PUBLISHED = (250.621836, 176.506559902, 4.697517762, 0.0, 97.554, 97.554, 3.19814917262)
+PUBLISHED: tuple[float, ...] = (250.621836, 176.506559902, 4.697517762, 0.0, 97.554, 97.554, 3.19814917262)
 PUBLISHED += (57.951224472, 93.2258828462, 250.621836)
 
 

@@ -22,7 +22,7 @@ from fpirhc.review.questions.reality import LOOP
 from fpirhc.review.questions.right_model import FORM
 
 SAFE = "RHC+FPI, model-referenced"
-GALLERY = ("hodgkin_huxley", "hodgkin_huxley_silent", "order_four", "stick_slip")
+GALLERY: tuple[str, ...] = ("hodgkin_huxley", "hodgkin_huxley_silent", "order_four", "stick_slip")
 GALLERY += ("tumour", "tumour_daily", "turbojet", "turbojet_slow")
 
 
