@@ -182,15 +182,20 @@ class LiveSettings:
             values[path] = float(cast(float, content_at(controller, path)))
         return problem, checked(problem, controller, numbers_only=True), values
 
-    def bounds(self, path: str) -> Interval:
+    def bounds(self, path: str, reach: float = math.inf) -> Interval:
         """Return the interval around the number of the build in which a setting is accepted while the others stay.
 
         An end is the last number that was accepted of a bisection, to a millionth; infinite: every larger one is accepted. A limit
         of an input is a fact of the machine: it ends at that of the build.
+
+        Args:
+            path: of the setting.
+            reach: sizes of its number beyond which no end is sought; an end farther away is infinite.
         """
         value = self._content(path)
         size = max(abs(value), _SMALLEST)
-        lower, upper = (_farthest(lambda number: self._accepts(path, number), value, side * size) for side in (-1, 1))
+        reaches = [*(r for r in _REACHES if r < reach), *([reach] if math.isfinite(reach) else [])]
+        lower, upper = (_farthest(lambda n: self._accepts(path, n), value, side * size, reaches) for side in (-1, 1))
         return (
             max(lower, value) if path.startswith(_OF_INPUTS) and path.endswith(".0") else lower,
             min(upper, value) if path.startswith(_OF_INPUTS) and path.endswith(".1") else upper,
@@ -277,10 +282,10 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
     return [path]
 
 
-def _farthest(accepts: Callable[[float], bool], value: float, size: float) -> float:
+def _farthest(accepts: Callable[[float], bool], value: float, size: float, reaches: Sequence[float]) -> float:
     """The last accepted number on the side of `size`, whose sign and magnitude the steps have; infinite where none is refused."""
     inside = value
-    for reach in _REACHES:
+    for reach in reaches:
         outside = value + reach * size
         if not accepts(outside):
             break

@@ -278,11 +278,12 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
     for path in dict.fromkeys(path for loop in loops for path in loop.ready.live.paths):
         having = [loop for loop in loops if path in loop.ready.live.paths]
         value = having[0].ready.live.start[path]
+        size = max(abs(value), 1e-3)
+        reach = max(_SPAN + 1, _WAIT * having[0].ready.problem.period / size)  # farther no slider goes
         low, high = (
             max(ends) if which == 0 else min(ends)
-            for which, ends in enumerate(zip(*(loop.ready.live.bounds(path) for loop in having), strict=True))
+            for which, ends in enumerate(zip(*(loop.ready.live.bounds(path, reach) for loop in having), strict=True))
         )
-        size = max(abs(value), 1e-3)
         low, high = (
             max(low, value / _SPAN if low > 0 else min(value / _SPAN, value * _SPAN, value - size)),
             min(high, max(value / _SPAN, value * _SPAN))
