@@ -1,7 +1,7 @@
 """A sledge that sticks and slips, with a model in which its slide is well oiled.
 
-Offset-free control wins, by a third: its filter measures the response, as the deformation does, and smooths it with
-the states.
+Of the plans the offset-free one wins, by a third: its filter measures the response, as the deformation does, and smooths it with
+the states. Computed torque with the iteration, which acts in every cycle, is as good.
 
 LuGre friction (Canudas de Wit, Olsson, Åström, Lischinsky: A new model for control of systems with friction, IEEE Trans.
 Automatic Control 40(3), 1995): bristles with the deflection z carry the force f until they slip,
