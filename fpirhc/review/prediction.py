@@ -19,11 +19,11 @@ from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, NoAnswer
 from fpirhc.plant.maps import response_age
-from fpirhc.plant.motion import known_exactly, with_exact_parameters
+from fpirhc.plant.motion import known_exactly
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import each, inner_places
 from fpirhc.sensing.sensing import Sensing
-from fpirhc.simulation.model_as_plant import ModelAsPlant, loop_of, shortened
+from fpirhc.simulation.model_as_plant import ModelAsPlant, exactly, loop_of, shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulate
 from fpirhc.simulation.trials import ErrorPair, Trials, errors_of
@@ -233,15 +233,6 @@ def _judge_block(plant: Plant) -> Block:
         return {"response_error": first - s.desired, "response_force": 0.5 * (first + last) - of_model}
 
     return Block("judge_response", Layout(reads), Layout(writes), step, opaque=plant.equations.inverse_opaque)
-
-
-def exactly(plant: Plant, values: np.ndarray) -> Plant:
-    """Return the plant with these exact parameters; the same one for the same values, so that what is built of it is shared."""
-    values = np.asarray(values, dtype=float)
-    return _EXACT.of((plant,), (values.tobytes(),), lambda: with_exact_parameters(plant, values))
-
-
-_EXACT: Latest[Plant] = Latest(8)
 
 
 def check_prediction(problem: Problem, controller: Controller, what: str = "prediction") -> None:

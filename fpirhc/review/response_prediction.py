@@ -26,12 +26,12 @@ from fpirhc.review.prediction import (
     NominalRun,
     ResponseErrors,
     errors_without_adaptation,
-    exactly,
     nominal_run,
     null_errors,
     response_errors,
 )
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.simulation.model_as_plant import exactly
 from fpirhc.simulation.simulate import simulate
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem, cycles_per_stage

@@ -71,14 +71,22 @@ def _each(value: float | tuple[float, ...], count: int) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,) * count
 
 
+def exactly(plant: Plant, values: np.ndarray) -> Plant:
+    """Return the plant with these exact parameters; the same one for the same values, so that what is built of it is shared."""
+    values = np.asarray(values, dtype=float)
+    return _EXACT.of((plant,), (values.tobytes(),), lambda: with_exact_parameters(plant, values))
+
+
+_EXACT: Latest[Plant] = Latest(8)
+
+
 class ModelAsPlant:
-    """Models of controllers as the plant of their loops, without disturbances; every loop runs once on every model."""
+    """Models of controllers as the plant of their loops, without disturbances; a loop does not run twice on a model."""
 
     def __init__(self, problem: Problem, *, seed: int) -> None:
         """Take the problem of the loops, and the seed of the sensors' noise."""
         self._problem, self._seed = problem, seed
         self._models: dict[Hashable, Problem] = {}
-        self._runs: dict[tuple[Simulator, int], Run] = {}
 
     def of(self, controller: Controller) -> Problem:
         """Return the problem whose plant is the model of a resolved controller, behind the lag and the dead time that it believes.
@@ -87,14 +95,14 @@ class ModelAsPlant:
         """
         known, mirror = controller.plant_model(self._problem), controller.deformation.mirror
         parameters = known.parameters(self._problem.plant)
-        name = parameters.tobytes(), identity(known.signals), mirror
+        name = parameters.tobytes(), identity(known.signals), mirror.cycles, mirror.measurement, mirror.lag
         if name not in self._models:
             self._models[name] = self._made(parameters, known.signals, controller.deformation)
         return self._models[name]
 
     def _made(self, parameters: np.ndarray, signals: Mapping[str, Exogenous], deformation: Deformation) -> Problem:
         own = self._problem.of_model
-        plant, longest = with_exact_parameters(own.plant, parameters), own.measure_from + CYCLES * own.period
+        plant, longest = exactly(own.plant, parameters), own.measure_from + CYCLES * own.period
         known, duration = as_known(own.plant, signals), min(own.duration, longest)
         return with_believed_way(replace(own, plant=plant, signals=known, duration=duration), deformation)
 
@@ -105,11 +113,13 @@ class ModelAsPlant:
 
     def run(self, loop: Simulator, model: Problem) -> Run:
         """Return the run of a loop, of the problem, on one of the models."""
-        name = loop, id(model)
-        if name not in self._runs:
-            own = self._behind(model, loop)
-            self._runs[name] = own.run(seed=self._seed, variant=model, disturbed=False)
-        return self._runs[name]
+        own = self._behind(model, loop)
+        # Random series of another length are others.
+        length = () if not own.problem.sensing.drawn else (model.cycles,)
+        longest = _RUNS.of((own, *_untimed(model)), (self._seed, *length), list)
+        if not longest or (longest[0].cycles < model.cycles and longest[0].stop is None):
+            longest[:] = [own.run(seed=self._seed, variant=model, disturbed=False)]
+        return longest[0].first(model.cycles)
 
     def _behind(self, model: Problem, loop: Simulator) -> Simulator:
         """The loop itself where it moves a plant of the model's kind; else the one that does, whose plans are built already."""
@@ -123,14 +133,18 @@ class ModelAsPlant:
 
 def loop_of(problem: Problem, controller: Controller) -> Simulator:
     """Return the closed loop for runs of any duration; it is the same one for problems that differ in their times alone."""
-    values = [getattr(problem, field.name) for field in fields(Problem) if field.name not in _TIMES]
-    same = tuple(None if isinstance(value, Mapping) and not value else value for value in values)
     build = lambda: simulator(problem, controller, compiled=False)  # noqa: E731
-    loop = _LOOPS.of(same, (identity(controller),), build)
+    loop = _LOOPS.of(_untimed(problem), (identity(controller),), build)
     return build() if loop.remembers else loop
 
 
+def _untimed(problem: Problem) -> tuple[object, ...]:
+    values = [getattr(problem, field.name) for field in fields(Problem) if field.name not in _TIMES]
+    return tuple(None if isinstance(value, Mapping) and not value else value for value in values)
+
+
 _LOOPS: Latest[Simulator] = Latest(8)
+_RUNS: Latest[list[Run]] = Latest(8)  # at most one each, from which shorter ones are taken
 _TIMES = {"duration", "measure_from"}  # of a problem, which are no part of its loop
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -112,6 +112,10 @@ class Run(Log):
             f"plans did not converge in {in_percent(share)} of the cycles; such plans depend on rounding, so compiled C, the "
             f"virtual machine and another computer may give other runs: allow more iterations, or loosen the tolerance"
         )
+
+    def first(self, cycles: int) -> Run:
+        """Return the run of its first cycles; itself where it has fewer."""
+        return replace(self, log=self.log[:cycles], stop=None) if cycles <= self.cycles else self
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return all signals as a pandas DataFrame with one column per entry, indexed by time."""

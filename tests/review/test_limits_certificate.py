@@ -18,7 +18,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.review.limits_certificate import LimitsCertificate
-from fpirhc.review.prediction import exactly
+from fpirhc.simulation.model_as_plant import exactly
 
 DURATIONS = {"body": 1.0, "arm": 1.0, "tanks": 1.5, "quadrotor": 0.5}
 

@@ -30,6 +30,7 @@ from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
 from fpirhc.task.disturbance import Step as Jump
 from fpirhc.task.problem import Problem
@@ -129,7 +130,8 @@ class AskedLoop:
     def __init__(self, problem: Problem, controller: Controller) -> None:
         """Compose the loop."""
         problem.require_equations("the step of a loop with a foreign reality cannot be evaluated twice at one point")
-        self.problem, self.controller = _calm(problem), resolved(problem, controller)
+        self.problem = _CALM.of((problem,), (), lambda: _calm(problem))
+        self.controller = resolved(problem, controller)
         with any_gain(), compiled_plans():  # one that a run refuses has poles too
             self.loop: Composite = close_loop(self.problem, self.controller)
         self._step = Step(self.loop, self.loop.reads.names[0])  # the disturbances of all inputs
@@ -213,16 +215,19 @@ class AskedLoop:
         memories, traces = np.empty((cycles + 1, memory.size)), np.empty((cycles, self.loop.trace.size))
         memories[0], end = memory, cycles
         leads = None if led is None else np.isfinite(led)
+        some, still = leads is not None and not leads.all(), np.zeros(self._step.width)
         asks = request is not None and len(self._request) == request.size
         for k in range(cycles):
             memory_next, trace = memories[k + 1], traces[k]
-            self._step.into(memories[k], 0.0, memory_next, trace)
+            self._step.into(memories[k], still, memory_next, trace)
             # A scalar product takes less time than a look at every entry.
             if not (memory_next.dot(memory_next) < _AWAY**2 or (np.abs(memory_next) < _AWAY).all()):
                 end = k
                 break
-            if led is not None and leads is not None:
+            if led is not None and leads is not None and some:
                 np.copyto(memory_next[self._state], led[k], where=leads[k])
+            elif led is not None:
+                memory_next[self._state] = led[k]
             if asks and k == self.warm:
                 memory_next[self._request] = request
             if led is not None and k % _LOOK == _LOOK - 1:
@@ -499,6 +504,9 @@ def _started(problem: Problem, state: Mapping[str, float] | None, before: Mappin
     for name, value in changes.items():
         object.__setattr__(moved, name, value)
     return moved
+
+
+_CALM: Latest[Problem] = Latest(4)
 
 
 def _calm(problem: Problem) -> Problem:
