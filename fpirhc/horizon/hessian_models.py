@@ -9,9 +9,10 @@ Loops in C call the parts, because they need Jacobians later, or not at all: `ev
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import NamedTuple
+from typing import NamedTuple, cast
 from weakref import WeakKeyDictionary
 
 import casadi as ca
@@ -162,15 +163,33 @@ def _graph(function: ca.Function, variables: ca.SX, parameters: ca.SX) -> tuple[
             value = ca.SX(function.instruction_constant(k))
         else:
             places = [at[j] for j in operands]
-            value, *slopes = _operation(kind, len(places))(*(values[j] for j in places))
+            value, *slopes = _elementary(kind, [values[j] for j in places])
             for place, slope in zip(places, slopes, strict=True):
                 if active[place] and not slope.is_zero():
-                    by[place] = by[place] + slope if place in by else slope
+                    by[place] = _plus(by[place], slope) if place in by else slope
         at[target[0]] = len(values)
         values.append(value)
         edges.append(by)
         active.append(bool(by))
     return edges, ends, values
+
+
+def _plus(a: ca.SX, b: ca.SX) -> ca.SX:
+    """a + b; the operator asks first whether its operands are numbers, which takes ten times as long."""
+    return ca.SX.binary(ca.OP_ADD, a, b)
+
+
+def _times(a: ca.SX, b: ca.SX) -> ca.SX:
+    return ca.SX.binary(ca.OP_MUL, a, b)
+
+
+def _elementary(kind: int, operands: list[ca.SX]) -> Sequence[ca.SX]:
+    """The value and the partial derivatives of an elementary operation; of the most frequent ones without a call."""
+    if kind == ca.OP_MUL:
+        return _times(*operands), operands[1], operands[0]
+    if kind in (ca.OP_ADD, ca.OP_SUB):
+        return ca.SX.binary(kind, *operands), ca.SX(1), ca.SX(1 if kind == ca.OP_ADD else -1)
+    return cast(Sequence[ca.SX], _operation(kind, len(operands))(*operands))
 
 
 @cache
@@ -208,10 +227,10 @@ def _pulled(edges: _Edges, ends: list[int], weights: ca.SX, count: int) -> ca.SX
     """J' w, from the last result back to the variables."""
     bars = [ca.SX(0) for _ in edges]
     for end, weight in zip(ends, ca.vertsplit(weights), strict=True):
-        bars[end] += weight
+        bars[end] = _plus(bars[end], weight)
     for n in reversed(range(count, len(edges))):
         for place, slope in edges[n].items():
-            bars[place] += slope * bars[n]
+            bars[place] = _plus(bars[place], _times(slope, bars[n]))
     return ca.vertcat(*bars[:count])
 
 
@@ -244,8 +263,8 @@ def _eliminate(n: int, back: _Edges, ahead: list[set[int]]) -> bool:
     for later in ahead[n]:
         slope, by = back[later].pop(n), back[later]
         for place, before in back[n].items():
-            product = slope * before
-            by[place] = by[place] + product if place in by else product
+            product = _times(slope, before)
+            by[place] = _plus(by[place], product) if place in by else product
             ahead[place].add(later)
     for place in back[n]:
         ahead[place].discard(n)

@@ -43,17 +43,16 @@ class Jump:
 
 def jumps(problem: Problem) -> list[Jump]:
     """Return the jumps of those states of the reference that are tracked, judged or weighed, the first of each state."""
-    motion = _motion(problem)
     times = np.linspace(0.0, problem.duration, min(_INTERVALS, problem.cycles) + 1)
-    values, slopes = motion(times)
+    values, slopes = _motion(problem, len(times))(times)
     rests = np.abs(_rests(times, values, slopes))
     scales = np.maximum(np.ptp(values, axis=1), 1e-12 * np.abs(values).max(axis=1, initial=0.0))
-    detected = []
-    for place, name in enumerate(problem.plant.output.elements):
-        largest = np.sort(np.argsort(rests[place])[-_LOOKED_AT:])
-        candidates = (_jump(motion, place, name, times[k], times[k + 1]) for k in largest)
-        real = (one for one in candidates if abs(one.size) > _SIZE * scales[place] > 0)
-        detected += [one for _, one in zip(range(1), real, strict=False)]
+    largest = np.sort(np.argsort(rests, axis=1)[:, -_LOOKED_AT:])
+    places, detected = np.repeat(np.arange(len(rests)), largest.shape[1]), list[Jump]()
+    for place, time, size in zip(places, *_narrowed(problem, places, times[largest], times[largest + 1]), strict=True):
+        name = problem.plant.output.elements[place]
+        if abs(size) > _SIZE * scales[place] > 0 and name not in [one.state for one in detected]:
+            detected.append(Jump(name, float(time), float(size)))
     return detected
 
 
@@ -93,13 +92,13 @@ def _factorial(k: int) -> int:
     return k if k < 3 else k * _factorial(k - 1)
 
 
-def _motion(problem: Problem) -> Motion:
-    """Times (m,) -> states of the reference and their derivatives, shape (nx, m) each."""
-    plant, function = problem.plant, problem.reference.function(problem.plant)
+def _motion(problem: Problem, count: int) -> Motion:
+    """Times (count,) -> states of the reference and their derivatives, shape (nx, count) each."""
+    plant, function = problem.plant, problem.reference.function(problem.plant).map(count)
     elements, names = plant.output.elements, list(plant.chains)
 
     def values(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        states, responses = (np.asarray(v.full()) for v in function.map(len(times))(times[None, :]))
+        states, responses = (np.asarray(v.full()) for v in function(times[None, :]))
         rows = [
             states[elements.index(e + "'")] if e + "'" in elements else responses[names.index(e.rstrip("'"))]
             for e in elements
@@ -115,20 +114,38 @@ def _rests(times: np.ndarray, values: np.ndarray, slopes: np.ndarray) -> np.ndar
     return np.where(np.isfinite(rests), rests, 0.0)
 
 
-def _jump(motion: Motion, place: int, name: str, first: float, last: float) -> Jump:
-    """What is left of an interval's rest after many halvings, each time of the half with the larger one."""
+def _narrowed(
+    problem: Problem, places: np.ndarray, first: np.ndarray, last: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times and sizes of what is left of some intervals' rests after many halvings, each time of the half with the larger one.
+
+    Args:
+        problem: of the reference.
+        places: of the states whose rests they are, shape (m,).
+        first: the intervals' first times, m numbers.
+        last: the last ones.
+    """
+    first, last, which = first.ravel(), last.ravel(), np.arange(len(places))
     margin = _MARGIN * (last - first)
+
+    def rests(*times: np.ndarray) -> np.ndarray:
+        """Of each state in its own intervals, shape (intervals, m)."""
+        between = np.array(times)
+        motion = motions[len(times)](between.ravel())
+        values, slopes = (v.reshape(-1, *between.shape)[places, :, which] for v in motion)
+        return _rests(between.T, values, slopes).T
+
+    motions = {count: _motion(problem, count * len(places)) for count in (2, 3)}
     for _ in range(_HALVINGS):
-        times = np.array([first, 0.5 * (first + last), last])
-        rests = np.abs(_rests(times, *motion(times))[place])
-        larger = int(np.argmax(rests))
-        if rests[larger] == 0.0:
+        middle = 0.5 * (first + last)
+        halves = np.abs(rests(first, middle, last))
+        later, moved = halves[1] > halves[0], halves.any(axis=0)
+        first, last = np.where(moved & later, middle, first), np.where(moved & ~later, middle, last)
+        if not moved.any():
             break
-        first, last = times[larger], times[larger + 1]
     # At its very time a kink has the mean of both slopes: half the jump stands on either side.
-    around = np.array([first - margin, last + margin])
-    time = 0.0 if last <= margin else float(last)
-    return Jump(name, time, float(_rests(around, *motion(around))[place, 0]))
+    size = rests(first - margin, last + margin)[0]
+    return np.where(last <= margin, 0.0, last), size
 
 
 LIMITS = "Does the reference keep the limits of states, rates and paths?"
