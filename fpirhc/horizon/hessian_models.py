@@ -175,7 +175,7 @@ def _graph(function: ca.Function, variables: ca.SX, parameters: ca.SX) -> tuple[
 
 
 def _plus(a: ca.SX, b: ca.SX) -> ca.SX:
-    """a + b; the operator asks first whether its operands are numbers, which takes ten times as long."""
+    """Return a + b; the operator asks first whether its operands are numbers, which takes ten times as long."""
     return ca.SX.binary(ca.OP_ADD, a, b)
 
 

@@ -18,6 +18,7 @@ from fpirhc.fields.kinds import Count
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.review.guaranteed_tube import Centre, Chains, Expressions, Sweep, Tube, expressions
 from fpirhc.review.prediction import check_prediction
+from fpirhc.simulation.model_as_plant import exactly
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.summary import line
 from fpirhc.symbolic.enclosures import Box

@@ -14,7 +14,7 @@ from fpirhc.errors import NoCode
 from fpirhc.simulation.log import with_common_columns
 from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.metrics.base import Metric, first_measured
-from fpirhc.simulation.metrics.streamed import Cycle, Measured, Streamed
+from fpirhc.simulation.metrics.summed import Cycle, Measured, Summed, Term, some
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import Run
 from fpirhc.symbolic.layout import Layout
@@ -42,7 +42,7 @@ class Sums:
 
     def __post_init__(self) -> None:
         for metric in self.metrics:
-            if metric.streamed is None and metric.reads is None:
+            if metric.summed is None and metric.reads is None:
                 raise NoCode(f"the metric '{metric.name}' reads whole runs")
         self.start(self.built)
 
@@ -100,7 +100,7 @@ class Sums:
         """Return the metrics that are summed up, by name and element, shape (runs,) each; and which runs left a range."""
         run = self._measured(problem)
         outside, *rest = np.split(sums, self._places[1:-1], axis=1)
-        pairs = zip(self._streamed, rest, strict=True)
+        pairs = zip(self._summed, rest, strict=True)
         return {m.name: one.result(part, run) for (m, one), part in pairs}, outside[:, -1] != 0
 
     def _row(self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, list[Any]]], run: Run) -> Values:
@@ -116,7 +116,7 @@ class Sums:
 
     def _starts(self, problem: Problem) -> list[np.ndarray]:
         run, starts = self._measured(problem), []
-        for one, name in zip(self._all, ("ranges", *(metric.name for metric, _ in self._streamed)), strict=True):
+        for one, name in zip(self._all, ("ranges", *(metric.name for metric, _ in self._summed)), strict=True):
             start = one.start(run)
             if start is None:
                 raise NoCode(f"'{name}' cannot be summed up: this problem does not say before a run what it needs")
@@ -132,37 +132,36 @@ class Sums:
         return with_common_columns(self.trace, np.eye(self.trace.size))
 
     @cached_property
-    def _streamed(self) -> list[tuple[Metric, Streamed]]:
-        return [(m, m.streamed) for m in self.metrics if m.streamed is not None]
+    def _summed(self) -> list[tuple[Metric, Summed]]:
+        return [(m, m.summed) for m in self.metrics if m.summed is not None]
 
     @cached_property
     def _of_logs(self) -> list[Metric]:
-        return [m for m in self.metrics if m.streamed is None]
+        return [m for m in self.metrics if m.summed is None]
 
     @cached_property
-    def _all(self) -> list[Streamed]:
-        return [self._outside, *(one for _, one in self._streamed)]
+    def _all(self) -> list[Summed]:
+        return [self._outside, *(one for _, one in self._summed)]
 
     @cached_property
     def _places(self) -> list[int]:
         return [0, *np.cumsum([len(start) for start in self._starts(self.built)]).tolist()]
 
     @cached_property
-    def _outside(self) -> Streamed:
-        """The ends of all ranges, and whether some number lay outside."""
-        columns = ranges_of(self.built, self.trace).columns.tolist()
+    def _outside(self) -> Summed:
+        """Whether some number lay outside its range."""
+        columns, names = ranges_of(self.built, self.trace).columns.tolist(), self.trace.names
 
-        def start(run: Measured) -> np.ndarray | None:
+        def ends(run: Measured) -> np.ndarray | None:
             found = ranges_of(run.problem, self.trace)
             ends = dict(zip(found.columns.tolist(), zip(found.lower, found.upper, strict=True), strict=True))
             if not ends.keys() <= set(columns):
                 return None
-            return np.append(np.array([ends.get(c, (-np.inf, np.inf)) for c in columns]).reshape(-1, 2).T.ravel(), 0.0)
+            return np.array([ends.get(c, (-np.inf, np.inf)) for c in columns]).reshape(-1, 2).T.ravel()
 
-        def step(memory: ca.SX, cycle: Cycle) -> ca.SX:
-            values, count = ca.vertcat(*(cycle[s.name] for s in self.trace.signals))[columns], len(columns)
-            lower, upper = memory[:count], memory[count:-1]
-            left = ca.sum1(ca.logic_or(values < lower, values > upper)) if columns else ca.SX(0)
-            return ca.vertcat(lower, upper, ca.fmax(memory[-1], left))
+        def left(cycle: Cycle) -> Term:
+            values, count = ca.vertcat(*(cycle[name] for name in names))[columns], len(columns)
+            lower, upper = cycle.constants[:count], cycle.constants[count:]
+            return some(ca.logic_or(values < lower, values > upper)) if columns else ca.SX(0)
 
-        return Streamed(start, step, lambda memories, _: {"": memories[:, -1]})
+        return Summed(names, ("",), left, lambda sums, _: sums, largest=True, all_cycles=True, constants=ends)

@@ -14,7 +14,7 @@ import numpy as np
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.motion import followed_units
-from fpirhc.simulation.metrics.streamed import Streamed
+from fpirhc.simulation.metrics.summed import Summed
 from fpirhc.simulation.run import Run
 from fpirhc.summary import written_out
 from fpirhc.task.problem import Problem
@@ -39,7 +39,7 @@ class Metric(Checked):
     Args:
         name: small letters, digits and '_'; one dot may put it in a group, 'solve.worst_iterations'.
         function: (problem, run) -> a number, or with `by` a mapping with one number for every element; None where the run has no
-            such number. NaN means that the run did not reach it.
+            such number. NaN means that the run did not reach it. A `Summed` is summed up where runs keep no log, too.
         by: kind of the elements ('coordinate', 'input', 'term', ...); None for one number.
         unit: of every element: text, or a function (problem, element) -> text; the element of a single number is ''.
         better: direction of an improvement: 'smaller', 'larger' or 'neither'.
@@ -54,7 +54,6 @@ class Metric(Checked):
         floor: size of a difference up to which two numbers count as equal.
         step: (period, number of cycles) -> the smallest step of a number that counts cycles; zero for every other number.
         order: place among the columns, smallest first.
-        streamed: how it is summed up cycle by cycle, for runs side by side that keep no log; None: by its function alone.
         reads: names of the signals that its function reads, where it reads nothing else of a run; None: anything.
 
     Raises:
@@ -78,7 +77,6 @@ class Metric(Checked):
     floor: float = 1e-12
     step: Callable[[float, int], float] = _no_step
     order: float = 100.0
-    streamed: Streamed | None = None
     reads: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -95,6 +93,11 @@ class Metric(Checked):
                 raise InvalidValue(
                     f"metric '{self.name}': {what} is {value!r}, expected one of {', '.join(valid)}.{nearest(value, valid)}"
                 )
+
+    @property
+    def summed(self) -> Summed | None:
+        """How it is summed up cycle by cycle, for runs side by side that keep no log; None: its function reads a log."""
+        return self.function if isinstance(self.function, Summed) else None
 
     @property
     def heading(self) -> str:

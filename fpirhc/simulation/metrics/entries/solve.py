@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.simulation.metrics.base import Function, Metric
-from fpirhc.simulation.metrics.streamed import Measured, Streamed
+from fpirhc.simulation.metrics.summed import Measured, Summed
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.summary import written_out
@@ -18,43 +17,33 @@ from fpirhc.task.problem import Problem
 _ALWAYS = (Status.OK, Status.NOT_CONVERGED, Status.INFEASIBLE, Status.HELD, Status.NON_FINITE)
 
 
-def status(problem: Problem, run: Run) -> dict[str, float]:  # noqa: ARG001 -- every metric is given the problem
-    """Return the number of cycles of the whole run by status; the cycle in which a run ended early counts as NON_FINITE."""
-    values, counts = np.unique(run["status"].astype(int), return_counts=True)
-    cycles = dict.fromkeys((s.name for s in _ALWAYS), 0)
-    cycles |= {Status(int(v)).name: int(c) for v, c in zip(values, counts, strict=True)}
-    if run.stop is not None:
-        cycles[Status.NON_FINITE.name] += 1
-    return {**cycles}
-
-
 def cycles(problem: Problem, run: Run) -> int:  # noqa: ARG001 -- every metric is given the problem
     """Return the number of cycles."""
     return run.cycles
 
 
-def _counts(memories: np.ndarray, run: Measured) -> dict[str, np.ndarray]:  # noqa: ARG001 -- as every metric's
-    counts = memories.astype(int)
-    return {s.name: np.ma.masked_equal(counts[:, s], 0 if s not in _ALWAYS else -1) for s in Status}
+def _counts(sums: np.ndarray, run: Measured) -> np.ndarray:
+    """The cycle in which a run ended early counts as NON_FINITE."""
+    counts = sums.astype(int)
+    counts[:, Status.NON_FINITE] += run.stopped
+    always = np.isin(list(Status), _ALWAYS)
+    return np.ma.masked_array(counts, (counts == 0) & ~always)
+
+
+# The number of cycles of the whole run by status.
+status = Summed(
+    ("status",),
+    tuple(s.name for s in Status),
+    lambda cycle: cycle["status"] == cycle.constants,
+    _counts,
+    all_cycles=True,
+    constants=lambda _: np.array(Status, dtype=float),
+)
 
 
 _CYCLES = (
     Metric("cycles", cycles, better="neither", report=False, compared="exact", finite=True, order=5, reads=()),
-    Metric(
-        "status",
-        status,
-        by="status",
-        better="neither",
-        report=False,
-        compared="exact",
-        finite=True,
-        order=80,
-        streamed=Streamed(
-            lambda _: np.zeros(len(Status)),
-            lambda memory, cycle: memory + (cycle["status"] == ca.DM(list(Status))),
-            _counts,
-        ),
-    ),
+    Metric("status", status, by="status", better="neither", report=False, compared="exact", finite=True, order=80),
 )
 
 
