@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.prediction import TRIED
 from fpirhc.review.question import SEE_CONVERGENCE, Case
+from fpirhc.simulation.trials import ErrorPair
 
 _LEAVE = "Lower the gain, use another form, or leave the deformation out."
 _FREE = "Run it where the commands are free."
 _ENDS = "Find out why the run ends early."
+
+
+def judged(good: bool, pairs: Iterable[ErrorPair], *, spared: bool) -> Verdict:
+    """Return the verdict that runs give: no where adaptation makes one clearly worse, unless that is no reason.
+
+    Args:
+        good: whether the answer is yes.
+        pairs: errors without adaptation and with it.
+        spared: whether a larger error is no reason for a no: the controller may still learn, or the error cures a larger one.
+    """
+    if good:
+        return Verdict.YES
+    return Verdict.NO if not spared and any(pair.fails for pair in pairs) else Verdict.UNKNOWN
 
 
 def by_run(case: Case, question: str, reason: str) -> Answer:
@@ -29,10 +44,11 @@ def by_run(case: Case, question: str, reason: str) -> Answer:
     text = f"in {'the whole run' if whole else f'a run of at most {TRIED} cycles'} {pair.sentence} ({reason})"
     if pair.stuck:
         return Answer(question, Verdict.UNKNOWN, f"{text}; {pair.stuck}", _FREE, numbers)
-    if pair.lower:
-        return Answer(question, Verdict.YES, text, "", numbers)
-    if pair.fails and (whole or not learns):
-        return Answer(question, Verdict.NO, text, SEE_CONVERGENCE if case.diverges else _LEAVE, numbers)
+    verdict = judged(pair.lower, (pair,), spared=learns and not whole)
+    if verdict == Verdict.YES:
+        return Answer(question, verdict, text, "", numbers)
+    if verdict == Verdict.NO:
+        return Answer(question, verdict, text, SEE_CONVERGENCE if case.diverges else _LEAVE, numbers)
     if not all(map(math.isfinite, pair.adapted.values())):
         return Answer(question, Verdict.UNKNOWN, text, _ENDS, numbers)
     longer = "Compare it over several scenarios." if whole else "Run it for longer and compare."

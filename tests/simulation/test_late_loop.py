@@ -53,6 +53,23 @@ def test_radius_and_response_are_those_of_all_eigenvalues(seed, size):
     assert short.opened(0)(frequencies) == pytest.approx(whole.opened(0)(frequencies), rel=1e-8)
 
 
+@pytest.mark.parametrize("cycles", [1, 3])
+@pytest.mark.parametrize("seed", range(6))
+def test_commands_that_arrive_later_are_those_of_the_whole_loop(seed, cycles):
+    short, whole = both(seed, 0.3)
+    radius = np.abs(np.linalg.eigvals(whole.delayed([0], cycles).dynamics)).max()
+    assert short.delayed([0], cycles).radius == pytest.approx(radius, rel=1e-7)
+
+
+@pytest.mark.parametrize("slower", [0.9, 0.9999, 1.1])
+def test_what_stays_as_it_is_and_no_judged_error_shows_is_left_out(slower):
+    """The amount that has left the body, beside a mode that is judged; where it is judged too, the loop does not converge."""
+    loop = waiting(np.array([[slower, 0.0], [0.3, 1.0]]), 500)
+    judged = replace(loop, errors=np.array([[1.0, 0.0]]))
+    assert judged.radius == pytest.approx(slower, abs=2e-8)
+    assert replace(loop, errors=np.array([[0.0, 1.0]])).radius == pytest.approx(max(slower, 1.0), abs=2e-6)
+
+
 @pytest.mark.parametrize("count", range(1, 9))
 @pytest.mark.parametrize("angle", [0.0, 0.3])
 def test_poles_that_lie_together_near_the_unit_circle_are_all_counted(count, angle):
@@ -81,7 +98,8 @@ def waiting(dynamics: np.ndarray, cycles: int) -> LateLoop:
     size = len(dynamics)
     nothing = np.zeros((1, size))
     cycle = LinearCycle(dynamics, np.ones((size, 1)), np.ones((1, size)), nothing)
-    return LateLoop((cycle,), nothing, nothing.T, PERIOD, (Late(0, cycles, np.zeros(size), np.zeros(1)),))
+    late = (Late(0, cycles, np.zeros(size), np.zeros(1)),)
+    return LateLoop((cycle,), np.eye(size), nothing.T, PERIOD, late)
 
 
 def test_a_line_of_a_loop_is_found_in_its_memory():
@@ -98,8 +116,9 @@ def test_a_line_of_a_loop_is_found_in_its_memory():
     assert short.radius == pytest.approx(whole.radius, abs=rounding)
     frequencies = np.pi / problem.period * np.linspace(0.0123, 0.987, 40)
     assert short.opened(0)(frequencies) == pytest.approx(whole.opened(0)(frequencies), rel=1e-4)
+    assert short.delayed([0], 3).radius == pytest.approx(whole.delayed([0], 3).radius, abs=rounding)
     with pytest.raises(NoAnswer, match="delay line of 59 cycles"):
-        short.delayed([0], 3)
+        short.delayed([0], -1)
 
 
 def test_entries_that_do_more_than_wait_are_refused():

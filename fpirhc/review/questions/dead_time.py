@@ -15,6 +15,7 @@ from fpirhc.controllers.contract import without_deformation
 from fpirhc.controllers.wrappers.predicted import other_predictions
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.by_run import judged
 from fpirhc.review.grid import is_late, scaled
 from fpirhc.review.prediction import CYCLES
 from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
@@ -156,16 +157,16 @@ def pays_when_late(case: Case) -> Answer | None:
     text = "; ".join(f"{name}: {one.sentence}" for name, one in errors.items())
     numbers = {f"{name}_{which}": value for name, one in errors.items() for which, value in _numbers(one).items()}
     cycles, radius = _a_tenth_later(case)
-    if all(one.passes for one in errors.values()):
+    verdict = judged(all(one.passes for one in errors.values()), errors.values(), spared=case.controller.learns)
+    if verdict == Verdict.YES:
         if radius < 1:
             return Answer(PAYS_LATE, Verdict.YES, text, "", numbers)
         text += f"; but {cycles} cycles off, the slowest mode is multiplied by {radius:.6g} per cycle, which short runs hardly show"
         change = "Weigh the inputs more, lower the rate or the gain, or measure the dead time better than to a tenth."
         return Answer(PAYS_LATE, Verdict.UNKNOWN, text, change, {**numbers, "radius": radius})
-    harmful = any(one.fails for one in errors.values()) and not case.controller.learns
     change = "Lower the gain or the rate of the loop, or measure the dead time better than to a tenth."
     change = SEE_CONVERGENCE if case.diverges else change
-    return Answer(PAYS_LATE, Verdict.NO if harmful else Verdict.UNKNOWN, text, change, numbers)
+    return Answer(PAYS_LATE, verdict, text, change, numbers)
 
 
 _CHANGES = {"longer": _PERCENT, "shorter": -_PERCENT}

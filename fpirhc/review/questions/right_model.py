@@ -24,7 +24,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.by_run import by_run
+from fpirhc.review.by_run import by_run, judged
 from fpirhc.review.prediction import (
     TRIED,
     NominalRun,
@@ -260,12 +260,13 @@ def leaves_right_model_alone(case: Case) -> Answer:
         return Answer(
             NULL_TEST, Verdict.UNKNOWN, f"{text}; {runs.stuck}", "Run it where the commands are free.", numbers
         )
-    if runs.passes:
-        return Answer(NULL_TEST, Verdict.YES, text, "", numbers)
-    harmful = runs.fails and not case.controller.learns and not _cures_more(case, runs, nominal, predicted)
-    if runs.fails and not harmful:
-        text += ", less than what the wrong model costs without it" if not case.controller.learns else ""
-    verdict = Verdict.NO if harmful else Verdict.UNKNOWN
+    learns = case.controller.learns
+    spared = runs.fails and (learns or _cures_more(case, runs, nominal, predicted))
+    verdict = judged(runs.passes, (runs,), spared=spared)
+    if verdict == Verdict.YES:
+        return Answer(NULL_TEST, verdict, text, "", numbers)
+    if runs.fails and spared and not learns:
+        text += ", less than what the wrong model costs without it"
     change, more = _remedy(case, runs, predicted)
     return Answer(NULL_TEST, verdict, text, change, numbers | more)
 

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NoReturn
 
 import numpy as np
 
 from fpirhc.errors import NoAnswer
-from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
 
 _TOGETHER = 4096  # matrices at once
 _PER_TURN = 8  # points of a circle for a turn of all lines together
@@ -28,6 +28,7 @@ _LEAST = 512  # points of half a circle
 _SAFE = math.pi / 2  # change of log det M between two points, from which there are more between them and beside them
 _HALVINGS = 30
 _EDGE = 1e-8  # relative error of a radius
+_SHOWN = 1e-6  # of a judged error, in a mode of length 1
 _DEEPEST = 200.0  # -log of what the longest line makes of a decaying mode, beyond which numbers end
 
 
@@ -66,16 +67,26 @@ class LateLoop(LinearLoop):
 
     @cached_property
     def radius(self) -> float:
-        """The factor per cycle of the slowest or fastest growing mode, by halving; no mode that is reached is left out."""
-        lower, upper = -_DEEPEST / max(self.longest, 1), 0.0
-        if not self._outside(lower):
+        """The factor per cycle of the slowest or fastest growing mode, by halving; neutral modes as in `LinearLoop.radius`."""
+        hidden = self._neutral
+        lower, upper = -_DEEPEST / max(self.longest, 1), 0.0 if not hidden else math.log1p(NEUTRAL)
+        if self._outside(lower) <= hidden:
             return math.exp(lower)
         while self._outside(upper):
             lower, upper = upper, 2 * upper + 1e-3
+            hidden = 0  # they lie inside
         while upper - lower > _EDGE:
             middle = (lower + upper) / 2
-            lower, upper = (middle, upper) if self._outside(middle) else (lower, middle)
+            lower, upper = (middle, upper) if self._outside(middle) > hidden else (lower, middle)
         return math.exp(upper)
+
+    @property
+    def _neutral(self) -> int:
+        """Number of modes that stay as they are, M(1) V = 0, and that no judged error shows, E V = 0."""
+        [matrix] = self._matrices(np.ones(1)).real
+        _, sizes, rows = np.linalg.svd(matrix)
+        still = rows[sizes <= NEUTRAL * max(float(sizes[0]), 1.0)]
+        return len(still) - int(np.linalg.matrix_rank(still @ self.errors.T, tol=_SHOWN)) if len(self.errors) else 0
 
     def opened(self, place: int) -> Callable[[np.ndarray], np.ndarray]:
         [one] = self.cycles
@@ -95,6 +106,29 @@ class LateLoop(LinearLoop):
 
         return response
 
+    def delayed(self, inputs: Sequence[int], cycles: int) -> LinearLoop:
+        if cycles < 0:
+            self._refuse()
+        [one], some = self.cycles, list(inputs)
+        acts, sent = one.entry[:, some], np.zeros(len(one.arriving))
+
+        def waiting(place: int, later: int, command: np.ndarray) -> Late:
+            """The commands (some,) of an entry, which arrive some cycles later."""
+            arriving = sent.copy()
+            arriving[some] = command
+            return Late(place, later, acts @ command, arriving)
+
+        at_once = [
+            replace(k, dynamics=k.dynamics - acts @ k.arriving[some], arriving=_without(k.arriving, some))
+            for k in self.late
+        ]
+        queued = [waiting(k.place, k.cycles + cycles, k.arriving[some]) for k in self.late]
+        queued += [
+            waiting(place, cycles, command) for place, command in enumerate(one.arriving[some].T) if command.any()
+        ]
+        cycle = replace(one, dynamics=one.dynamics - acts @ one.arriving[some], arriving=_without(one.arriving, some))
+        return replace(self, cycles=(cycle,), late=(*at_once, *queued))
+
     @property
     def poles(self) -> np.ndarray:
         self._refuse()
@@ -108,9 +142,6 @@ class LateLoop(LinearLoop):
         self._refuse()
 
     def with_noise(self, feedthrough: Sequence[np.ndarray], correlation: np.ndarray) -> LinearLoop:  # noqa: ARG002
-        self._refuse()
-
-    def delayed(self, inputs: Sequence[int], cycles: int) -> LinearLoop:  # noqa: ARG002
         self._refuse()
 
     def carried(self, deviation: np.ndarray, cycles: int) -> tuple[np.ndarray, np.ndarray]:  # noqa: ARG002
@@ -134,13 +165,13 @@ class LateLoop(LinearLoop):
         """The sign det M / |det M|, and log |det M|, at some points, shape (2, number)."""
         return np.hstack([np.array(np.linalg.slogdet(self._matrices(points[some]))) for some in _parts(len(points))])
 
-    def _outside(self, logarithm: float) -> bool:
-        """Whether a pole lies on the circle with this logarithm of its radius, or outside: n less the turns of det M along it."""
-        signs = self._half(logarithm)
+    def _outside(self, logarithm: float) -> int:
+        """Number of poles on the circle with this logarithm of its radius, or outside: n less the turns of det M along it."""
+        signs, count = self._half(logarithm), len(self.cycles[0].dynamics)
         if not signs.all():
-            return True
+            return count + 1  # some pole is on it
         turns = float(np.angle(signs[1:] / signs[:-1]).sum()) / math.pi  # of half a circle, the other one is its mirror
-        return len(self.cycles[0].dynamics) != round(turns)
+        return count - round(turns)
 
     def _half(self, logarithm: float) -> np.ndarray:
         """Signs of det M at points of the upper half of a circle, close enough to count turns; a zero ends it.
@@ -162,6 +193,13 @@ class LateLoop(LinearLoop):
             more = self._determinants(np.exp(logarithm + 1j * between))
             angles, found = np.insert(angles, wide + 1, between), np.insert(found, wide + 1, more, axis=1)
         return np.asarray(found[0])
+
+
+def _without(arriving: np.ndarray, some: list[int]) -> np.ndarray:
+    """What arrives without some of the commands."""
+    rest = arriving.copy()
+    rest[some] = 0.0
+    return rest
 
 
 def _parts(count: int) -> list[slice]:
