@@ -118,16 +118,20 @@ class Summed:
     first: tuple[str, ...] = ()
     constants: Callable[[Measured], np.ndarray | None] = _none
 
-    def __call__(self, problem: Problem, run: Run) -> float | dict[str, float]:
-        """Return the numbers of a logged run by element; NaN where it has no cycle that counts."""
+    def __call__(self, problem: Problem, run: Run) -> float | Mapping[str, float]:
+        """Return the numbers of a logged run; NaN where it has no cycle that counts."""
+        values = self.values(problem, run)
+        return values[""] if self.names == ("",) else values
+
+    def values(self, problem: Problem, run: Run) -> dict[str, float]:
+        """Return the same by element, a single number under ''."""
         first = int(np.sum(run.time < problem.measure_from - 0.5 * problem.period))
         about = Measured(problem, run.layout, run.cycles, first, run)
         names, begin = self._elements(run.layout), 0 if self.all_cycles else first
         none = (begin == run.cycles and not self.all_cycles) or (self.of_whole_runs and about.stopped)
         sums = np.full((1, len(names)), np.nan) if none else self._of_log(about, run, begin, len(names))
         numbers = dict(zip(names, self.number(sums, about)[0], strict=True))
-        values = {name: value.item() for name, value in numbers.items() if value is not np.ma.masked}
-        return values[""] if self.names == ("",) else values
+        return {name: value.item() for name, value in numbers.items() if value is not np.ma.masked}
 
     def _elements(self, layout: Layout) -> tuple[str, ...]:
         return layout[self.names].elements if isinstance(self.names, str) else self.names

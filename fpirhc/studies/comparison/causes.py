@@ -80,7 +80,7 @@ def error_left_alone(problem: Problem, *, seed: int) -> Mapping[str, float]:
         run = judged_run(simulator(problem, HeldInput(), compiled=False), seed=seed)
     except FpirhcError:
         return {}
-    return {} if run.stop is not None else rms_error(problem, run)
+    return {} if run.stop is not None else rms_error.values(problem, run)
 
 
 def not_followed(plain: Entry, adaptive: Entry, names: list[str], yardstick: Yardstick) -> str:

@@ -84,7 +84,7 @@ def null_test(
     before, after = (_or_nan(errors) for errors in (pair.without, pair.adapted))
     slight = {name: SLIGHT * size for name, size in pair.ranges.items()}
     if pair.stuck:
-        text = _not_informative({n: at_limit(null, run) for n, run in zip(names, runs, strict=True)})
+        text = _not_informative({n: at_limit.values(null, run)[""] for n, run in zip(names, runs, strict=True)})
         return NullTest(
             names, before, after, Outcome.NOT_COMPARABLE, False, text, null.cycles, time.perf_counter() - begin
         )
