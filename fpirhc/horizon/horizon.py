@@ -11,7 +11,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Count, Duration
+from fpirhc.fields.kinds import Count, Duration, described
 from fpirhc.plant.integrators import USUAL, Integrator
 
 
@@ -75,7 +75,7 @@ class Horizon(Checked):
         ):
             raise InvalidValue(
                 f"horizon: lengths must be {self.stages} finite numbers of at least 1, one for every stage in steps of the first, "
-                f"which is 1; got {self.lengths}"
+                f"which is 1; got {described(self.lengths)}"
             )
         if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):
             raise InvalidValue(

@@ -164,16 +164,20 @@ def progress_bars(*, as_json: bool = False) -> Iterator[Report]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        known: dict[str, TaskID] = {}
+    bars, known = Progress(*columns, console=Console(stderr=True), transient=True), dict[str, TaskID]()
 
-        def report(name: str, done: int, total: int) -> None:
-            if name not in known:
-                known[name] = bars.add_task(printable(name), total=total, rate="")
-            speed = bars.tasks[bars.task_ids.index(known[name])].speed
-            bars.update(known[name], completed=done, rate=f"{speed:.3g}/s" if speed else "")
+    def report(name: str, done: int, total: int) -> None:
+        bars.start()  # here, because it leaves a line behind, which is none of an error that comes before
+        if name not in known:
+            known[name] = bars.add_task(printable(name), total=total, rate="")
+        speed = bars.tasks[bars.task_ids.index(known[name])].speed
+        bars.update(known[name], completed=done, rate=f"{speed:.3g}/s" if speed else "")
 
+    try:
         yield report
+    finally:
+        if known:
+            bars.stop()
 
 
 class _Status:

@@ -264,6 +264,9 @@ def test_terminal_shows_names_literally(comparison, capsys, monkeypatch):
     with progress_bars() as report:
         report(HOSTILE, 1, 2)
     assert "\x1b[31m:bomb:" not in capsys.readouterr().err
+    with progress_bars():
+        pass  # an error before the first run leaves no line of bars
+    assert capsys.readouterr().err == ""
 
 
 def test_tables_escape_every_part():
