@@ -28,8 +28,9 @@ def of_seed(
     assert cases is not None
     with tempfile.TemporaryDirectory() as folder:
         study = fp.compare_scenarios(task, cases=patterns, controllers=controllers, seed=seed, folder=Path(folder))
+        all_records = {controller: list(records) for controller, records in study.records.items()}
     found = {}
-    for controller, records in study.records.items():
+    for controller, records in all_records.items():
         for group in dict.fromkeys(cases.group(r["name"]) for r in records):
             own = [r["metrics"] for r in records if cases.group(r["name"]) == group]
             shares, lowest = (np.array([m[what][""] for m in own]) for what in ("in_band", "lowest"))

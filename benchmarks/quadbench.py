@@ -122,7 +122,7 @@ def ours(task: Task, patterns: Sequence[str]) -> dict[str, np.ndarray]:
         return {}
     with tempfile.TemporaryDirectory() as folder:
         study = fp.compare_scenarios(task, cases=patterns, seed=0, folder=Path(folder), compiled=False)
-    return {name: np.array([_distance(one) for one in records]) for name, records in study.records.items()}
+        return {name: np.array([_distance(one) for one in records]) for name, records in study.records.items()}
 
 
 def _distance(record: Mapping[str, Any]) -> float:

@@ -352,6 +352,10 @@ def test_records_of_a_file_are_what_they_were(seed, tmp_path):
     assert records == wanted
     assert records[5:50:7] == wanted[5:50:7]
     assert records.at([7, 3]) == [wanted[7], wanted[3]]
+    (tmp_path / "l.jsonl").rename(tmp_path / "gone")
+    with pytest.raises(OutputError, match="records stay in the folder of their study, so keep it"):
+        records[0]
+    (tmp_path / "gone").rename(tmp_path / "l.jsonl")
     assert (records[-1], len(records), records != wanted[1:]) == (wanted[-1], 300, True)
 
 

@@ -44,7 +44,14 @@ class Records(Sequence[Mapping[str, Any]]):
         return Records(self._path, (self._places[k] for k in numbers))
 
     def __iter__(self) -> Iterator[Mapping[str, Any]]:
-        with self._path.open("rb") as file:
+        try:
+            file = self._path.open("rb")
+        except OSError as error:
+            raise OutputError(
+                f"cannot read '{self._path}': {error.strerror}; records stay in the folder of their study, so keep it as long as "
+                "they are read"
+            ) from None
+        with file:
             for place in self._places:
                 file.seek(place)
                 record = _parsed(self._path, file.readline())

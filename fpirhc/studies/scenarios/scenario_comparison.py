@@ -45,7 +45,7 @@ class ScenarioComparison(Study, FoundByName):
         measure_from: time from which errors count.
         columns: columns of the summaries' metrics in a short table.
         summaries: summaries in the controllers' order, the baseline first.
-        records: records of the scenarios, by controller.
+        records: records of the scenarios, by controller; they are read from the folder of the study where they are asked for.
         skipped: reasons why controllers were not run, by name.
         verdict: the verdict in sentences.
         tuning: sentences about the origin of tuned settings, by controller.
