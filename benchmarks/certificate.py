@@ -20,7 +20,7 @@ from table import write_table
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
-from fpirhc.plant.mismatch import exact_ranges
+from fpirhc.plant.plant import exact_ranges
 from fpirhc.review.prediction import exactly
 from fpirhc.simulation.simulate import simulator
 

@@ -24,8 +24,7 @@ from optimisers import rival
 from table import write_table
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.optimisers.limited import limited_step
 from fpirhc.symbolic.native import native
 

@@ -9,8 +9,7 @@ import numpy as np
 from limited_loop import Plan
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.optimisers.bounds import scales
 from fpirhc.optimisers.nlp import interleave, program, separate, shift_dynamics, shift_variables, sizes
 

@@ -15,8 +15,7 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import nnls
 
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.optimisers.bounds import scales
 
 _MET = 1e-6  # of the range: nearer limits may have a multiplier

@@ -23,8 +23,7 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, judge

@@ -6,8 +6,7 @@ import argparse
 import re
 from pathlib import Path
 
-from fpirhc.cli.discovery import shipped
-from fpirhc.cli.verb import ExitCode, Verb, markdown_table
+from fpirhc.cli.verb import ExitCode, Verb, markdown_table, shipped
 
 PAGE = Path(__file__).resolve().parent / "command-line.md"
 README = PAGE.parents[1] / "README.md"

@@ -28,7 +28,7 @@ from .deformation.wrappers.haar import Haar
 from .deformation.wrappers.self_paired import DelayWatched, SelfPaired
 from .deformation.wrappers.tuned import Tuned
 from .errors import FpirhcError, HarmfulAdaptation
-from .export.processor import Processor
+from .export.target import Processor
 from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.horizon import Horizon
@@ -47,8 +47,7 @@ from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
-from .plant.implicit import ImplicitMidpoint, RadauIIA
-from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.integrators import Cvodes, Euler, ImplicitMidpoint, RadauIIA, RungeKutta4
 from .plant.motion import Algebraic, Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
 from .plant.plant import Parameter, Plant
@@ -91,7 +90,7 @@ from .studies.information import compare_information
 from .studies.operating_limits import operating_limits
 from .studies.scenarios.scenario_study import compare_scenarios
 from .studies.tuning.tune import tune
-from .symbolic.functions import signed_power
+from .symbolic.live import signed_power
 from .task.cases import Cases
 from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step

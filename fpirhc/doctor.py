@@ -44,7 +44,7 @@ class Finding:
     """The result of one check."""
 
     name: str  # name of the check
-    outcome: Outcome  # its outcome
+    outcome: Outcome
     evidence: str  # the facts in a sentence
     remedy: str = ""  # what to do; empty: nothing
 

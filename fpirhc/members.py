@@ -113,8 +113,7 @@ def member_classes(family: str) -> tuple[type, ...]:
 def examples(family: str, inner: Any = None) -> tuple[Any, ...]:
     """Example values of every member of the family.
 
-    Args:
-        inner: the value that wrappers are built around; None leaves wrappers out.
+    `inner`: the value that wrappers are built around; None leaves wrappers out.
     """
     values: list[Any] = []
     for module in member_modules(family):

@@ -11,9 +11,7 @@ from fpirhc.errors import OutputError
 def write_whole(content: str | bytes, path: Path, what: str) -> None:
     """Write a file, atomically: a write that fails leaves what was there.
 
-    Args:
-        content: text, written as UTF-8 with the line ends that it has, or bytes.
-        what: what it is, for the error: "report".
+    `content`: text, written as UTF-8 with the line ends that it has, or bytes. `what`: what it is, for the error: "report".
     """
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.simulation.sample import raw_measurements
+from fpirhc.simulation.step_arguments import raw_measurements
 
 State = Any
 

@@ -54,11 +54,7 @@ def commonroad_body(
 
 
 class _Car:
-    """The package's derivative, integrated by Runge-Kutta steps of 1 ms.
-
-    Args:
-        kind: "st" or "std".
-    """
+    """The package's derivative, integrated by Runge-Kutta steps of 1 ms. `kind`: "st" or "std"."""
 
     def __init__(self, kind: str, speed: float, vehicle: int, steps: int, inputs: tuple[str, ...]) -> None:
         names = f"vehicle_dynamics_{kind}", f"init_{kind}", f"parameters_vehicle{vehicle}"

@@ -14,8 +14,7 @@ from fpirhc.adapters.names import adapter, finite_numbers
 from fpirhc.errors import package
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.simulation.held_input import HELD_INPUT, HeldInput
-from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.simulation.loop import HELD_INPUT, HeldInput, close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.simulate import run_tables
 from fpirhc.simulation.step_arguments import Setpoints

@@ -68,11 +68,7 @@ def fmu_body(
 
 
 class _Body:
-    """An instance of the FMU, made anew for every run.
-
-    Args:
-        third: whether it is of FMI 3.
-    """
+    """An instance of the FMU, made anew for every run. `third`: whether it is of FMI 3."""
 
     def __init__(self, made: Callable[[], Any], third: bool, period: float, sent: list[int], read: list[int]) -> None:
         self._made, self._third, self._period, self._sent, self._read = made, third, period, sent, read

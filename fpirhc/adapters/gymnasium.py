@@ -55,8 +55,7 @@ def gymnasium_body(env: Any, model: Plant, *, measures: Mapping[str, Read]) -> E
 class _Body:
     """The environment with the quantities that are read from its observations.
 
-    Args:
-        measures: quantity -> place, or a function of the observation.
+    `measures`: quantity -> place, or a function of the observation.
     """
 
     def __init__(self, env: Any, measures: Mapping[str, Read]) -> None:

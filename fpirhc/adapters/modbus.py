@@ -75,8 +75,6 @@ def modbus_body(
 
 
 class _Unit:
-    """Registers of one device."""
-
     def __init__(self, client: Any, unit: int, sent: list[Register], read: list[Register]) -> None:
         self._client, self._unit, self._sent, self._read = client, unit, sent, read
         weakref.finalize(self, client.close)

@@ -66,9 +66,7 @@ def mujoco_body(
 class _Body:
     """Joints and motors at their places in MuJoCo's vectors.
 
-    Args:
-        places: quantity -> (order of the derivative, place).
-        start: quantity -> value.
+    `places`: quantity -> (order of the derivative, place). `start`: quantity -> value.
     """
 
     def __init__(self, mujoco: Any, model: Any, steps: int, motors: list[int], places: _Places, start: _Values) -> None:

@@ -55,11 +55,7 @@ def opcua_body(
 
 
 class _Session:
-    """A session with the server.
-
-    Args:
-        sync: the package's module.
-    """
+    """A session with the server. `sync`: the package's module."""
 
     def __init__(self, sync: Any, address: str, sent: list[str], read: list[str]) -> None:
         self._sync, self._address, self._names = sync, address, (sent, read)

@@ -130,11 +130,7 @@ class _Standstill:
 
 
 class _Device:
-    """A link in the rhythm of the cycles.
-
-    Args:
-        counts: whether the link reads a counter first.
-    """
+    """A link in the rhythm of the cycles. `counts`: whether the link reads a counter first."""
 
     def __init__(self, link: Link, names: tuple[str, ...], setup: Setup, counts: bool) -> None:
         self._link, self._names, self._setup, self._clock = link, names, setup, setup.clock or RealTime()

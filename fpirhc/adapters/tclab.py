@@ -46,11 +46,7 @@ def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) ->
 
 
 class _Twin:
-    """The package's own model of the lab, led by simulated time.
-
-    Args:
-        period: of a cycle, s.
-    """
+    """The package's own model of the lab, led by simulated time. `period`: of a cycle, s."""
 
     def __init__(self, tclab: Any, model: Plant, period: float) -> None:
         self._tclab, self._model, self._period = tclab, model, period

@@ -14,8 +14,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fpirhc.baselines.bands import BANDED, EXACT, KINDS, Expected, Metric, expected
-from fpirhc.baselines.baseline import FORMAT, Baseline, Settings, fingerprint, settings_hash, settings_of, to_text
+from fpirhc.baselines.baseline import (
+    BANDED,
+    EXACT,
+    FORMAT,
+    KINDS,
+    Baseline,
+    Expected,
+    Metric,
+    Settings,
+    expected,
+    fingerprint,
+    settings_hash,
+    settings_of,
+    to_text,
+)
 from fpirhc.baselines.judging import Judgement, judge
 from fpirhc.baselines.measuring import (
     FINISHED,
@@ -398,8 +411,7 @@ def accept(
 def write_merged(problem: Path, parts: Sequence[str], working: Path) -> Path:
     """Write the baseline of all parts, with those controllers of the earlier file that no part has.
 
-    Args:
-        working: a folder of the project, outside of which nothing is written.
+    `working`: a folder of the project, outside of which nothing is written.
     """
     path = baseline_path(problem)
     check_inside(path, working)

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeGuard
 
-from fpirhc.baselines.bands import EXACT, Expected, Metric
-from fpirhc.baselines.baseline import Baseline, Settings, differences
+from fpirhc.baselines.baseline import EXACT, Baseline, Expected, Metric, Settings, differences
 from fpirhc.baselines.measuring import FINISHED, Measurement, Number, metric_of
 from fpirhc.simulation import metrics as run_metrics
 
@@ -99,8 +98,7 @@ def judge(
 ) -> Judgement:
     """Compare the fresh results of a problem with its baseline.
 
-    Args:
-        fresh: results under the nominal variant, of all controllers or of some.
+    `fresh`: results under the nominal variant, of all controllers or of some.
     """
     whole = set(fresh) == set(settings.controllers)
     names = dict.fromkeys([*fresh, *(baseline.controllers if whole else ())])
@@ -130,8 +128,7 @@ def _old_names(baseline: Baseline) -> list[str]:
 def ignoring(judgement: Judgement, share: float) -> Judgement:
     """Return the judgement in which changes smaller than a share of the old value hold; counts and words never do.
 
-    Args:
-        share: of the old value; 0 ignores nothing.
+    `share`: of the old value; 0 ignores nothing.
     """
     small = [r for r in judgement.changed if r.band is not None and r.change is not None and abs(r.change) < share]
     if not small:

@@ -44,7 +44,7 @@ class Job:
     """One controller under one variant."""
 
     controller: str  # name of the controller
-    variant: Variant  # the variant
+    variant: Variant
 
 
 def _no_run_has_it(problem: Problem, run: Run) -> None:
@@ -65,11 +65,7 @@ PLANS = {
 
 
 def metric_of(key: str, metrics: Sequence[run_metrics.Metric] | None = None) -> run_metrics.Metric:
-    """Return the metric of a number, which says how it is compared.
-
-    Args:
-        key: name of the number, 'metric.element'.
-    """
+    """Return the metric of a number, which says how it is compared. `key`: name of the number, 'metric.element'."""
     entries = {**PLANS, **{m.name: m for m in (known_metrics() if metrics is None else metrics)}}
     name = key
     while name not in entries and "." in name:  # an element may have dots of its own

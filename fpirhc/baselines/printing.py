@@ -11,8 +11,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from fpirhc.baselines.bands import FACTOR, Metric
-from fpirhc.baselines.baseline import Baseline
+from fpirhc.baselines.baseline import FACTOR, Baseline, Metric
 from fpirhc.baselines.judging import OUTCOME, Judgement, Row
 from fpirhc.baselines.measuring import Number
 from fpirhc.errors import OutputError
@@ -29,8 +28,7 @@ _STYLES = {"holds": "", "better": "bold green", "worse": "bold red"}
 def show_check(judgements: Sequence[Judgement], unchecked: Mapping[str, str], every: bool) -> None:
     """Print a table and a sentence for every problem.
 
-    Args:
-        every: whether to print every metric, and not only those that changed and the headline metric.
+    `every`: whether to print every metric, and not only those that changed and the headline metric.
     """
     for one in judgements:
         name, (causes, rows) = clean(one.problem), explained(one)

@@ -8,9 +8,8 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 
-from fpirhc.cli.discovery import Known, former_names, known, shipped
 from fpirhc.cli.output import closed_by_reader, crash, interrupted, of_a_problem_file, silence_output
-from fpirhc.cli.verb import DEBUG, GROUPS, ExitCode, Parser, aligned, table
+from fpirhc.cli.verb import DEBUG, GROUPS, ExitCode, Known, Parser, aligned, former_names, known, shipped, table
 from fpirhc.summary import printable
 
 

@@ -92,7 +92,7 @@ def positive(text: str) -> float:
 
 
 def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:
-    """--mismatch PERCENT, with the same meaning wherever it stands; see `fpirhc.plant.mismatch`."""
+    """--mismatch PERCENT, with the same meaning wherever it stands; see `fpirhc.plant.plant`."""
     text = (
         "every exact parameter lies within PERCENT %% of its value in the problem file, or of its spread, and dead times likewise "
         "(default: 0)"
@@ -196,7 +196,7 @@ class _Optimisers(argparse._StoreAction):
     @property
     def help(self) -> str:
         """The names, found when they are shown."""
-        from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
+        from fpirhc.studies.open_loop import optimiser_choices
 
         return f"{', '.join(optimiser_choices())}, or all"
 

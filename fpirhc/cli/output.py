@@ -24,11 +24,7 @@ RESULTS = "results.json"  # what --json prints, beside every report
 
 
 def results_folder(wanted: str | None, *default: str) -> Path:
-    """Return the folder for results, created before anything runs.
-
-    Args:
-        wanted: path of the folder; None: `results/DEFAULT...`.
-    """
+    """Return the folder for results, created before anything runs. `wanted`: path of the folder; None: `results/DEFAULT...`."""
     return output_folder(Path(wanted) if wanted else Path("results", *default))
 
 

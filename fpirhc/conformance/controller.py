@@ -27,8 +27,8 @@ from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import without_warning
 from fpirhc.status import Status

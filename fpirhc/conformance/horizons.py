@@ -37,7 +37,7 @@ _EFFORT = 1.0
 class Trial:
     """An optimiser with the horizons of its laws."""
 
-    optimiser: Optimiser  # the optimiser
+    optimiser: Optimiser
     tolerance: float  # stationarity below which it calls a plan OK
     calls: int  # calls within which it must solve a small problem
 
@@ -95,10 +95,10 @@ class TrialPlan:
 class TrialHorizon:
     """One horizon with its data, the functions of an optimiser for it, and its solution by other means."""
 
-    optimiser: Optimiser  # the optimiser
+    optimiser: Optimiser
     calls: int  # calls within which it must solve the horizon
-    plant: Plant  # the plant
-    limits: Limits  # the limits
+    plant: Plant
+    limits: Limits
 
     @cached_property
     def served(self) -> bool:

@@ -68,8 +68,8 @@ def two_masses() -> Problem:
 class Trial:
     """A controller on a problem."""
 
-    controller: Controller  # the controller
-    problem: Problem  # the problem
+    controller: Controller
+    problem: Problem
     seed: int  # of the noise
     left: float  # share of the first error that may be left with the exact model
     compiled: bool  # whether compiled C is compared too
@@ -144,7 +144,7 @@ class Replay:
     """A controller, without a gate before it, that is given the motion of a recorded run."""
 
     problem: Problem  # that the controller is composed for
-    controller: Controller  # the controller
+    controller: Controller
     run: Run  # whose motion it is given
 
     def cycles(self) -> Iterator[Cycle]:

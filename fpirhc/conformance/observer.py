@@ -17,12 +17,11 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed_state import believed_integrator, moving
 from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.plant.motion import with_exact_parameters
-from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, values_of
-from fpirhc.sensing.observability import unobservable
+from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, unobservable, values_of
 from fpirhc.sensing.sensing import Sensing, Sensor
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import without_warning
 from fpirhc.status import Status

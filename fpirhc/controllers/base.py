@@ -23,9 +23,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import GAP, SETTLING, Block, Delay, Step, is_long
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
-from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar, vector
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.live import nominal, numbers
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 

@@ -14,15 +14,14 @@ from contextvars import ContextVar
 import numpy as np
 
 from fpirhc.contraction.delayed import limit_behind_weights
-from fpirhc.contraction.measured import jacobians_along
-from fpirhc.contraction.spectrum import Spectrum, assess_gain, linear_limit
+from fpirhc.contraction.spectrum import Spectrum, assess_gain, jacobians_along, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.deformation.base import Deformation, Iteration, against_wrappers
 from fpirhc.errors import NotContractive
 from fpirhc.plant.maps import against_parts
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.live import nominal
-from fpirhc.symbolic.queue import every
+from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 
 _SOUGHT = 20.0  # effective gain times eigenvalue up to which limits are sought

@@ -78,9 +78,8 @@ class PlantModel:
     plant: Plant  # equations of the model
     signals: Mapping[str, Exogenous]  # measured disturbances, with their preview
     exact: bool = False  # whether its parameters are the exact ones; such a controller is a bound to compare with
-    given: Mapping[str, float] = field(
-        default_factory=dict
-    )  # values of parameters in place of the approximate ones, by name
+    # values of parameters in place of the approximate ones, by name
+    given: Mapping[str, float] = field(default_factory=dict)
 
     def parameters(self, plant: Plant) -> np.ndarray:
         """Return the parameters with which the controller evaluates a plant, shape (np,)."""
@@ -117,7 +116,7 @@ class Planner:
         return self.tracking is not None or self.corrects(plant)
 
     def starts_consistent(self, plant: Plant) -> bool:
-        """Return whether plans start where the model has the measured outputs (`fpirhc.horizon.consistent_state`)."""
+        """Return whether plans start where the model has the measured outputs (`fpirhc.horizon.nominal`)."""
         return len(measured_signals(plant)) > 1 and (
             self.corrects(plant) if self.consistent is None else self.consistent
         )
@@ -239,10 +238,8 @@ class Controller(Checked, ABC):
         own = self.deformation
         deformation = late_deformation(own, problem)
         if automatic(deformation):
-            where = problem if self.inner is None else self.inner_problem(problem)
-            request = (
-                request_along_reference(where, tracking_law(self)) if self.planner is None else request_of_plans(where)
-            )
+            plans = self.planner is not None
+            request = request_of_plans(problem) if plans else request_along_reference(problem, tracking_law(self))
             deformation = deformation.with_scale_for(request)
         return self if deformation is own else self.with_deformation(deformation)
 
@@ -286,22 +283,20 @@ class ControllerWrapper(Controller, ABC):
         return self.controller.deformation
 
 
-def with_lateness(problem: Problem, controller: Controller) -> Controller:
-    """Return the controller whose deformation believes the problem's dead times, and an external plant's lag, where it is open."""
-    return _with_late(problem, controller)
+def with_lateness(problem: Problem, controller: Controller, least: float = math.ulp(0.0)) -> Controller:
+    """Return the controller whose deformation believes the problem's dead times, and an external plant's lag, where it is open.
 
-
-def believing(problem: Problem, controller: Controller) -> Controller:
-    """Return the resolved controller whose deformation believes this problem's dead times and lags in every other one too."""
-    return _with_late(problem, resolved(problem, controller), least=0)
-
-
-def _with_late(problem: Problem, controller: Controller, least: float = math.ulp(0.0)) -> Controller:
-    """The controller with the deformation of `late_deformation`; one with several deformations has its own for each already."""
+    One with several deformations has its own for each already. `least`: the smallest of these times that is believed.
+    """
     own = controller.deformation
     late = late_deformation(own, problem, least)
     unchanged = late is own or controller.response(problem) is not None
     return controller if unchanged else controller.with_deformation(late)
+
+
+def believing(problem: Problem, controller: Controller) -> Controller:
+    """Return the resolved controller whose deformation believes this problem's dead times and lags in every other one too."""
+    return with_lateness(problem, resolved(problem, controller), least=0)
 
 
 def late_deformation(deformation: Deformation, problem: Problem, least: float = math.ulp(0.0)) -> Deformation:
@@ -425,8 +420,7 @@ def refuse(reasons: Iterator[str]) -> None:
 def check_chains(problem: Problem, law: str) -> None:
     """Raise for an output of order 0, which has no derivative below its response.
 
-    Args:
-        law: what needs such a derivative, as the beginning of a sentence.
+    `law`: what needs such a derivative, as the beginning of a sentence.
     """
     refuse(
         f"{law}, and the command moves '{name}' at once (order 0); use DisturbanceObserver"
@@ -438,8 +432,7 @@ def check_chains(problem: Problem, law: str) -> None:
 def check_derivatives(problem: Problem, law: str) -> None:
     """Raise for a map or an output of order 0, where a law has no meaning.
 
-    Args:
-        law: what the law does with derivatives, as the beginning of a sentence.
+    `law`: what the law does with derivatives, as the beginning of a sentence.
     """
     what = rateless(problem.plant)
     if what:

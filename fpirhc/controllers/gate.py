@@ -1,7 +1,4 @@
-"""The gate in front of a controller: a bad sample is a skipped cycle.
-
-Theory: docs/theory-questions.md.
-"""
+"""The gate in front of a controller: a bad sample is a skipped cycle. Theory: docs/theory-questions.md."""
 
 from __future__ import annotations
 
@@ -96,8 +93,7 @@ class Gap:
 def gap_of(problem: Problem, bridged: int) -> Gap:
     """Return the gap counter of a problem's steps.
 
-    Args:
-        problem: of the steps; where state and response are measured as they are, nothing settles.
+    `problem`: of the steps; where state and response are measured as they are, nothing settles.
     """
     if not problem.sensing.estimates:
         return Gap(bridged, 0.0)
@@ -127,9 +123,7 @@ def outcome(
 ) -> tuple[Expression, Expression]:
     """Return (memory to keep, whether the step is fine): memory and command are finite, and no status says that something was not.
 
-    Args:
-        ran: whether the results are to be kept where they are fine.
-        opaque: whether the step is a graph of calls.
+    `ran`: whether the results are to be kept where they are fine. `opaque`: whether the step is a graph of calls.
     """
     said = expression(1.0) if "status" not in layout else trace[layout.slice("status")] != int(Status.NON_FINITE)
     if not opaque:

@@ -159,8 +159,7 @@ class LiveSettings:
     def changed(self, numbers: Numbers) -> tuple[Problem, Controller, dict[str, float]]:
         """Return problem and controller with other numbers, checked, and the numbers of all settings by path.
 
-        Args:
-            numbers: by path, a pair for an interval; settings that are not named have the numbers of the build.
+        `numbers`: by path, a pair for an interval; settings that are not named have the numbers of the build.
         """
         values = {path: value for path, value in self.start.items() if path in self.paths}
         values |= self.flat(numbers)
@@ -195,11 +194,12 @@ class LiveSettings:
         value = self._content(path)
         size = max(abs(value), _SMALLEST)
         reaches = [*(r for r in _REACHES if r < reach), *([reach] if math.isfinite(reach) else [])]
-        lower, upper = (_farthest(lambda n: self._accepts(path, n), value, side * size, reaches) for side in (-1, 1))
-        return (
-            max(lower, value) if path.startswith(_OF_INPUTS) and path.endswith(".0") else lower,
-            min(upper, value) if path.startswith(_OF_INPUTS) and path.endswith(".1") else upper,
+        of_machine = path[-2:] if path.startswith(_OF_INPUTS) else ""
+        lower, upper = (
+            value if of_machine == end else _farthest(lambda n: self._accepts(path, n), value, side * size, reaches)
+            for end, side in ((".0", -1), (".1", 1))
         )
+        return lower, upper
 
     def _accepts(self, path: str, value: float) -> bool:
         try:

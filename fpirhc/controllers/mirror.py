@@ -25,7 +25,7 @@ from fpirhc.sensing.base import response_names, values_of
 from fpirhc.symbolic.block import GAP, Block, Delay, straightened, unseen
 from fpirhc.symbolic.expression import Signals, expression, is_finite, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.queue import Queue
+from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
 
 
@@ -217,8 +217,7 @@ class _Deformations:
 def _seen(problem: Problem, names: Sequence[str], shifted: Sequence[str]) -> ca.Function:
     """Function (state, command that acted, parameters, shift) -> what the sensors show without noise, rounded as they round.
 
-    Args:
-        shifted: names of the quantities to which the entries of the shift are added.
+    `shifted`: names of the quantities to which the entries of the shift are added.
     """
     (x, u, p), shift = problem.plant.symbols(), ca.SX.sym("shift", len(shifted))
     values = values_of(problem.plant, x, u, p)

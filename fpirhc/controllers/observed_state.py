@@ -26,13 +26,12 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.maps import growth_of
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Evidence, Model, StateObserver, values_of
-from fpirhc.sensing.observability import members, slowest
+from fpirhc.sensing.base import Evidence, Model, StateObserver, members, slowest, values_of
 from fpirhc.symbolic.block import GAP, Block, Delay, bridged, call
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
-from fpirhc.symbolic.queue import Queue
+from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem, nominal_start
 
 
@@ -153,8 +152,7 @@ class Believing:
 def moving(plant: Plant, integrator: Integrator, period: float, *, fraction: bool) -> ca.Function:
     """Return Function (state, input, parameters, forcing, share) -> state after that share of a cycle.
 
-    Args:
-        fraction: whether the share may lie between 0 and 1; a sample in between is interpolated.
+    `fraction`: whether the share may lie between 0 and 1; a sample in between is interpolated.
     """
     (x, u, p), w, share = plant.symbols(), ca.SX.sym("w", len(plant.names)), ca.SX.sym("share")
     after = integrator.step(plant, period)(x, u, p, w)

@@ -1,7 +1,4 @@
-"""The plausible range of a sample: what no working sensor shows.
-
-Theory: docs/theory-questions.md.
-"""
+"""The plausible range of a sample: what no working sensor shows. Theory: docs/theory-questions.md."""
 
 from __future__ import annotations
 
@@ -21,9 +18,8 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import FINITE, Signals
-from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.live import nan_where, nominal
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 

@@ -1,7 +1,4 @@
-"""Receding-horizon control whose nominal acceleration is deformed.
-
-Theory: docs/theory-questions.md.
-"""
+"""Receding-horizon control whose nominal acceleration is deformed. Theory: docs/theory-questions.md."""
 
 from __future__ import annotations
 
@@ -41,9 +38,19 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.status import STOPPED, Status
 from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
-from fpirhc.symbolic.functions import nan_where, numbers
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, copied, live_numbers, nominal, settled
+from fpirhc.symbolic.live import (
+    DERIVED,
+    PREFIX,
+    Derived,
+    LiveNumber,
+    copied,
+    live_numbers,
+    nan_where,
+    nominal,
+    numbers,
+    settled,
+)
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
 

@@ -206,7 +206,7 @@ def _recovery(problem: Problem, law: Tracking | None) -> float:
     rates = [(len(one.gains), one.rate) for one in laws if one is not None and one.rate is not None and one.gains]
     if not rates:
         return 0.0
-    from fpirhc.contraction.large_errors import step_for_basin  # of laws with one rate alone
+    from fpirhc.contraction.delayed import step_for_basin  # of laws with one rate alone
 
     error = _largest_error(problem)
     return max(step_for_basin(error, poles, rate, problem.period) for poles, rate in rates)

@@ -1,7 +1,4 @@
-"""Where a horizon starts and what is tracked between two plans: three choices.
-
-Theory: docs/theory-questions.md.
-"""
+"""Where a horizon starts and what is tracked between two plans: three choices. Theory: docs/theory-questions.md."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.reference_states import largest_response
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
-from fpirhc.horizon.consistent_state import consistent_state
+from fpirhc.horizon.nominal import consistent_state
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.integrators import USUAL, motion_of
@@ -24,8 +21,8 @@ from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.driver import plans_are_compiled
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -67,7 +64,7 @@ class FromMeasurement(Replanning):
 
     Args:
         consistent: whether a plan on outputs starts at the state at which the model has the measured outputs and derivatives, see
-            `fpirhc.horizon.consistent_state`; None: where a deformation, or a believed disturbance of the response, makes the
+            `fpirhc.horizon.nominal`; None: where a deformation, or a believed disturbance of the response, makes the
             plant's response that of the plan: the plant then moves as that plan foresees. Coordinates are always consistent.
     """
 
@@ -252,8 +249,7 @@ def built_first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalContr
 def first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
     """Return the optimiser's memory before the run.
 
-    Args:
-        data_of: Function (time, parameters, live numbers) -> data of the horizon.
+    `data_of`: Function (time, parameters, live numbers) -> data of the horizon.
     """
     first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
     live = ocp.nodes[2][ocp.data.slice("settings").start :, 0] if ocp.settings else None

@@ -28,8 +28,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import GAP, Block, Composite, Delay, bridged, compose, straightened
 from fpirhc.symbolic.driver import plans_are_compiled
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
@@ -246,7 +246,6 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
 
 
 def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], list[Delay]]:
-    """The blocks of a controller and what they remember."""
     given: object = controller.blocks(problem)
     pair = given if isinstance(given, tuple) and len(given) == 2 else None
     kinds = (Block, Delay)
@@ -265,8 +264,7 @@ def compose_informed(
 ) -> Composite:
     """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
 
-    Args:
-        ahead: whether the time is the one at which the command will act.
+    `ahead`: whether the time is the one at which the command will act.
     """
     model = ready.plant_model(problem)
     known = KnownSignals(model.plant, model.signals, problem.period)
@@ -283,8 +281,7 @@ def compose_informed(
 def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
     """Return a composed step as one block.
 
-    Args:
-        feeds: name of a signal that the step reads -> the signal that it is given instead.
+    `feeds`: name of a signal that the step reads -> the signal that it is given instead.
     """
     reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
 

@@ -62,11 +62,10 @@ class Affine(Deformation):
 
     @property
     def _rows(self) -> tuple[tuple[float, ...], ...]:
-        """W by rows."""
-        given = self.weights or ()
-        if rows := tuple(one for one in given if isinstance(one, tuple)):
+        weights = self.weights or ()
+        if rows := tuple(one for one in weights if isinstance(one, tuple)):
             return rows
-        numbers = [one for one in given if not isinstance(one, tuple)]
+        numbers = [one for one in weights if not isinstance(one, tuple)]
         return tuple(tuple(w if j == k else 0.0 for j in range(len(numbers))) for k, w in enumerate(numbers))
 
     def step(

@@ -140,7 +140,7 @@ class RequestChange:
     # the map needs room beyond it.
     sudden: bool
     # step per cycle with which the plain form comes back from the largest response error that is expected, in units of the
-    # response (`fpirhc.contraction.large_errors`)
+    # response (`fpirhc.contraction.delayed`)
     recovery: float = 0.0
 
 

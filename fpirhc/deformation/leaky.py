@@ -11,8 +11,8 @@ import math
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
-from fpirhc.symbolic.functions import between, ceil, larger, largest, positive, smaller, sqrt
-from fpirhc.symbolic.queue import MOST, Cycles, every
+from fpirhc.symbolic.live import between, ceil, larger, largest, positive, smaller, sqrt
+from fpirhc.task.dead_time import MOST, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists

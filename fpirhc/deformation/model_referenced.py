@@ -16,10 +16,9 @@ from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertai
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne, finite_number
 from fpirhc.symbolic.expression import is_finite
-from fpirhc.symbolic.functions import stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import nominal
-from fpirhc.symbolic.queue import Cycles, Queue, every, longest_of, several
+from fpirhc.symbolic.live import nominal, stays
+from fpirhc.task.dead_time import Cycles, Queue, every, longest_of, several
 
 
 @dataclass(frozen=True)

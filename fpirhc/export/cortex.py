@@ -112,9 +112,9 @@ class Board:
 
     def _read(self, unit: Any, at: int) -> int:
         _, to, size = struct.unpack("<3I", unit.mem_read(at, 12))
-        found = self._source.read(size)
-        unit.mem_write(to, found)
-        return size - len(found)
+        received = self._source.read(size)
+        unit.mem_write(to, received)
+        return size - len(received)
 
     def _write(self, unit: Any, at: int) -> int:
         _, start, size = struct.unpack("<3I", unit.mem_read(at, 12))

@@ -15,7 +15,7 @@ import casadi as ca
 
 from fpirhc.export.device import Device
 from fpirhc.export.targets.c import sources
-from fpirhc.plant.inverse import NEWTON_ITERATIONS
+from fpirhc.plant.motion import NEWTON_ITERATIONS
 from fpirhc.symbolic.native import find_compiler
 
 _STILL = frozenset((ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_PARAMETER))

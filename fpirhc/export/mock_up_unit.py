@@ -69,9 +69,8 @@ class Interface:
     code: str  # template of the functions that a master calls
     headers: tuple[str, ...]  # files of the standard that it includes
     token: str  # attribute that holds the unit's key
-    step: Callable[
-        [str], Mapping[str, str]
-    ]  # attributes of the co-simulation that this version alone has, from the period
+    # attributes of the co-simulation that this version alone has, from the period
+    step: Callable[[str], Mapping[str, str]]
     add: Callable[[ET.Element, int, Variable], None]  # puts a variable with its number into the list of variables
     # puts what is computed, as numbers of the variables, into the structure of the model
     structure: Callable[[ET.Element, list[int]], None]

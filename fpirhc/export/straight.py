@@ -14,8 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 
-from fpirhc.export.choices import CHOICE, COMPARED, DIGITS, EVERY, NUMBER, POINTER, ROW, Graph
-from fpirhc.export.forms import Forms, Way
+from fpirhc.export.choices import CHOICE, COMPARED, DIGITS, EVERY, NUMBER, POINTER, ROW, Forms, Graph, Way
 
 _BODY = re.compile(
     r"(^static int \w+\([^{]*\{[^\n]*\n)((?:  casadi_real a\d[^;]*;\n)+)((?:  (?:a\d+=|if \(res\[)[^\n]*;\n)+)(?=  return 0;\n\})",
@@ -38,8 +37,7 @@ _Sure = Mapping[int, bool]  # flags, and what they are in a block
 def condensed(text: str) -> str:
     """Return the C text of a step with its functions of straight lines condensed.
 
-    Args:
-        text: generated C, whose caller passes rows for all that is read and written, and none for both.
+    `text`: generated C, whose caller passes rows for all that is read and written, and none for both.
     """
     shorter = _BODY.sub(lambda found: _function(found[1], found[3].splitlines()), text)
     return shorter.replace("#include <math.h>\n", "#include <math.h>\n#include <string.h>\n", 1)
@@ -110,8 +108,6 @@ class _Group:
 
 
 class _Writer:
-    """The lines of one function."""
-
     def __init__(self, forms: Forms) -> None:
         self._forms, self._graph = forms, forms.graph
         self._lines: list[str] = []
@@ -138,17 +134,17 @@ class _Writer:
 
     def _reached(self, nodes: Iterable[int], names: _Names, sure: _Sure) -> tuple[set[int], set[int]]:
         """The values that are still missing, and those that are there and read."""
-        found, there, waiting = set[int](), set[int](), list(nodes)
+        missing, there, waiting = set[int](), set[int](), list(nodes)
         while waiting:
             node = waiting.pop()
             if names.get(node):
                 there.add(node)
             elif self._known(node, sure) != node:
                 waiting.append(self._known(node, sure))
-            elif node not in found:
-                found.add(node)
+            elif node not in missing:
+                missing.add(node)
                 waiting += self._graph.operands[node]
-        return found, there
+        return missing, there
 
     def _block(self, stored: Sequence[tuple[str, int]], names: _Names, indent: str, sure: _Sure) -> None:
         """Write stores, the results first that need the least that is not yet computed: few values then wait at a time."""
@@ -194,18 +190,18 @@ class _Writer:
 
     def _read_by(self, node: int, names: _Names, sure: _Sure) -> set[int]:
         """The values with names or lines of their own that a line of this value reads."""
-        found, waiting = set[int](), list(self._graph.operands[self._known(node, sure)])
+        operands, waiting = set[int](), list(self._graph.operands[self._known(node, sure)])
         while waiting:
             one = waiting.pop()
             if names.get(one):
-                found.add(one)
+                operands.add(one)
                 continue
             one = self._known(one, sure)
             if one in self._forms.inline and not names.get(one):
                 waiting += self._graph.operands[one]
             else:
-                found.add(one)
-        return found
+                operands.add(one)
+        return operands
 
     def _grouped(self, stored: Sequence[tuple[str, int]], names: _Names) -> tuple[list[tuple[str, int]], list[_Group]]:
         """Stores one by one, and those that follow a flag."""

@@ -11,21 +11,30 @@ import inspect
 import re
 import sys
 from abc import ABCMeta
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache, wraps
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, ClassVar, ParamSpec, TypeVar, get_origin
+from typing import TYPE_CHECKING, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
 
 import casadi as ca
 
-from fpirhc.by_name import find_by_name
-from fpirhc.errors import InvalidField, nearest
-from fpirhc.fields.expected import Anything, Choice, Expected, Number, accepts, expected_by
-from fpirhc.fields.kinds import call_of, described, shortened, signature_of
+from fpirhc.errors import InvalidField, InvalidName, nearest
+from fpirhc.fields.kinds import (
+    Anything,
+    Choice,
+    Expected,
+    Number,
+    accepts,
+    call_of,
+    described,
+    expected_by,
+    shortened,
+    signature_of,
+)
 from fpirhc.fields.user_code import users_place
 from fpirhc.members import FORMER_MEMBERS
 
@@ -177,8 +186,6 @@ def checks_of(function: Callable[..., object]) -> _Arguments:
 
 @dataclass(frozen=True)
 class _Arguments:
-    """The arguments of a class or a function."""
-
     owner: type | Callable[..., object]  # what is called
     noun: str  # what an argument of it is called, "field" or "argument"
     positional: tuple[str, ...]  # names of those that may be given by their place
@@ -256,7 +263,6 @@ def _read_annotation(annotation: object, names: Mapping[str, object], own: Mappi
 
 
 def _mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
-    """Yield every mistake of the value and its parts."""
     if not expected.fits(value):
         comma = isinstance(value, tuple) and len(value) == 1 and accepts(expected, value[0])
         mend = "a comma behind the value makes a tuple of it; remove the comma" if comma else ""
@@ -365,3 +371,43 @@ def replaced(value: Value, field: str, content: object) -> Value | None:
         return None
     changed: Value = replace(value, **{field: content})  # type: ignore[type-var]  # mypy does not narrow type variables
     return changed
+
+
+class ByName(dict[str, Value]):
+    """A dictionary with names as keys; dictionaries in it are such ones too.
+
+    Raises:
+        InvalidName: a name that is not there.
+    """
+
+    def __init__(self, entries: Mapping[str, Value] | Iterable[tuple[str, Value]], where: str = "the mapping") -> None:
+        """Copy the entries; `where` is the subject of the error: "Task.controllers"."""
+        super().__init__(entries)
+        self._where = where
+        for name, value in self.items():
+            if type(value) is dict:  # not a subclass, which may have an order or a default of its own
+                super().__setitem__(name, cast(Value, ByName(cast(dict[str, object], value), f"{where}[{name!r}]")))
+
+    def __getitem__(self, name: str) -> Value:
+        try:
+            return super().__getitem__(name)
+        except TypeError:  # a list or a slice
+            self.__missing__(name)
+
+    def __missing__(self, name: object) -> NoReturn:
+        raise InvalidName(f"{self._where} has no '{name}'.{nearest(name, self)}")
+
+
+class FoundByName:
+    """Base of dataclasses whose dictionaries are found by name."""
+
+    def __post_init__(self) -> None:
+        """Let every dictionary in a public field be found by name."""
+        find_by_name(self)
+
+
+def find_by_name(value: object) -> None:
+    """Let every dictionary in a public attribute of a value be found by name."""
+    for name, content in list(getattr(value, "__dict__", {}).items()):
+        if type(content) is dict and not name.startswith("_") and all(isinstance(key, str) for key in content):
+            object.__setattr__(value, name, ByName(content, f"{type(value).__name__}.{name}"))

@@ -45,8 +45,7 @@ def _entry_of(name: str, one: Limit, view: View) -> ConstraintState:
 def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> list[ConstraintState]:
     """Hard limits of states and paths after so many steps inside a stage of a map: the nodes do not see what is between them.
 
-    Args:
-        limits: of the problem; soft and priced ones, and those of a change of inputs, hold at the nodes alone.
+    `limits`: of the problem; soft and priced ones, and those of a change of inputs, hold at the nodes alone.
     """
     nodes_alone, measured_view = limits.soft.keys() | limits.prices.keys(), replace(view, state=seen)
     states = [_entry_of(name, one, measured_view) for name, one in limits.boxes(plant).items()]

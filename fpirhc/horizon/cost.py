@@ -20,9 +20,8 @@ from fpirhc.fields.kinds import NotNegative
 from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
-from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Named
-from fpirhc.symbolic.live import DERIVED, computed_from, nominal
+from fpirhc.symbolic.live import DERIVED, computed_from, nominal, numbers
 
 
 @dataclass(frozen=True, eq=False)

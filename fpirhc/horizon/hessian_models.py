@@ -19,7 +19,7 @@ import casadi as ca
 
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 
 _OPERANDS = 2  # most operands of an elementary operation
 _Edges = list[dict[int, ca.SX]]  # for every result, its partial derivatives by the result that they are of

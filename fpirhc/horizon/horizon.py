@@ -39,7 +39,7 @@ class Horizon(Checked):
             its rate holds from plan to plan, and its cost is stages per plan times that of a later change.
         share: of a stage, the time from plan to plan. Controllers fill it in from `replan`.
         measured: names of states whose limits hold for the measured state: for the plan's plus the distance of the measured one
-            from the plan's start. Controllers fill it in where a plan starts elsewhere, see `fpirhc.horizon.consistent_state`.
+            from the plan's start. Controllers fill it in where a plan starts elsewhere, see `fpirhc.horizon.nominal`.
 
     Raises:
         InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, margins that are not one

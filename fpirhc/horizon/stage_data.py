@@ -156,9 +156,7 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int, *, corrected: bo
 def offset_limits(plant: Plant, horizon: Horizon, layout: Layout) -> ca.Function:
     """Function (data, state from which the plan starts, measured state) -> data with the distance of the measured state.
 
-    Args:
-        horizon: of the plan, with states whose limits hold for the measured one.
-        layout: of one stage's data.
+    `horizon`: of the plan, with states whose limits hold for the measured one. `layout`: of one stage's data.
     """
     nodes, rows = horizon.stages + 1, layout.slice("offset")
     places = [plant.state.elements.index(name) for name in horizon.measured]

@@ -33,15 +33,14 @@ from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
 from fpirhc.plant.motion import outside_of, sampling
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
 from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal, settled
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
-_LATEST: Latest[OptimalControl] = Latest(
-    16
-)  # a comparison goes through its controllers, and asks for the first one again
+# a comparison goes through its controllers, and asks for the first one again
+_LATEST: Latest[OptimalControl] = Latest(16)
 
 
 def transcribe(
@@ -200,8 +199,8 @@ def _stage_expressions(
             terms["held"] = (1 - data["free"]) * ca.sumsqr((u - before) / _reach(limits, plant))
         end = replace(view, output=_outputs(plant, x, ca.SX.nan(plant.input.size), view.parameters.vector))
         terminal = cost.terminal_cost(end, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.last)
-        kept = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
-        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.last * kept
+        soft_states = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
+        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.last * soft_states
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
     binding = hard(written, soft_names(limits, plant))
@@ -222,7 +221,7 @@ def _stage_expressions(
         places = ca.vertcat(at, at_z)
         return (
             ca.Function("fpirhc_linear_cost", [s, u, theta, ca.vertcat(places, at_u)], [horizon.step * length * rate]),
-            ca.Function("fpirhc_linear_end", [s, theta, places], [last + horizon.last * kept]),
+            ca.Function("fpirhc_linear_end", [s, theta, places], [last + horizon.last * soft_states]),
         )
 
     return _Stage(
@@ -231,7 +230,6 @@ def _stage_expressions(
 
 
 def _linearised(output: Named, variables: Expression, at: Expression) -> Named:
-    """The outputs, linearised in the variables at other ones."""
     values, slopes = (ca.substitute(e, variables, at) for e in (output.vector, ca.jacobian(output.vector, variables)))
     return Named(tuple(output), values + slopes @ (variables - at), "output")
 
@@ -394,7 +392,6 @@ def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca
 
 
 def _scalar_terms(expressions: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Terms as scalar expressions."""
     mistakes = Mistakes("cost")
     if not isinstance(expressions, Mapping) or not expressions:
         mistakes.add(f"the terms must be {{name: expression}} with at least one entry, got {expressions!r}")

@@ -1,7 +1,4 @@
-"""Anderson acceleration of a fixed-point iteration x <- T(x), safeguarded.
-
-Theory: docs/theory-plants.md.
-"""
+"""Anderson acceleration of a fixed-point iteration x <- T(x), safeguarded. Theory: docs/theory-plants.md."""
 
 from __future__ import annotations
 
@@ -35,11 +32,7 @@ class Anderson(Checked):
 def iterated(
     function: ca.Function, start: ca.MX, arguments: list[ca.MX], iterations: int, acceleration: Anderson | None
 ) -> ca.MX:
-    """Return the column x after a number of steps x <- function(x, *arguments).
-
-    Args:
-        acceleration: None: plain steps.
-    """
+    """Return the column x after a number of steps x <- function(x, *arguments). `acceleration`: None: plain steps."""
     x = ca.vec(start)
     if acceleration is None:
         for _ in range(iterations):

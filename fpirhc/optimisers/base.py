@@ -1,12 +1,9 @@
-"""The contract of optimisers, and how every plan is judged.
-
-Theory: docs/theory-plants.md.
-"""
+"""The contract of optimisers, and how every plan is judged. Theory: docs/theory-plants.md."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import ClassVar, Literal, cast
 
@@ -16,12 +13,12 @@ import numpy as np
 from fpirhc.describe import Same
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import reduced_gradient, rollout
+from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
 from fpirhc.status import Status
-from fpirhc.symbolic.driver import plans_are_compiled
+from fpirhc.symbolic.driver import Driver, plans_are_compiled, registered
 from fpirhc.symbolic.expression import FINITE, Matrix, is_finite
 from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.native import Native, native
 
 FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept, where an optimiser has no unit for it
 KEPT = 1e-6  # the same as a share of half the range, where it has one
@@ -252,6 +249,24 @@ def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, toler
     return ca.if_else(finite, feasible, int(Status.NON_FINITE))
 
 
+def judged_plan(
+    ocp: OptimalControl,
+    arguments: Sequence[ca.MX],
+    plan: ca.MX,
+    settings: tuple[int, float],
+    beside: ca.MX | None = None,
+) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """Return whether a plan after (iterations, tolerance) is finite, with `beside`; whether the call is posed; its diagnostics."""
+    s0, data, lower, upper, _ = arguments
+    cost, residual, violation = judge(ocp)(plan, s0, data, lower, upper, ca.MX.zeros(ocp.state.size, ocp.stages))
+    posed = sane(s0, data, lower, upper)
+    finite = ca.logic_and(posed, is_finite(ca.vertcat(ca.vec(plan) if beside is None else beside, cost, residual)))
+    status = status_of(finite, residual, violation, settings[1])
+    status = ca.if_else(ca.mmax(lower - upper) > 0, int(Status.INFEASIBLE), status)
+    numbers = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
+    return finite, posed, ca.vertcat(numbers, settings[0], status)
+
+
 def improved(
     optimiser: Optimiser,
     ocp: OptimalControl,
@@ -308,3 +323,30 @@ def first_plan(
     memory[layout.slice("plan_inputs")] = np.tile(lower + reach / 2, ocp.stages).ravel(order="F")
     other = improved(optimiser, ocp, state, data, memory, calls=calls)
     return other if other[1][4] == Status.OK and other[1][0] < first[1][0] else first
+
+
+LAST = "(arg[5] ? *arg[5] : 0)"
+
+
+def plan_library(ocp: OptimalControl, name: str, driver: Driver, memory: int) -> Native:
+    """Return the compiled Function (s0, data, lower, upper, memory, last) -> (U, diagnostics, memory), or why there is none.
+
+    It has one argument more than a step, a number that its text reads as `LAST`: one library serves a loop and plans in open loop.
+    """
+    results = [ca.MX.zeros(*size) for size in ((ocp.input.size, ocp.stages), (5, 1), (memory, 1))]
+    return native(ca.Function(registered(name, driver), [*call_arguments(ocp, memory), ca.MX.sym("last")], results))
+
+
+def with_last(ocp: OptimalControl, library: ca.Function, last: int) -> ca.Function:
+    """Return the library's Function without its last argument."""
+    arguments = call_arguments(ocp, library.size1_in(4))
+    return ca.Function(
+        "fpirhc_plan_library", arguments, library.call([*arguments, ca.MX(last)]), {"always_inline": True}
+    )
+
+
+def call_arguments(ocp: OptimalControl, memory: int) -> list[ca.MX]:
+    """Return the symbols (s0, data, lower, upper, memory) of a step that remembers so many numbers."""
+    nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+    sizes = {"s0": (ns, 1), "data": (ocp.data.size, n + 1), "lower": (nu, 1), "upper": (nu, 1), "memory": (memory, 1)}
+    return [ca.MX.sym(name, *size) for name, size in sizes.items()]

@@ -105,9 +105,7 @@ class Interior(NamedTuple):
 class Limited:
     """The limits of one call.
 
-    Args:
-        lower: lower limits of the inputs, shape (nu,).
-        upper: upper limits of the inputs, shape (nu,).
+    `lower`: lower limits of the inputs, shape (nu,). `upper`: upper limits of the inputs, shape (nu,).
     """
 
     def __init__(self, ocp: OptimalControl, scales: Scales, lower: ca.MX, upper: ca.MX) -> None:

@@ -13,8 +13,7 @@ import numpy as np
 
 from fpirhc.fields.checked import checked_call
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import reduced_gradient
+from fpirhc.horizon.problem import OptimalControl, reduced_gradient
 from fpirhc.optimisers.plan import Plan, sensitivity_of
 from fpirhc.summary import line, number, table
 
@@ -62,7 +61,6 @@ class Certificate:
         return table("Certificate", ("", "value"), self._facts(), [note])
 
     def _facts(self) -> list[tuple[str, str]]:
-        """What is known, by name."""
         limits = [
             ("active limits of states", str(self.active)),
             ("complementarity", number(self.complementarity)),
@@ -204,7 +202,6 @@ class _Active:
 
 
 def _active_limits(plan: Plan) -> _Active:
-    """Return the limits of states that have a multiplier at this plan."""
     ocp, multipliers = plan.problem, plan.state_multipliers
     has_multiplier = multipliers.ravel(order="F") != 0
     if not has_multiplier.any():

@@ -17,11 +17,9 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count, Positive
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import Optimiser, judge, sane, shift, status_of
-from fpirhc.status import Status
+from fpirhc.optimisers.base import Optimiser, call_arguments, judged_plan, shift
 from fpirhc.symbolic.expression import expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal
 
@@ -82,8 +80,7 @@ class FullSpaceFixedPoint(Optimiser):
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
-        s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
-        lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", n * (2 * ns + nu))
+        s0, data, _, _, memory = arguments = call_arguments(ocp, n * (2 * ns + nu))
         remembered_parts = self.memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
         fresh = ca.logic_not(ca.mmax(ca.fabs(remembered_parts["plan_states"])) > 0)
         rolled = rollout(ocp)(s0, ca.reshape(remembered_parts["plan_inputs"], nu, n), data)[0]
@@ -95,17 +92,11 @@ class FullSpaceFixedPoint(Optimiser):
             self._transformation(ocp), start / scale, [s0, data], self.iterations, self.acceleration
         )
         plan = ca.reshape(last[n * ns : n * (ns + nu)], nu, n)
-        cost, residual, _ = judge(ocp)(plan, s0, data, lower, upper, ca.MX.zeros(ns, n))
-        posed = sane(s0, data, lower, upper)
-        finite = ca.logic_and(posed, is_finite(ca.vertcat(last, cost, residual)))
+        finite, posed, diagnostics = judged_plan(ocp, arguments, plan, (self.iterations, self.tolerance), last)
         before = ca.reshape(remembered_parts["plan_inputs"], nu, n)
-        status = status_of(finite, residual, 0, self.tolerance)
-        empty = ca.mmax(lower - upper) > 0
-        numbers = ca.if_else(finite, ca.vertcat(cost, residual), ca.MX.zeros(2))
-        diagnostics = ca.vertcat(numbers, 0, self.iterations, ca.if_else(empty, int(Status.INFEASIBLE), status))
         remembered = ca.if_else(finite, last, ca.if_else(posed, 0, memory))
         results = [ca.if_else(finite, plan, before), diagnostics, remembered]
-        return ca.Function("fpirhc_full_space", [s0, data, lower, upper, memory], results)
+        return ca.Function("fpirhc_full_space", arguments, results)
 
     def _transformation(self, ocp: OptimalControl) -> ca.Function:
         """Function (scaled column z, s0, data) -> scaled column z+."""

@@ -16,12 +16,10 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count, Positive
-from fpirhc.horizon.problem import OptimalControl, steepest_curvature
-from fpirhc.horizon.rollout import reduced_gradient
+from fpirhc.horizon.problem import OptimalControl, reduced_gradient, steepest_curvature
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, sane, shift, status_of
-from fpirhc.status import Status
-from fpirhc.symbolic.expression import expression, graph, is_finite
+from fpirhc.optimisers.base import Optimiser, call_arguments, clip, judged_plan, remembered_plan, shift
+from fpirhc.symbolic.expression import expression, graph
 from fpirhc.symbolic.layout import Layout, Signal
 
 _SAFE = 0.95  # share of the largest gain, for the map that is chosen automatically
@@ -73,24 +71,15 @@ class GradientFixedPoint(Optimiser):
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         nu, n = ocp.input.size, ocp.stages
-        s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
-        lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", nu * n)
+        s0, data, lower, upper, memory = arguments = call_arguments(ocp, nu * n)
         start = remembered_plan(memory, nu, lower, upper)
         last = iterated(self._transformation(ocp), start, [s0, data, lower, upper], self.iterations, self.acceleration)
         inputs = clip(ca.reshape(last, nu, n), lower, upper)
-        cost, residual, _ = judge(ocp)(inputs, s0, data, lower, upper, ca.MX.zeros(ocp.state.size, n))
-        posed = sane(s0, data, lower, upper)
-        finite = ca.logic_and(posed, is_finite(ca.vertcat(ca.vec(inputs), cost, residual)))
+        finite, posed, diagnostics = judged_plan(ocp, arguments, inputs, (self.iterations, self.tolerance))
         plan = ca.if_else(finite, inputs, start)
-        empty = ca.mmax(lower - upper) > 0
-        status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, 0, self.tolerance))
-        numbers = ca.if_else(finite, ca.vertcat(cost, residual), ca.MX.zeros(2))
         # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
         next_memory = ca.if_else(finite, ca.vec(plan), ca.if_else(posed, 0, memory))
-        diagnostics = ca.vertcat(numbers, 0, self.iterations, status)
-        return ca.Function(
-            "fpirhc_gradient_fixed_point", [s0, data, lower, upper, memory], [plan, diagnostics, next_memory]
-        )
+        return ca.Function("fpirhc_gradient_fixed_point", arguments, [plan, diagnostics, next_memory])
 
     def _map(self, ocp: OptimalControl) -> Deformation:
         return Affine(gain=-2 * _SAFE / _steepest(ocp)) if self.map is None else self.map

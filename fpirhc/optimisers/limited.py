@@ -23,17 +23,16 @@ from fpirhc.horizon.hessian_models import (
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT
 from fpirhc.optimisers import limited_settings as constants
-from fpirhc.optimisers.base import FEASIBLE, KEPT, shift, shift_gains
+from fpirhc.optimisers.base import FEASIBLE, KEPT, LAST, plan_library, shift, shift_gains, with_last
 from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF, Scales, scales
 from fpirhc.optimisers.limited_graph import limited_graph
 from fpirhc.optimisers.limited_phases import guess
 from fpirhc.optimisers.limited_settings import LimitedSettings, limited_memory
-from fpirhc.optimisers.plan_library import LAST, plan_library, with_last
 from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.native import Native
 
 _TEXTS = ("kernels", "limited_sweep", "limited_bounds", "limited")

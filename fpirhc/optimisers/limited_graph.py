@@ -216,8 +216,6 @@ def _status(call: Call, s: State, p: Expansion, c: Certified, ok: ca.MX) -> ca.M
 
 
 class _Turn:
-    """Builds the expressions of a turn."""
-
     def __init__(self, call: Call) -> None:
         ocp = call.ocp
         self._call, self._direction, self._expand = call, _Direction(call), expand(ocp)

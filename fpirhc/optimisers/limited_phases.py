@@ -234,8 +234,7 @@ def _eased_damping(s: State) -> ca.MX:
 def _lowered_barrier(call: Call, s: State, rest: ca.MX, products: tuple[ca.MX, ca.MX]) -> tuple[ca.MX, ca.MX]:
     """Lower mu as long as its barrier problem is solved; the filter is emptied with every reduction.
 
-    Args:
-        products: the least and the largest product of the complementarity.
+    `products`: the least and the largest product of the complementarity.
     """
     (least, most), cost = products, call.scales.cost
     mu, filtered, going = s["mu"], s["filtered"], ca.MX(1)

@@ -17,9 +17,18 @@ import numpy as np
 
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Count, Positive
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import rollout
-from fpirhc.optimisers.base import UNKNOWN_ITERATIONS, Optimiser, clip, judge, remembered_plan, sane, shift, status_of
+from fpirhc.horizon.problem import OptimalControl, rollout
+from fpirhc.optimisers.base import (
+    UNKNOWN_ITERATIONS,
+    Optimiser,
+    call_arguments,
+    clip,
+    judge,
+    remembered_plan,
+    sane,
+    shift,
+    status_of,
+)
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal
@@ -77,7 +86,7 @@ class MultipleShooting(Optimiser):
         Solvers misbehave on numbers that are not finite, so they are not called when the arguments, or the program at its
         first guess, are not.
         """
-        s0, data, lower, upper, _ = arguments = self._arguments(ocp)
+        s0, data, lower, upper, _ = arguments = call_arguments(ocp, self.memory(ocp).size)
         start, states = self._guess(ocp)(*arguments)
         begin = _program_values(ocp)(interleave(states, start), ca.vec(data))
         usable = ca.logic_and(sane(s0, data, lower, upper), is_finite(begin))
@@ -85,16 +94,10 @@ class MultipleShooting(Optimiser):
         results = ca.Function.if_else("fpirhc_guarded_shooting", run, skip)(usable, *arguments)
         return ca.Function("fpirhc_shooting_step", arguments, list(results))
 
-    def _arguments(self, ocp: OptimalControl) -> list[ca.MX]:
-        ns, nu = ocp.state.size, ocp.input.size
-        shapes = {"s0": (ns, 1), "data": (ocp.data.size, ocp.stages + 1), "lower": (nu, 1), "upper": (nu, 1)}
-        symbols = [ca.MX.sym(name, *shape) for name, shape in shapes.items()]
-        return [*symbols, ca.MX.sym("memory", self.memory(ocp).size)]
-
     def _skip(self, ocp: OptimalControl) -> ca.Function:
         """The remembered plan, with status NON_FINITE (INFEASIBLE for an empty box) and forgotten multipliers."""
         layout = self.memory(ocp)
-        _, _, lower, upper, memory = arguments = self._arguments(ocp)
+        _, _, lower, upper, memory = arguments = call_arguments(ocp, self.memory(ocp).size)
         start = remembered_plan(layout.split(memory)["plan_inputs"], ocp.input.size, lower, upper)
         status = ca.if_else(ca.mmax(lower - upper) > 0, int(Status.INFEASIBLE), int(Status.NON_FINITE))
         diagnostics = ca.vertcat(ca.MX.zeros(3), UNKNOWN_ITERATIONS, status)
@@ -104,7 +107,7 @@ class MultipleShooting(Optimiser):
 
     def _guess(self, ocp: OptimalControl) -> ca.Function:
         """Function of the step's arguments -> (U, S): the remembered plan, or one that the model survives."""
-        s0, data, lower, upper, memory = arguments = self._arguments(ocp)
+        s0, data, lower, upper, memory = arguments = call_arguments(ocp, self.memory(ocp).size)
         plan = remembered_plan(self.memory(ocp).split(memory)["plan_inputs"], ocp.input.size, lower, upper)
         still = clip(ca.MX.zeros(ocp.input.size, ocp.stages), lower, upper)
         survives = is_finite(rollout(ocp)(s0, plan, data)[0])
@@ -116,7 +119,7 @@ class MultipleShooting(Optimiser):
 
     def _solve(self, ocp: OptimalControl, name: str) -> ca.Function:
         n, layout = ocp.stages, self.memory(ocp)
-        s0, data, lower, upper, memory = arguments = self._arguments(ocp)
+        s0, data, lower, upper, memory = arguments = call_arguments(ocp, self.memory(ocp).size)
         remembered = layout.split(memory)
         start, states = self._guess(ocp)(*arguments)
         solution = ca.nlpsol("fpirhc_shooting_solver", self.plugin, program(ocp), self.options(ocp))(

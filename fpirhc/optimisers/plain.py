@@ -14,13 +14,22 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import BOX_PIVOT, rounds
 from fpirhc.horizon.stage_data import SCALE, STEEPEST
 from fpirhc.optimisers import search as line_search
-from fpirhc.optimisers.base import clip, sane, shift, shift_gains, stationarity, status_of
-from fpirhc.optimisers.plan_library import LAST, plan_library, with_last
+from fpirhc.optimisers.base import (
+    LAST,
+    clip,
+    plan_library,
+    sane,
+    shift,
+    shift_gains,
+    stationarity,
+    status_of,
+    with_last,
+)
 from fpirhc.optimisers.search import Anchor, Arguments, Search, deformed_move, first_gamma
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE, is_finite
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, discrete
 from fpirhc.symbolic.live import LiveNumber, Number
 from fpirhc.symbolic.native import Native

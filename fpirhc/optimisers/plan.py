@@ -9,10 +9,8 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.by_name import ByName
-from fpirhc.fields.checked import checked_call
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import reduced_gradient, rollout
+from fpirhc.fields.checked import ByName, checked_call
+from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
 from fpirhc.optimisers.base import FEASIBLE, Optimiser, first_plan, improved, judge
 from fpirhc.optimisers.bounds import tolerated
 from fpirhc.status import Status

@@ -1,7 +1,4 @@
-"""The reduced-gradient method, which the fixed-point optimisers replace.
-
-Theory: docs/theory-plants.md.
-"""
+"""The reduced-gradient method, which the fixed-point optimisers replace. Theory: docs/theory-plants.md."""
 
 from __future__ import annotations
 
@@ -10,10 +7,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.fields.kinds import Count, Positive
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import reduced_gradient
-from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, sane, shift, status_of
-from fpirhc.status import Status
+from fpirhc.horizon.problem import OptimalControl, reduced_gradient
+from fpirhc.optimisers.base import Optimiser, call_arguments, clip, judged_plan, remembered_plan, shift
 from fpirhc.symbolic.expression import TINY, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, discrete
 
@@ -48,9 +43,7 @@ class ReducedGradient(Optimiser):
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         nu, n = ocp.input.size, ocp.stages
-        s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
-        lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
-        memory = ca.MX.sym("memory", nu * n + 1)
+        s0, data, lower, upper, memory = arguments = call_arguments(ocp, nu * n + 1)
         start = remembered_plan(memory[: nu * n], nu, lower, upper)
         none = ca.MX.zeros(ocp.state.size, n)
         value, slope, _, _ = reduced_gradient(ocp)(s0, start, data, none)
@@ -63,35 +56,13 @@ class ReducedGradient(Optimiser):
         final = iterate(state, *repeated)
         best, length = ca.reshape(_part(ocp, final, 3), nu, n), _part(ocp, final, 2)
         survives = is_finite(ca.vertcat(value, ca.vec(slope)))
-        return self._finish(ocp, (s0, data, lower, upper, memory), start, survives, best, length)
-
-    def _finish(
-        self,
-        ocp: OptimalControl,
-        arguments: tuple[ca.MX, ...],
-        start: ca.MX,
-        survives: ca.MX,
-        best: ca.MX,
-        length: ca.MX,
-    ) -> ca.Function:
-        s0, data, lower, upper, memory = arguments
-        posed = sane(s0, data, lower, upper)
-        none = ca.MX.zeros(ocp.state.size, ocp.stages)
-        cost, residual, violation = judge(ocp)(best, s0, data, lower, upper, none)
-        finite = ca.logic_and(posed, is_finite(ca.vertcat(ca.vec(best), cost, residual)))
-        plan = _choose(finite, best, start)
-        iterations = ca.MX(self.iterations)
-        empty = ca.mmax(lower - upper) > 0
-        status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, violation, self.tolerance))
-        numbers = _choose(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
-        diagnostics = ca.vertcat(numbers, iterations, status)
+        finite, posed, diagnostics = judged_plan(ocp, arguments, best, (self.iterations, self.tolerance))
+        plan = ca.if_else(finite, best, start)
         # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
         lost = ca.logic_and(posed, ca.logic_not(ca.logic_or(finite, survives)))
         next_inputs = ca.if_else(lost, clip(0 * plan, lower, upper), plan)
         next_memory = ca.vertcat(ca.vec(next_inputs), ca.if_else(finite, length, 0))
-        return ca.Function(
-            "fpirhc_reduced_gradient", [s0, data, lower, upper, memory], [plan, diagnostics, next_memory]
-        )
+        return ca.Function("fpirhc_reduced_gradient", arguments, [plan, diagnostics, next_memory])
 
     def _iteration(self, ocp: OptimalControl) -> ca.Function:
         """One iteration on the column (U, last values, step length, best U, best value, gradient at U)."""
@@ -113,12 +84,12 @@ class ReducedGradient(Optimiser):
         spectral = _spectral_length(move, scale, new_slope - slope, length)
         better = ca.logic_and(accepted, value <= lowest)
         result = ca.vertcat(
-            ca.vec(_choose(accepted, next_inputs, inputs)),
-            _choose(accepted, ca.vertcat(values[1:], value), values),
-            _choose(accepted, spectral, _SHORTER * length),
-            ca.vec(_choose(better, next_inputs, best)),
-            _choose(better, value, lowest),
-            ca.vec(_choose(accepted, new_slope, slope)),
+            ca.vec(ca.if_else(accepted, next_inputs, inputs)),
+            ca.if_else(accepted, ca.vertcat(values[1:], value), values),
+            ca.if_else(accepted, spectral, _SHORTER * length),
+            ca.vec(ca.if_else(better, next_inputs, best)),
+            ca.if_else(better, value, lowest),
+            ca.vec(ca.if_else(accepted, new_slope, slope)),
         )
         return ca.Function("fpirhc_gradient_iteration", [state, s0, flat, lower, upper], [result])
 
@@ -129,11 +100,6 @@ def _part(ocp: OptimalControl, state: ca.MX, k: int) -> ca.MX:
     for width in (size, _HISTORY, 1, size, 1, size):
         ends.append(ends[-1] + width)
     return state[ends[k] : ends[k + 1]]
-
-
-def _choose(condition: ca.MX, yes: ca.MX, no: ca.MX) -> ca.MX:
-    """Entry-wise choice that keeps NaN of the branch not taken out of the result."""
-    return ca.if_else(condition, yes, no)
 
 
 def _spectral_length(move: ca.MX, scale: ca.MX, change: ca.MX, before: ca.MX) -> ca.MX:

@@ -15,8 +15,8 @@ from fpirhc.errors import NotSupported
 from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression, output_order, structural_order
 from fpirhc.plant.motion import controlled_places, derivative_unit, followed_units, outside_names
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Matrix
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Signal
 
 _FUNCTIONS: Latest[ca.Function] = Latest(8)  # the parts of a loop that is composed ask for the same few
@@ -25,14 +25,12 @@ _FUNCTIONS: Latest[ca.Function] = Latest(8)  # the parts of a loop that is compo
 def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
     """Return the Function (state, input, parameters, forcing) -> the wanted derivatives, in their order.
 
-    Args:
-        wanted: (coordinate or output, number of the derivative) of every entry.
+    `wanted`: (coordinate or output, number of the derivative) of every entry.
     """
     return _FUNCTIONS.of((plant,), tuple(wanted), lambda: _derivatives(plant, wanted))
 
 
 def _derivatives(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
-    """See `derivatives_function`."""
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     most = {name: max(k for n, k in wanted if n == name) for name, _ in wanted}

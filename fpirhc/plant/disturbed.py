@@ -53,8 +53,10 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
         inverse=None,
         outputs={n: _output(plant, n, one, names) for n, one in plant.outputs.items()},
     )
-    given = plant.inverse
-    return bare if given is None or _mixed(bare, coordinates) else replace(bare, inverse=_inverse(plant, given, names))
+    inverse = plant.inverse
+    return (
+        bare if inverse is None or _mixed(bare, coordinates) else replace(bare, inverse=_inverse(plant, inverse, names))
+    )
 
 
 def _mixed(plant: Plant, coordinates: Sequence[str]) -> bool:

@@ -12,8 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError, Mistakes
-from fpirhc.fields.expected import takes
-from fpirhc.fields.kinds import described
+from fpirhc.fields.kinds import described, takes
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.maps import shifted
 from fpirhc.plant.motion import Motion, arguments_of, by_name, words

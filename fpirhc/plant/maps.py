@@ -1,7 +1,4 @@
-"""Maps x+ = f(x, u, p): plants that step, and have no differential equation.
-
-Theory: docs/theory-plants.md.
-"""
+"""Maps x+ = f(x, u, p): plants that step, and have no differential equation. Theory: docs/theory-plants.md."""
 
 from __future__ import annotations
 
@@ -140,8 +137,7 @@ def check_time(plant: Motion, model: Motion, orders: Mapping[str, int], mistakes
 def shifted(plant: Motion, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX, ca.SX]) -> Expression:
     """Return the divided difference of an expression of the state over one control cycle.
 
-    Args:
-        symbols: x, u, p and the forcing w; what the value has of u, p and w is held.
+    `symbols`: x, u, p and the forcing w; what the value has of u, p and w is held.
     """
     x, u, p, w = symbols
     return (ca.substitute(ca.SX(value), x, plant.equations.next(x, u, p, w)) - value) / sampling(plant)
@@ -230,8 +226,7 @@ def _differences(step: float) -> Callable[[Expression, Expression, int], list[Ex
 def check_modes(law: object, plant: Motion, gains: Sequence[float]) -> None:
     """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked.
 
-    Args:
-        gains: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.
+    `gains`: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.
     """
     if plant.step is None or not gains:
         return

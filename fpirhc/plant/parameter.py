@@ -141,7 +141,25 @@ class Spread(Checked, ABC):
 
 
 @dataclass(frozen=True)
-class Uniform(Spread):
+class _Wide(Spread, ABC):
+    """A spread whose width is one of the parameter's unit, or a share of its value."""
+
+    absolute: float | None = None
+    relative: float | None = None
+
+    def __post_init__(self) -> None:
+        values = [v for v in (self.absolute, self.relative) if v is not None]
+        if len(values) != 1 or real_number(values[0]) is None or not 0 < values[0] < math.inf:
+            raise InvalidValue(
+                f"{self!r}: expected one positive number, absolute=... in the parameter's unit or relative=... as a share"
+            )
+
+    def _width(self, exact: float) -> float:
+        return self.absolute if self.absolute is not None else (self.relative or 0.0) * abs(exact)
+
+
+@dataclass(frozen=True)
+class Uniform(_Wide):
     """Uniform in exact -+ width.
 
     Args:
@@ -152,19 +170,13 @@ class Uniform(Spread):
         InvalidValue: both or neither are given, or the width is not positive.
     """
 
-    absolute: float | None = None
-    relative: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_width(self, self.absolute, self.relative)
-
     def quantile(self, exact: float, share: float, probability: float) -> float:
         """Return exact + share width (2 probability - 1)."""
-        return exact + share * _width(exact, self.absolute, self.relative) * (2 * probability - 1)
+        return exact + share * self._width(exact) * (2 * probability - 1)
 
 
 @dataclass(frozen=True)
-class Normal(Spread):
+class Normal(_Wide):
     """Normal around exact, cut off at two standard deviations.
 
     Args:
@@ -175,15 +187,9 @@ class Normal(Spread):
         InvalidValue: both or neither are given, or the deviation is not positive.
     """
 
-    absolute: float | None = None
-    relative: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_width(self, self.absolute, self.relative)
-
     def quantile(self, exact: float, share: float, probability: float) -> float:
         """Return exact + share deviation z, with z the quantile of the cut standard normal."""
-        return exact + share * _width(exact, self.absolute, self.relative) * _standard(probability)
+        return exact + share * self._width(exact) * _standard(probability)
 
 
 _FACTOR = Range("a number above 1, such as 1.3 for 30 %", 1.0, open_low=True, open_high=True)
@@ -215,22 +221,6 @@ def _standard(probability: float) -> float:
     if probability in (0.0, 1.0):
         return TAILS * (2 * probability - 1)
     return _NORMAL.inv_cdf(_LEAST + (1 - 2 * _LEAST) * probability)
-
-
-def _width(exact: float, absolute: float | None, relative: float | None) -> float:
-    return absolute if absolute is not None else (relative or 0.0) * abs(exact)
-
-
-def _check_width(spread: Spread, absolute: float | None, relative: float | None) -> None:
-    values = [v for v in (absolute, relative) if v is not None]
-    if len(values) != 1 or not _is_number(values[0]) or not 0 < values[0] < math.inf:
-        raise InvalidValue(
-            f"{spread!r}: expected one positive number, absolute=... in the parameter's unit or relative=... as a share"
-        )
-
-
-def _is_number(value: object) -> bool:
-    return real_number(value) is not None
 
 
 EXAMPLES = (

@@ -5,15 +5,15 @@ Theory: docs/theory-plants.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Protocol, Self
 
 import casadi as ca
 
-from fpirhc.errors import Mistakes
-from fpirhc.plant.inverse import affine, inverse_function
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.lie_derivatives import (
     believed_disturbance,
     check_outputs,
@@ -28,9 +28,11 @@ from fpirhc.plant.motion import (
     Motion,
     MotionEquations,
     Output,
+    affine,
     controlled_places,
     derivative_unit,
     followed_units,
+    inverse_function,
 )
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
@@ -347,3 +349,72 @@ class Equations(MotionEquations):
             NotInvertible: the inputs and the controlled coordinates differ in number.
         """
         return inverse_function(self.motion, self.controlled_response)
+
+
+class Parametric(Protocol):
+    """What has exact parameters: a plant, or a body outside."""
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """By name."""
+
+
+def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, float]]:
+    """Return the least and the largest value of every exact parameter. `mismatch`: percent."""
+    check_mismatch(plant, mismatch)
+    ranges = {name: _range(parameter, mismatch) for name, parameter in plant.parameters.items()}
+    mistakes = Mistakes("mismatch")
+    for name, parameter in plant.parameters.items():
+        (low, high), (least, largest) = parameter.bounds, ranges[name]
+        if least < low or largest > high:
+            mistakes.add(
+                f"parameter '{name}': {mismatch:g} % around {parameter.exact:g} reach from {least:g} to {largest:g} "
+                f"{parameter.unit}, outside its bounds ({low:g}, {high:g}); at most {_most(parameter):.3g} % stay inside"
+            )
+    mistakes.raise_if_any()
+    return ranges
+
+
+def check_mismatch(plant: Parametric, mismatch: float) -> None:
+    """Raise if no range belongs to this mismatch."""
+    all_spread = bool(plant.parameters) and all(p.spread is not None or p.outside for p in plant.parameters.values())
+    if not 0 <= mismatch < (math.inf if all_spread else 100):
+        raise InvalidValue(
+            f"mismatch {mismatch!r}: expected percent of at least 0 and below 100; a parameter keeps its sign"
+            + ("" if not all_spread else " (100 is the whole spread, more is possible here)")
+        )
+
+
+def drawn(parameter: Parameter, mismatch: float, share: float) -> float:
+    """Return the exact value at this share of the distribution, from 0 to 1.
+
+    Without a spread the factor is log-uniform between 1 - P/100 and 1 + P/100.
+    """
+    if parameter.outside:
+        return parameter.exact
+    if parameter.spread is not None:
+        return parameter.spread.quantile(parameter.exact, mismatch / 100, share)
+    low, high = math.log1p(-mismatch / 100), math.log1p(mismatch / 100)
+    return parameter.exact * (math.exp(low + (high - low) * share) if mismatch else 1.0)
+
+
+def _range(parameter: Parameter, mismatch: float) -> tuple[float, float]:
+    if parameter.outside:  # its values are those of the problem
+        return parameter.exact, parameter.exact
+    if parameter.spread is not None:
+        return parameter.spread.interval(parameter.exact, mismatch / 100)
+    width = mismatch / 100 * abs(parameter.exact)
+    return parameter.exact - width, parameter.exact + width
+
+
+def _most(parameter: Parameter) -> float:
+    """The largest mismatch that stays inside the bounds, percent; ranges grow with it, so bisection finds it."""
+    low, high = parameter.bounds
+    inside, outside = 0.0, 100.0
+    while low <= _range(parameter, outside)[0] and _range(parameter, outside)[1] <= high:
+        inside, outside = outside, 2 * outside
+    for _ in range(60):
+        middle = (inside + outside) / 2
+        least, largest = _range(parameter, middle)
+        inside, outside = (middle, outside) if low <= least and largest <= high else (inside, middle)
+    return inside

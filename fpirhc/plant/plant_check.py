@@ -9,11 +9,10 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError, Mistakes
-from fpirhc.fields.expected import takes
+from fpirhc.fields.kinds import takes
 from fpirhc.fields.user_code import called, named_results, place_of, scalar_expression
-from fpirhc.plant.inverse import inverse_by_user
 from fpirhc.plant.lie_derivatives import structural_order
-from fpirhc.plant.motion import Algebraic, Motion, arguments_of, controlled_places, words
+from fpirhc.plant.motion import Algebraic, Motion, arguments_of, controlled_places, inverse_by_user, words
 from fpirhc.symbolic.layout import Expression, Named
 
 HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mistyped 10**9 would fill the memory

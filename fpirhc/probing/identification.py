@@ -58,8 +58,6 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """One point of the search."""
-
     likelihood: float
     dead: int
     lag: float

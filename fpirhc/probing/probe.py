@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fpirhc.by_name import FoundByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.deformation.base import Deformation
 from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
-from fpirhc.fields.checked import checked_call
+from fpirhc.fields.checked import FoundByName, checked_call
 from fpirhc.fields.kinds import Count, Seed
 from fpirhc.probing.identification import Estimates, Interval, identify
 from fpirhc.probing.recording import Record, excited, read_recording

@@ -485,9 +485,8 @@ class Corner:
     lags: tuple[float, ...]
 
 
-Case: TypeAlias = tuple[
-    Corner, float, int
-]  # a corner, a factor of the gains, and the number of a draw; 0: the estimate
+# a corner, a factor of the gains, and the number of a draw; 0: the estimate
+Case: TypeAlias = tuple[Corner, float, int]
 Cases: TypeAlias = tuple[Case, ...]
 
 

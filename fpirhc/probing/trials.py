@@ -58,8 +58,7 @@ class OnPlant:
     ) -> None:
         """Run nothing yet.
 
-        Args:
-            allowed: function of the run of the controller alone -> largest rms step of every input; None: any.
+        `allowed`: function of the run of the controller alone -> largest rms step of every input; None: any.
         """
         self._problem, self._bare = shortened(problem, _LONGEST), without_deformation(controller)
         self._names, self._allowed = weighed(problem, controller), allowed
@@ -68,8 +67,7 @@ class OnPlant:
     def trial(self, deformation: Deformation, seed: int, *, loud: bool = False) -> Trial | str:
         """Return the trial of a candidate; of one that the loop refuses, the reason.
 
-        Args:
-            loud: whether steps of any size are calm.
+        `loud`: whether steps of any size are calm.
         """
         alone = self._run_alone(seed)
         try:

@@ -25,11 +25,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
-from fpirhc.by_name import FoundByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import named_in_task
 from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, ProblemFileError
-from fpirhc.fields.checked import Checked, checked_call, mistakes_of
+from fpirhc.fields.checked import Checked, FoundByName, checked_call, mistakes_of
 from fpirhc.fields.kinds import call_of, described
 from fpirhc.fields.user_code import explained
 from fpirhc.problem_files.settings import (
@@ -420,7 +419,6 @@ def _calls(source: ast.AST) -> Iterator[ast.Call]:
 
 
 def _defined(statement: ast.stmt) -> Iterator[str]:
-    """Names that a statement defines."""
     for node in ast.walk(statement):
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             yield node.id

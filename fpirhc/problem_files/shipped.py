@@ -88,6 +88,5 @@ def find_problem(name_or_path: str) -> Path:
 
 
 def _files_in(folder: Path) -> str:
-    """Python files of a folder, as an offer."""
     files = [str(one) for one in sorted(folder.glob("*.py")) if one.is_file()][:_OFFERED] if folder.is_dir() else []
     return f", such as {', '.join(files)}" if files else ""

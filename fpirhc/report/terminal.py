@@ -149,8 +149,7 @@ def _widths(table: Table, places: Sequence[int], width: int) -> list[int]:
 def progress_bars(*, as_json: bool = False) -> Iterator[Report]:
     """Yield a function (name, done, total) that shows on standard error how far each controller is, its rate and the time left.
 
-    Args:
-        as_json: in place of bars, a line with a JSON object every second.
+    `as_json`: in place of bars, a line with a JSON object every second.
     """
     if as_json:
         yield _Status().report

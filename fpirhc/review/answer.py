@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from fpirhc.by_name import FoundByName
+from fpirhc.fields.checked import FoundByName
 from fpirhc.summary import line, numbers_written_out, table
 from fpirhc.task.problem import Problem
 
@@ -57,7 +57,7 @@ class Review(FoundByName):
     Args:
         problem: answers about the problem.
         controllers: answers about each controller, by name.
-        mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`.
+        mismatch: range of the exact parameters, percent, see `fpirhc.plant.plant`.
     """
 
     problem: tuple[Answer, ...]

@@ -21,15 +21,14 @@ from fpirhc.errors import FpirhcError
 from fpirhc.horizon.nominal import filled, output_feedback
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.chain import nominal_responses
-from fpirhc.plant.mismatch import exact_ranges
-from fpirhc.plant.plant import Plant
+from fpirhc.plant.plant import Plant, exact_ranges
 from fpirhc.symbolic.evaluate import require_unsolved
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.roots import Equations
 from fpirhc.task.dead_time import MEASUREMENT
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
+from fpirhc.task.reality import Equations
 
 _TOLERANCE = 1e-7
 _STEPS = 100_000
@@ -265,7 +264,7 @@ _FINE = 2001  # times of the plant's own inner states
 class ReviewGrid:
     """Points of the reference and draws of the parameters; build it with `review_grid`."""
 
-    problem: Problem  # the problem
+    problem: Problem
     times: np.ndarray  # times of the points, shape (m,)
     # states of the reference, shape (m, nx); inner ones are simulated with the exact parameters, see `inner`
     states: np.ndarray
@@ -336,11 +335,7 @@ class ReviewGrid:
 
 
 def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
-    """Return the points and draws of a review.
-
-    Args:
-        mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`.
-    """
+    """Return the points and draws of a review. `mismatch`: range of the exact parameters, percent, see `fpirhc.plant.plant`."""
     elsewhere, known = problem.reality is not None, problem.of_equations
     real = known if known.reality else None
     problem = problem.of_model

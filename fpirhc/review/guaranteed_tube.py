@@ -32,7 +32,7 @@ _LOST = 1e6  # bounds, as multiples of the run's own sizes, that will not close 
 class Chains:
     """Where each coordinate and its derivatives stand in the state, and how they move over a cycle with a constant response."""
 
-    plant: Plant  # the plant
+    plant: Plant
     period: float  # T of the control cycle
     law: Tracking  # that feeds the errors of the controlled coordinates back, without an integral
 

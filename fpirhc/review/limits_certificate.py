@@ -15,7 +15,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import refuse, resolved, tracking_law, with_margins
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count
-from fpirhc.plant.mismatch import exact_ranges
+from fpirhc.plant.plant import exact_ranges
 from fpirhc.review.guaranteed_tube import Centre, Chains, Expressions, Sweep, Tube, expressions
 from fpirhc.review.prediction import check_prediction
 from fpirhc.simulation.model_as_plant import exactly
@@ -37,9 +37,8 @@ class LimitsCertificate:
     failures: tuple[str, ...]  # every inequality that fails, in words; empty where the certificate holds
     box: Mapping[str, tuple[float, float]]  # by parameter, the least and the largest exact value
     contraction: float  # rho, the largest spectral radius of |I - a J|, of its bound entry by entry
-    drift: Mapping[
-        str, float
-    ]  # L by controlled coordinate, the largest rate at which the responses of plant and model part
+    # L by controlled coordinate, the largest rate at which the responses of plant and model part
+    drift: Mapping[str, float]
     error: Mapping[str, float]  # e_bar by controlled coordinate, the largest response error of any plant
     # by state, the largest distance at a cycle of any plant from the run in the middle of its piece of the box
     tube: Mapping[str, float]

@@ -27,8 +27,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each, is_late, scaled
 from fpirhc.simulation.linearise.asked_loop import AskedLoop, near_fixed_point
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.latest import Latest
 from fpirhc.task.problem import Problem
 
 T = TypeVar("T")

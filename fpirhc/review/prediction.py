@@ -28,8 +28,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulate
 from fpirhc.simulation.trials import ErrorPair, Trials, errors_of
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
-from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Evaluator, Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.exogenous import as_known
 from fpirhc.task.problem import Problem
@@ -41,7 +40,7 @@ _CALL = 25  # cycles of the recursion in one call
 class NominalRun:
     """The run of a right model, along which responses are predicted; build it with `nominal_run`."""
 
-    problem: Problem  # the problem
+    problem: Problem
     controller: Controller  # the controller, with its deformation
     states: np.ndarray  # states of the run, shape (cycles + 1, nx)
     desired: np.ndarray  # desired responses, shape (cycles, n)

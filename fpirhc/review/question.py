@@ -14,7 +14,6 @@ from typing import TypeVar, cast
 
 import numpy as np
 
-from fpirhc.broken import attempted
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation
@@ -25,6 +24,7 @@ from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops, LoopsByGain, loops_along, loops_by_gain, spectrum_near
 from fpirhc.review.prediction import NominalRun, NominalRuns
 from fpirhc.simulation.trials import ErrorPair, harm_in
+from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
 GROUP = "fpirhc.questions"  # of entry points

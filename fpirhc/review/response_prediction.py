@@ -11,15 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.by_name import ByName
 from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import refuse_without, resolved, with_margins
 from fpirhc.errors import InvalidProblem, InvalidValue, NoAnswer, NotSupported
-from fpirhc.fields.checked import checked_call
+from fpirhc.fields.checked import ByName, checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.plant.mismatch import check_mismatch
-from fpirhc.plant.plant import Plant
+from fpirhc.plant.plant import Plant, check_mismatch
 from fpirhc.review.grid import ReviewGrid, each, review_grid, state_slopes
 from fpirhc.review.loops import ideal_loops, ideal_places, own_loops
 from fpirhc.review.prediction import (
@@ -173,8 +171,7 @@ _LOST = 1e6  # entry of a product of I - a J, from which errors grow
 def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.ndarray | None = None) -> np.ndarray:
     """Return the bound of |y_k - y^_k| (cycles + 1, ny) that the response errors allow, with y^_k the outputs of the nominal run.
 
-    Args:
-        exact: exact parameters, shape (np,); None: the plant's.
+    `exact`: exact parameters, shape (np,); None: the plant's.
     """
     plant = nominal.plant
     free = [n for n in plant.chains if not plant.response_orders.get(n)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
-from fpirhc.broken import attempted
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import any_gain, checked
 from fpirhc.controllers.contract import resolved, with_lateness
@@ -19,6 +18,7 @@ from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, as
 from fpirhc.review.questions.convergence import converges
 from fpirhc.simulation.model_as_plant import behind_stated_lag
 from fpirhc.symbolic.driver import compiled_plans
+from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
 
@@ -29,7 +29,7 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     Args:
         problem: the problem.
         controllers: the controllers by name.
-        mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`; the box spans the plants
+        mismatch: range of the exact parameters, percent, see `fpirhc.plant.plant`; the box spans the plants
             between this range and the model too.
         seed: of the draws from the box.
 
@@ -76,7 +76,6 @@ def _of(grid: ReviewGrid, controller: Controller, general: tuple[Answer, ...], r
 
 
 def _present(answers: Iterable[Answer | None]) -> tuple[Answer, ...]:
-    """Those questions that have an answer."""
     return tuple(answer for answer in answers if answer is not None)
 
 

@@ -1,4 +1,4 @@
-"""The contracts of derivative estimators and of state observers; and the estimator of a plant that is measured as a whole.
+"""The contracts of derivative estimators and of state observers, a plant that is measured as a whole, and what never shows.
 
 Theory: docs/theory-estimation.md.
 """
@@ -134,8 +134,37 @@ def combine(coefficients: Array, samples: Sequence[Expression]) -> Expression:
     return sum(c * s for c, s in zip(coefficients, samples, strict=True) if c != 0)
 
 
+class AtOnce(DerivativeEstimator, ABC):
+    """An estimator whose response answers the last request alone."""
+
+    def weights(self, order: int, period: float) -> Array:
+        del order, period
+        return np.ones(1)
+
+    def delay(self, order: int, period: float) -> float:
+        del order, period
+        return 0.0
+
+    def fills(self, order: int) -> int:
+        del order
+        return 1
+
+
+class OfPositions(DerivativeEstimator, ABC):
+    """An estimator of all derivatives from positions."""
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        return tuple(plant.chains)
+
+    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
+        return known_by_positions(plant, measured)
+
+    def answers(self, plant: Plant) -> tuple[str, ...]:
+        return plant.controlled_names
+
+
 @dataclass(frozen=True)
-class Measured(DerivativeEstimator):
+class Measured(AtOnce):
     """State and response as the sensors show them, without delay."""
 
     @property
@@ -162,18 +191,6 @@ class Measured(DerivativeEstimator):
     @property
     def shows_response(self) -> bool:
         return True
-
-    def weights(self, order: int, period: float) -> Array:
-        del order, period
-        return np.ones(1)
-
-    def delay(self, order: int, period: float) -> float:
-        del order, period
-        return 0.0
-
-    def fills(self, order: int) -> int:
-        del order
-        return 1
 
 
 EXAMPLES = (Measured(),)
@@ -287,11 +304,7 @@ def name_mistakes(
     noise: Mapping[str, float],
     start: Mapping[str, float],
 ) -> Mistakes:
-    """Return the mistakes in the names of an observer's noises.
-
-    Args:
-        owner: the observer's class.
-    """
+    """Return the mistakes in the names of an observer's noises. `owner`: the observer's class."""
     mistakes, every = Mistakes(owner), quantities(plant)
     mistakes.unknown("measured: quantity", measured, every)
     for name in measured:
@@ -310,3 +323,52 @@ def first_covariance(plant: Plant, start: Mapping[str, float]) -> np.ndarray:
 def covariance_entries(plant: Plant) -> tuple[str, ...]:
     """Names of the entries of a covariance, column by column."""
     return tuple(f"{i},{j}" for j in plant.state.elements for i in plant.state.elements)
+
+
+_NOTHING = 1e-9  # share of a matrix below which a part of it counts as zero
+
+
+def unobservable(slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
+    """Return an orthonormal basis of the errors that never show, shape (nx, number).
+
+    `slopes`: A_i, each (nx, nx), in states of size one. `shown`: C_i, each (number, nx), in states of size one.
+    """
+    basis = _kernel(np.vstack([_rows_of_size_one(c) for c in shown]))
+    motions = [a / max(np.abs(a).max(), np.finfo(float).tiny) for a in slopes]
+    while basis.shape[1]:
+        leaving = np.vstack([a @ basis - basis @ (basis.T @ (a @ basis)) for a in motions])
+        staying = _kernel(leaving)
+        if staying.shape[1] == basis.shape[1]:
+            break
+        basis = basis @ staying
+    return basis
+
+
+def members(basis: np.ndarray) -> list[int]:
+    """Return the places of the states that have a part in these errors."""
+    return [k for k, row in enumerate(basis) if np.abs(row).max(initial=0.0) > 1e-6]
+
+
+def slowest(
+    slopes: Sequence[np.ndarray], basis: np.ndarray, growth: Callable[[np.ndarray], np.ndarray] = np.real
+) -> float:
+    """Return the largest real part of the poles with which these errors move, in 1 / unit of time; negative: all decay.
+
+    `growth`: of poles; of a map's divided differences it is not the real part (`fpirhc.plant.maps.decay_rates`).
+    """
+    if not basis.shape[1]:
+        return -np.inf
+    dual = np.linalg.pinv(basis)
+    return max(float(growth(np.linalg.eigvals(dual @ a @ basis)).max()) for a in slopes)
+
+
+def _kernel(matrix: np.ndarray) -> np.ndarray:
+    _, values, rows = np.linalg.svd(matrix, full_matrices=True)
+    rank = int((values > _NOTHING).sum())
+    return np.asarray(rows[rank:].T)
+
+
+def _rows_of_size_one(matrix: np.ndarray) -> np.ndarray:
+    """The matrix with rows of size one at most; rows of zero stay zero."""
+    largest = np.abs(matrix).max(axis=1, keepdims=True)
+    return np.asarray(matrix / np.where(largest > 0, largest, 1.0))

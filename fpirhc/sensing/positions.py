@@ -8,7 +8,7 @@ The start's motion, continued backwards, fills the samples before the first one,
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,14 +18,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import (
-    Array,
-    DerivativeEstimator,
-    backward_difference,
-    combine,
-    known_by_positions,
-    spline_weights,
-)
+from fpirhc.sensing.base import Array, DerivativeEstimator, OfPositions, backward_difference, combine, spline_weights
 from fpirhc.symbolic.block import GAP, Block, ahead, continued, is_long, shares
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -33,21 +26,12 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal
 LONGEST = 1001  # samples: the memory has a fixed size
 
 
-class _Finite(DerivativeEstimator):
+class _Finite(OfPositions, ABC):
     """Common part of the formulas."""
 
     @abstractmethod
     def coefficients(self, order: int) -> Array:
         """Rows c_0 ... c_n, newest sample first, shape (order + 1, samples); the last row gives the response."""
-
-    def measures(self, plant: Plant) -> tuple[str, ...]:
-        return tuple(plant.chains)
-
-    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
-        return known_by_positions(plant, measured)
-
-    def answers(self, plant: Plant) -> tuple[str, ...]:
-        return plant.controlled_names
 
     def weights(self, order: int, period: float) -> Array:
         del period
@@ -153,7 +137,7 @@ class PositionDifference(_Finite):
 
 
 @dataclass(frozen=True)
-class StepDifference(_Finite):
+class StepDifference(PositionDifference):
     """The divided differences of a map's last steps, delta^s y = (s-th backward difference) / T^s.
 
     The one of relative order n is exact, with no average: the difference up to this cycle is the response to the request of n
@@ -168,12 +152,6 @@ class StepDifference(_Finite):
     def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
         """State elements that are measured: the differences are those of earlier cycles."""
         return DerivativeEstimator.known(self, plant, measured)
-
-    def coefficients(self, order: int) -> Array:
-        rows = np.zeros((order + 1, order + 1))
-        for s in range(order + 1):
-            rows[s, : s + 1] = backward_difference(s)
-        return rows
 
     def weights(self, order: int, period: float) -> Array:
         del period

@@ -21,10 +21,9 @@ from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, quantities, response_names
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.functions import ceil, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.symbolic.queue import Queue
-from fpirhc.task.dead_time import delay_block
+from fpirhc.symbolic.live import ceil, stays
+from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.disturbance import Disturbance
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from fpirhc.fields.kinds import Positive
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, known_by_positions, spline_weights
+from fpirhc.sensing.base import Array, OfPositions, spline_weights
 from fpirhc.symbolic.block import GAP, Block, is_long
 from fpirhc.symbolic.expression import Signals, expression, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -30,7 +30,7 @@ _TAIL = 1e-16  # share of a low-pass's weights that is left out
 
 
 @dataclass(frozen=True)
-class StateVariableFilter(DerivativeEstimator):
+class StateVariableFilter(OfPositions):
     """Derivatives of filtered positions.
 
     The filter begins in the steady state of a motion at the plant's first velocities.
@@ -44,15 +44,6 @@ class StateVariableFilter(DerivativeEstimator):
     """
 
     bandwidth: Positive
-
-    def measures(self, plant: Plant) -> tuple[str, ...]:
-        return tuple(plant.chains)
-
-    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
-        return known_by_positions(plant, measured)
-
-    def answers(self, plant: Plant) -> tuple[str, ...]:
-        return plant.controlled_names
 
     def weights(self, order: int, period: float) -> Array:
         """The B-spline of an n-th difference through n low-passes (1 - p) / (1 - p / z), without the negligible tail."""

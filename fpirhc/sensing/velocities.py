@@ -18,7 +18,7 @@ import numpy as np
 
 from fpirhc.fields.kinds import Range
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator
+from fpirhc.sensing.base import Array, AtOnce, DerivativeEstimator
 from fpirhc.symbolic.block import GAP, Block, is_long, straightened
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -27,7 +27,7 @@ _TAIL = 1e-9  # share of the low-pass's weights that is left out
 
 
 @dataclass(frozen=True)
-class VelocityDifference(DerivativeEstimator):
+class VelocityDifference(AtOnce):
     """Backward difference of the highest measured derivative over the period."""
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
@@ -39,18 +39,6 @@ class VelocityDifference(DerivativeEstimator):
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
         """Block (state) -> (state, its difference)."""
         return _difference_block(plant, period, start, seen, 0.0)
-
-    def weights(self, order: int, period: float) -> Array:
-        del order, period
-        return np.ones(1)
-
-    def delay(self, order: int, period: float) -> float:
-        del order, period
-        return 0.0
-
-    def fills(self, order: int) -> int:
-        del order
-        return 1
 
 
 _TIME_CONSTANT = Range(

@@ -18,8 +18,8 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import FINITE, Signals
-from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import nan_where
 from fpirhc.task.problem import Problem
 
 # In the memory: the last time that was believed, or is expected; the last one that was given; and times in a row that are a period
@@ -116,11 +116,7 @@ class Deadline:
     """
 
     def __init__(self, limit: float, clock: Clock) -> None:
-        """Begin to count.
-
-        Args:
-            clock: function that returns the time, s.
-        """
+        """Begin to count. `clock`: function that returns the time, s."""
         if isinstance(limit, bool) or not isinstance(limit, int | float) or not 0 < limit < math.inf:
             raise InvalidValue(
                 f"Stepper(deadline={limit!r}): expected a positive number of seconds, such as the period"
@@ -159,8 +155,7 @@ class Deadline:
     def percentile(self, percent: float = _SHOWN) -> float:
         """Return a duration within which at least this share of the steps ended, s: the upper end of its class, at most `worst`.
 
-        Args:
-            percent: from 0 to 100.
+        `percent`: from 0 to 100.
         """
         wanted, seen = self.cycles * percent / 100, 0
         for k, count in enumerate(self._counts[:-1]):  # the last class has no end

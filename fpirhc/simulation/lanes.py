@@ -23,8 +23,8 @@ from fpirhc.simulation.simulate import Simulator, run_tables
 from fpirhc.simulation.sums import Sums, Values
 from fpirhc.status import Status
 from fpirhc.symbolic.dataflow import Callee
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.lanes import lanes_library, written_for_devices, written_in_lanes
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.task.problem import Problem
 

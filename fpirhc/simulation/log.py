@@ -8,8 +8,8 @@ from typing import cast
 
 import numpy as np
 
-from fpirhc.by_name import ByName, FoundByName
 from fpirhc.errors import InvalidName, nearest
+from fpirhc.fields.checked import ByName, FoundByName
 from fpirhc.symbolic.layout import Layout, Signal
 
 
@@ -78,12 +78,8 @@ class Log(FoundByName):
 
 _SAME = {"plant_state": "state", "plant_output": "output", "plant_realised": "realised"}
 
-_MOTION = (
-    "plant_output",
-    "output",
-    "plant_state",
-    "state",
-)  # where the judged motion is logged: the first that a run has
+# where the judged motion is logged: the first that a run has
+_MOTION = ("plant_output", "output", "plant_state", "state")
 
 
 def with_common_columns(layout: Layout, log: np.ndarray) -> tuple[Layout, np.ndarray]:

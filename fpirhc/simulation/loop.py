@@ -7,12 +7,13 @@ held since t_{k-1}; the controller turns them into a command; the plant moves on
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller
+from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import given_response
+from fpirhc.controllers.contract import Undeformed, given_response
 from fpirhc.controllers.gate import BRIDGED, INNER, Gate, across_gaps, gap_of
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.plausible import plausible_range, response_jumps
@@ -114,3 +115,25 @@ def _clock_block(time: Signal, period: float) -> Block:
         return {"time": s.cycle * period, "cycle_next": s.cycle + 1}
 
     return Block("clock", Layout(), Layout((time,)), step, Layout((discrete("cycle"),)))
+
+
+HELD_INPUT = "_held_input"  # signal in the memory of the loop, with one entry per input
+
+
+@dataclass(frozen=True)
+class HeldInput(Undeformed):
+    """Sends the input that stands in its memory, within the limits."""
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        plant, (closing, delays) = problem.plant, commanding_blocks(problem)
+        before = tuple(map(float, problem.inputs_before))
+        held = Signal(HELD_INPUT, plant.input.elements, plant.input.units, before)
+        responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
+
+        def step(s: Signals) -> dict[str, Expression]:
+            response = plant.equations.controlled_response(s.state, getattr(s, HELD_INPUT), s.parameters)
+            return {"command_unclipped": getattr(s, HELD_INPUT), **{r.name: response for r in responses}}
+
+        writes = Layout((*responses, like(plant.input, "command_unclipped")))
+        hold = Block("hold", Layout((held, plant.state, plant.parameter)), writes, step)
+        return [reference_block(problem), hold, *closing], [*delays, Delay(held, HELD_INPUT)]

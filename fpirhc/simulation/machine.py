@@ -161,8 +161,7 @@ class RunMonitor:
 def machine_step(problem: Problem, controller: Controller, gate: Gate, monitor: RunMonitor) -> Composite:
     """Return the step (memory, sample, parameters) -> (memory, trace, command); `Gate.named` names its memory.
 
-    Args:
-        gate: around the controller's step.
+    `gate`: around the controller's step.
     """
     block = under_names(gate.block(), {"status": _GATED})
     longest = round(monitor.saturated_after / problem.period)

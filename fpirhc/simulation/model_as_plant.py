@@ -17,7 +17,7 @@ from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.exogenous import Exogenous, as_known
@@ -166,8 +166,7 @@ _SHORTENED: Latest[Problem] = Latest(8)
 def behind_actuators(plant: Plant, lags: Sequence[float]) -> Plant:
     """Return the plant whose inputs act through lags.
 
-    Args:
-        lags: time constant of every input's actuator, in the plant's unit of time; 0: the input acts at once.
+    `lags`: time constant of every input's actuator, in the plant's unit of time; 0: the input acts at once.
     """
     taus = {name: tau for name, tau in zip(plant.inputs, lags, strict=True) if tau > 0}
     acting = {name: _free(f"{name}_acting", plant) for name in taus}

@@ -24,8 +24,7 @@ class Kernel:
 def loaded_kernel(source: str, device: str) -> Kernel:
     """Build the kernel `run_lanes`.
 
-    Args:
-        device: part of the name of a device; '': the first graphics processor, else the first device.
+    `device`: part of the name of a device; '': the first graphics processor, else the first device.
     """
     cl = package("pyopencl", "opencl", "a device")
     chosen = _device(cl, device)

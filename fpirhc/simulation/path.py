@@ -27,8 +27,7 @@ from fpirhc.simulation.ranges import Ranges, physical_ranges, ranges_of
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.queue import Queue
-from fpirhc.task.dead_time import MEASUREMENT, delay_block
+from fpirhc.task.dead_time import MEASUREMENT, Queue, delay_block
 from fpirhc.task.disturbance import disturbed_place
 from fpirhc.task.exogenous import model_values, real_values
 from fpirhc.task.external_plant import ExternalPlant
@@ -435,8 +434,7 @@ def _forcing(plant: Plant, name: str) -> Signal:
 def with_true_response(problem: Problem, sense: Block, motion: Signal, response: Signal) -> Block:
     """Return the block of the true motion, with the true response of a map in place of the one that it writes.
 
-    Args:
-        motion: signal of the state, or of the outputs where the plant has some.
+    `motion`: signal of the state, or of the outputs where the plant has some.
     """
     period = problem.period
     orders = problem.plant.response_orders

@@ -12,7 +12,7 @@ import numpy as np
 
 from fpirhc.status import STOPPED, Status
 from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 
@@ -21,12 +21,8 @@ _RUNAWAY = 1e6  # times the largest value of the reference, or of the start
 _INSTANTS = 200  # of the reference
 _MOTIONS: Latest[np.ndarray] = Latest(4)  # of references
 _ERRORS = ("true_error", "error")  # where they are logged: the first that a run has
-_SIGNALS = (
-    "foreign",
-    "reality_state",
-    "plant_state",
-    "state",
-)  # where the moving state is logged: the first that a run has
+# where the moving state is logged: the first that a run has
+_SIGNALS = ("foreign", "reality_state", "plant_state", "state")
 _DIVERGED = 1e100  # size of numbers that no loop but a diverging one has
 
 

@@ -14,9 +14,7 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.broken import attempted
-from fpirhc.contraction.measured import identified_factor, jacobians_along
-from fpirhc.contraction.spectrum import factors_along
+from fpirhc.contraction.spectrum import factors_along, identified_factor, jacobians_along
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
@@ -35,8 +33,7 @@ from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record, set_point_table
 from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Evaluator, Latest, attempted
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.native import Native, native
 from fpirhc.symbolic.program import chained

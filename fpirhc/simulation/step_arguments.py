@@ -12,18 +12,17 @@ from typing import Protocol, cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.by_name import ByName
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.sensing_chain import given_states, raw_signal
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.fields.checked import ByName
 from fpirhc.fields.kinds import described, named_entries, real_number
 from fpirhc.fields.user_code import called
 from fpirhc.plant.chain import measured_signals
 from fpirhc.simulation.machine import SKIPPED
-from fpirhc.simulation.sample import numbers as numbers_of
-from fpirhc.simulation.sample import one_number
+from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
@@ -35,9 +34,8 @@ from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps, pairs
 from fpirhc.task.set_point import in_force
 
-Setpoints = Mapping[
-    str, Steps | Callable[[float], float]
-]  # by coordinate: a number, pairs (time, set-point), function of the time
+# by coordinate: a number, pairs (time, set-point), function of the time
+Setpoints = Mapping[str, Steps | Callable[[float], float]]
 SetpointsNow = Mapping[str, float | Sequence[float]]  # by coordinate: a number, or one per node of the horizon
 _FUNCTION = "a function of time"
 
@@ -80,9 +78,9 @@ def set_points_now(problem: Problem, setpoints: SetpointsNow, before: np.ndarray
 
 
 def _steps(problem: Problem, setpoints: Setpoints | None) -> Setpoints:
-    given = {} if setpoints is None else setpoints
-    _check_names(problem, given)
-    return {**problem.reference.set_points, **given}
+    changed = {} if setpoints is None else setpoints
+    _check_names(problem, changed)
+    return {**problem.reference.set_points, **changed}
 
 
 def _check_names(problem: Problem, setpoints: Mapping[str, object]) -> None:
@@ -102,10 +100,10 @@ def _values(problem: Problem, name: str, steps: Steps | Callable[[float], float]
     if not callable(steps):
         return in_force(pairs(name, steps), times, problem.period)
     what = f"set-points of '{name}': the function of time"
-    given = [called(what, steps, float(t)) for t in times.ravel()]
-    values = [real_number(one) for one in given]
+    results = [called(what, steps, float(t)) for t in times.ravel()]
+    values = [real_number(one) for one in results]
     if None in values:
-        wrong = given[values.index(None)]
+        wrong = results[values.index(None)]
         raise InvalidValue(f"{what} does not return a number, but {described(wrong)}")
     return np.array(values, dtype=float).reshape(times.shape)
 
@@ -199,8 +197,7 @@ class StepArguments:
     def hold(self, layout: Layout, signals: Layout, missing: int) -> np.ndarray:
         """Return the memory of a skipped cycle, and write status, command and count of it into the trace.
 
-        Args:
-            missing: number of cycles that the next step will count as skipped; 0: this cycle is counted now.
+        `missing`: number of cycles that the next step will count as skipped; 0: this cycle is counted now.
         """
         memory = np.where(np.isfinite(self.memory_before), self.memory_before, layout.start())
         self.trace[signals.slice("status")] = int(Status.SOLVER_FAILED)
@@ -239,8 +236,7 @@ class NumbersNow:
     ) -> None:
         """Put the numbers of the build in force.
 
-        Args:
-            setpoints: argument of the step, with the set-points at the start; no entries without any.
+        `setpoints`: argument of the step, with the set-points at the start; no entries without any.
         """
         self._live, self._composite = live, composite
         self._settings, self._setpoints = settings, setpoints
@@ -309,3 +305,48 @@ class NumbersNow:
     def _refuse(self, error: FpirhcError) -> bool:
         self.refused, self.why_refused = self.refused + 1, str(error)
         return False
+
+
+def raw_measurements(run: Run) -> np.ndarray:
+    """Return what the controller of a run was given in every cycle, shape (cycles, number of measurements).
+
+    It is what the sensors show, as it arrives; state and response where both are measured. `Stepper.step_measured` takes its rows.
+    Of a plant with outputs the state stands before raw measurements of these, unless it is believed.
+    """
+    for name in ("arrived", "measured"):
+        if name in run.layout:
+            # A state that is logged before the measurements is not made from them.
+            state_measured = "output" in run.layout and run.layout.names.index("state") < run.layout.names.index(name)
+            return np.ascontiguousarray(np.hstack([run["state"], run[name]]) if state_measured else run[name])
+    return np.hstack([run[name] for name in ("state", "output", "realised") if name in run.layout])
+
+
+def numbers_of(name: str, value: object, size: int) -> np.ndarray:
+    """Return `value` as float64, shape (size,)."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise InvalidValue(
+            f"argument '{name}' is a masked array; a missing number is NaN: {name}.filled(np.nan) skips the cycle"
+        )
+    if isinstance(value, list | tuple) and any(isinstance(v, bool | np.bool_) for v in value):
+        raise InvalidValue(f"argument '{name}' must be made of real numbers, got {described(value)} with a truth value")
+    try:
+        array = np.asarray(value)
+    except Exception:  # noqa: BLE001 -- rows of different lengths; an object of a stranger's that raises where numpy asks it
+        raise InvalidValue(f"argument '{name}' is not made of numbers, got {described(value)}") from None
+    if array.dtype.kind == "O":
+        raise InvalidValue(f"argument '{name}' is not made of numbers, got {described(value)}; expected {size} numbers")
+    if array.dtype.kind not in "fiu":
+        raise InvalidValue(
+            f"argument '{name}' must be made of real numbers, got {described(value)} of type '{array.dtype}'"
+        )
+    if array.size != size or sum(n != 1 for n in array.shape) > 1 or array.ndim == 0:
+        raise InvalidShape(f"argument '{name}' has {size} entries (shape ({size},)), got shape {array.shape}")
+    return np.ascontiguousarray(array.ravel(), dtype=np.float64)
+
+
+def one_number(name: str, value: object) -> float:
+    """Return `value` as a float."""
+    number = real_number(value)
+    if number is None:
+        raise InvalidValue(f"argument '{name}' must be a number of seconds, got {described(value)}")
+    return number

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NoReturn
 import casadi as ca
 import numpy as np
 
-from fpirhc.by_name import ByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import name_in_task
@@ -18,13 +17,19 @@ from fpirhc.controllers.gate import BRIDGED, HELD
 from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.errors import ConcurrentUse
-from fpirhc.fields.checked import Checked, missing
+from fpirhc.fields.checked import ByName, Checked, missing
 from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.simulation.clock import Clock, Deadline, missed_cycles, most_missed
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, measures, refuse_unbounded
-from fpirhc.simulation.sample import numbers as numbers_of
-from fpirhc.simulation.sample import one_number
-from fpirhc.simulation.step_arguments import NOT_WRITTEN, NOTHING, NumbersNow, SetpointsNow, StepArguments
+from fpirhc.simulation.step_arguments import (
+    NOT_WRITTEN,
+    NOTHING,
+    NumbersNow,
+    SetpointsNow,
+    StepArguments,
+    numbers_of,
+    one_number,
+)
 from fpirhc.simulation.trials import warn_of_harm, with_recommended_gain
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout

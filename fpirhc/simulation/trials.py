@@ -28,7 +28,7 @@ from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.model_as_plant import ModelAsPlant, loop_of, shortened
 from fpirhc.simulation.run import Run
 from fpirhc.summary import beside
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.task.problem import Problem
 
 WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
@@ -260,9 +260,8 @@ def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[
     try:
         yield
     except NotContractive as error:
-        review = import_module(
-            "fpirhc.review.questions.gain"
-        )  # of a layer above, which is only asked when nothing else follows
+        # of a layer above, which is only asked when nothing else follows
+        review = import_module("fpirhc.review.questions.gain")
         advice = review.recommended_for(problem, controller)
         if advice is None:
             raise

@@ -29,7 +29,7 @@ from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.scenarios.bench import ranges, relative_error
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number
-from fpirhc.symbolic.queue import MOST
+from fpirhc.task.dead_time import MOST
 from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
 
@@ -38,10 +38,8 @@ _NEAR = 1.05  # between the value that fails and the one that holds
 _HALVINGS = 14  # below the first value that is tried
 _OUTSIDE = 0.02  # of a limit's width: a state farther outside has left it
 _SAMPLES = 2000
-_ROOMS = (
-    128,
-    512,
-)  # cycles of latency for which loops are built; C of the long queue takes longer to compile than to do without
+# cycles of latency for which loops are built; C of the long queue takes longer to compile than to do without
+_ROOMS = (128, 512)
 _LOOPS = 20  # cycles that the longest period leaves to a run
 
 
@@ -236,9 +234,7 @@ def bracket(
 ) -> tuple[float, float]:
     """Return the largest value that holds and the smallest one that fails, by doubling and halving; infinity where none fails.
 
-    Args:
-        failed: whether a value fails; the start does not.
-        step: of which all values are multiples; 0: they are any.
+    `failed`: whether a value fails; the start does not. `step`: of which all values are multiples; 0: they are any.
     """
     holds, fails = start, min(first, most)
     while not failed(fails):

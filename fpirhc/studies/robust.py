@@ -17,7 +17,7 @@ from fpirhc.controllers.contract import Controller, believing
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
+from fpirhc.plant.plant import Parametric, drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.lanes import Lanes
 from fpirhc.simulation.metrics import Metrics

@@ -303,11 +303,7 @@ def _of_problem(problem: Problem, path: str) -> float | None:
 
 
 class _Grid:
-    """The cells, by number: the last axis is the fastest.
-
-    Args:
-        of_problem: paths that are the problem's.
-    """
+    """The cells, by number: the last axis is the fastest. `of_problem`: paths that are the problem's."""
 
     def __init__(self, axes: Sequence[Axis], of_problem: frozenset[str], seed: int) -> None:
         self.axes, self.of_problem = axes, of_problem
@@ -492,8 +488,8 @@ def _sentences(result: Sweep) -> Iterator[str]:
     cells, places = result.winners.size, result.winners.ravel()
     if len(result.maps) > 1:
         shares = sorted(((int((places == k).sum()), one.controller) for k, one in enumerate(result.maps)), reverse=True)
-        told = ", ".join(f"{name} in {count}" for count, name in shares if count)
-        yield f"{result.aim.subject[0].upper()}{result.aim.subject[1:]} is best with: {told or 'none alone'} of {cells} cells."
+        best = ", ".join(f"{name} in {count}" for count, name in shares if count)
+        yield f"{result.aim.subject[0].upper()}{result.aim.subject[1:]} is best with: {best or 'none alone'} of {cells} cells."
     for one in result.maps:
         failed = int((one.outcomes != "finished").sum())
         yield f"{one.controller} fails in {failed} of {cells} cells." if failed else f"{one.controller} fails nowhere."

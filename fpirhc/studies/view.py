@@ -26,7 +26,7 @@ Progress = Callable[[str, int, int], None]  # of (controller, what is done, what
 class View:
     """What is said of a study; all texts are as they are in a user's file, and every output escapes them."""
 
-    title: str  # its title
+    title: str
     about: str  # the problem's description
     # the verdict, with the outcome that each sentence states; None for a remark
     sentences: Sequence[tuple[str, Outcome | None]]
@@ -37,9 +37,8 @@ class View:
     command: str  # the command that reproduces it; '' where there is none
     elapsed: float  # wall time, s
     facts: Mapping[str, Any] = field(repr=False)  # what the JSON object holds
-    lists: Mapping[str, Sequence[str]] = field(
-        default_factory=dict
-    )  # sentences by the heading under which a page has them
+    # sentences by the heading under which a page has them
+    lists: Mapping[str, Sequence[str]] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)  # reasons why controllers did not run, by name
 
     def html(self) -> str:

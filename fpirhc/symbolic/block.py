@@ -315,8 +315,7 @@ def open_settings(blocks: Sequence[Block]) -> Layout:
 def unseen(block: Block, samples: Sequence[str]) -> Block:
     """Return the block that runs a step in a cycle without a sample, for a step that passes over samples which are not finite.
 
-    Args:
-        samples: names of the signals that are missing; it is given a number beyond the finite ones.
+    `samples`: names of the signals that are missing; it is given a number beyond the finite ones.
     """
     missing = {s.name: s.size for s in block.reads.signals if s.name in samples}
 

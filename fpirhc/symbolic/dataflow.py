@@ -259,9 +259,8 @@ class Dataflow:
     """What Functions compute."""
 
     callee: Callable[[ca.Function], Callee]  # returns how a Function is called that is not read into its caller
-    sites: Counter[
-        int
-    ]  # in how many places of the whole program every Function is called, by its hash; see `call_sites`
+    # in how many places of the whole program every Function is called, by its hash; see `call_sites`
+    sites: Counter[int]
     words: Words  # of the operations
     tables: list[str] = field(default_factory=list)  # C text of constants, without their names
 
@@ -296,7 +295,6 @@ class Dataflow:
         return region
 
     def _results(self, region: Region, code: int, made: ca.MX, operands: list[Value], count: int) -> list[Value]:
-        """The values of one instruction."""
         if code == ca.OP_CALL:
             return self._called(region, made.which_function(), operands)
         if code in (ca.OP_VERTSPLIT, ca.OP_VERTCAT) and any(made.dep(k).size2() != 1 for k in range(made.n_dep())):
@@ -442,12 +440,10 @@ def _entries(facts: dict[str, object]) -> Sequence[int]:
 
 
 def _pieces(_: ca.MX, operands: list[Value]) -> Iterable[Piece]:
-    """The pieces of all operands, one after the other."""
     return (piece for value in operands for piece in value)
 
 
 def _selected(made: ca.MX, operands: list[Value]) -> Iterable[Piece]:
-    """Some entries of the operand."""
     return (piece for i in _entries(made.info()) for piece in part(operands[0], i, i + 1))
 
 

@@ -17,8 +17,8 @@ from functools import cache
 
 import casadi as ca
 
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE, TINY, Expression, graph, kind
-from fpirhc.symbolic.latest import Latest
 
 SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
 # Large leaves are compiled without much optimising; the loops around them never are. The loops use wider registers than the

@@ -259,11 +259,7 @@ class Enclosure:
     """Bounds of the entries of an expression, column by column, over boxes of a column of symbols."""
 
     def __init__(self, value: ca.SX, argument: ca.SX) -> None:
-        """Expand the expression.
-
-        Args:
-            value: any shape.
-        """
+        """Expand the expression. `value`: any shape."""
         self.function = ca.Function("fpirhc_enclosed", [argument], [ca.densify(ca.vec(value))])
         own = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_RULES}
         for k in range(self.function.n_instructions()):

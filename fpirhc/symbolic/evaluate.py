@@ -1,23 +1,22 @@
-"""The one door between numbers and CasADi: evaluation through buffers.
+"""The one door between numbers and CasADi: evaluation through buffers, results that are kept, and results that break.
 
-An ordinary call of a Function from Python costs tens of microseconds; through fixed buffers it costs a fraction of one. An
-`Evaluator` owns numpy arrays for all arguments and results: write into `arguments`, call `evaluate`, read `results`.
-
-CasADi matrices are column-major, so a (rows, columns) matrix appears as an array of shape (columns, rows); a column as (rows,).
-A Function must not run in two threads at once. Use processes instead of threads, each with an Evaluator of its own.
+An ordinary call of a Function costs tens of microseconds; through fixed buffers it costs a fraction of one. A matrix appears as an
+array of shape (columns, rows), a column as (rows,). A Function must not run in two threads at once: use processes, each with an
+`Evaluator` of its own.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import NoReturn, Protocol, cast
+from typing import Generic, NoReturn, Protocol, TypeVar, cast
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.errors import InvalidShape, InvalidValue, NotSupported
 
 
 class _Buffer(Protocol):
@@ -151,3 +150,61 @@ def _dense(function: ca.Function) -> ca.Function:
     inputs = [ca.MX.sym(function.name_in(k), *function.size_in(k)) for k in range(function.n_in())]
     results = [ca.densify(r) for r in function.call(inputs)]
     return ca.Function(function.name(), inputs, results, function.name_in(), function.name_out())
+
+
+T = TypeVar("T")
+
+
+class Latest(Generic[T]):
+    """The latest results of a function of values.
+
+    `most`: number of results that are kept, with their arguments; what is built of one problem follows each other, so a few do.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._known: deque[tuple[tuple[object, ...], tuple[object, ...], T]] = deque(maxlen=most)
+
+    def of(self, same: tuple[object, ...], equal: tuple[object, ...], build: Callable[[], T]) -> T:
+        """Return what `build` returns, or what it returned for these arguments.
+
+        Args:
+            same: arguments that must be the same objects, because values with functions and arrays cannot be compared.
+            build: function without arguments.
+        """
+        for objects, others, result in tuple(self._known):
+            alike = len(objects) == len(same) and all(a is b for a, b in zip(objects, same, strict=True))
+            if alike and _equal(others, equal):
+                return result
+        result = build()
+        self._known.append((same, equal, result))
+        return result
+
+
+def _equal(one: tuple[object, ...], other: tuple[object, ...]) -> bool:
+    """Whether they are equal; a live number, which refuses to be compared, equals no other."""
+    try:
+        return one == other
+    except NotSupported:
+        return False
+
+
+def words_of(error: BaseException) -> str:
+    """Return class and first line of an error: "LinAlgError: Array must not contain infs or NaNs"."""
+    first = f"{error}".strip().partition("\n")[0]
+    return f"{type(error).__name__}: {first}" if first else type(error).__name__
+
+
+def attempted(what: str, compute: Callable[..., T], *arguments: object, broken: list[str], **named: object) -> T | None:
+    """Return what a function returns; None where it raises, with a sentence about it added to `broken`.
+
+    `compute`: the function.
+    """
+    try:
+        with np.errstate(all="ignore"):  # numbers that overflow show in the result
+            return compute(*arguments, **named)
+    except Exception as error:  # noqa: BLE001 -- whatever it is, what was computed before must not be lost
+        interruption = unwrapped(error)
+        if not isinstance(interruption, Exception):
+            raise interruption from None
+        broken.append(f"{what} could not be computed ({words_of(error)}); the rest does not depend on it")
+        return None

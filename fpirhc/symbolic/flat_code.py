@@ -91,8 +91,6 @@ class FlatCode:
 
 
 class _Writer:
-    """The text of one function."""
-
     def __init__(self, region: Region, words: Words) -> None:
         self._region, self._placed, self._words = region, Placement(region, apart=words.side_by_side), words
         self._lines: list[str] = []
@@ -244,7 +242,6 @@ def _expression(step: Operation, at: int, index: str) -> str:
 
 
 def _entry(node: Node, at: int, index: str = "") -> str:
-    """The text of an entry."""
     if isinstance(node.base, str) and node.base[0] in "=&":
         return node.base[1:]
     base, place = ("w", node.base.begin) if isinstance(node.base, Place) else (node.base, 0)

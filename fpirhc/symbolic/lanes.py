@@ -76,8 +76,6 @@ def _registers() -> tuple[int, tuple[str, ...]]:
 
 
 class _File:
-    """The functions of one file."""
-
     def __init__(self, words: Words) -> None:
         self._words = words
         self.drivers: list[str] = []

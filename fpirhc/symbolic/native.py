@@ -261,9 +261,7 @@ def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) ->
 def shared_library(sources: Sequence[str], flags: Sequence[str] = (), libraries: Sequence[str] = ()) -> Path:
     """Return the path of a library of C files, compiled where it is not in the cache.
 
-    Args:
-        sources: C; all but the first may be shared with other libraries.
-        libraries: for the linker, such as '-lm'.
+    `sources`: C; all but the first may be shared with other libraries. `libraries`: for the linker, such as '-lm'.
     """
     compiler = find_compiler()
     if compiler is None:

@@ -26,9 +26,7 @@ _OUTER = re.compile(r"^static int casadi_f0\([^\n]*\{\n.*?^\}\n", re.MULTILINE |
 def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
     """Return the C files of a Function: its own under a fixed name, and the files of the drivers that it calls.
 
-    Args:
-        function: the Function.
-        calls: number of calls in a row, see `chained`; 0: it is called once.
+    `function`: the Function. `calls`: number of calls in a row, see `chained`; 0: it is called once.
     """
     called = function.find_functions()
     if any(f.is_a("External") for f in called):

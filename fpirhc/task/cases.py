@@ -21,9 +21,9 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, InvalidValue
 from fpirhc.fields.checked import Checked, checked_call, expects_whole_number
 from fpirhc.fields.kinds import described, finite_number
 from fpirhc.fields.user_code import users_folder
-from fpirhc.plant.mismatch import Parametric
+from fpirhc.plant.plant import Parametric
 from fpirhc.summary import line
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.paths import changed_at, content_at
 from fpirhc.task.problem import Problem
 

@@ -23,7 +23,7 @@ from fpirhc.plant.maps import over
 from fpirhc.plant.motion import followed_units, outside_of
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.external_plant import ExternalPlant
@@ -110,8 +110,7 @@ def needed_measurements(plant: Plant, sensing: Sensing) -> tuple[str, ...]:
 def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -> frozenset[str]:
     """Return the names of the model's coordinates and outputs that the plant that moves must have.
 
-    Args:
-        judged: names whose errors are judged beside the controlled ones; None: no other need be there.
+    `judged`: names whose errors are judged beside the controlled ones; None: no other need be there.
     """
     if sensing.observer is None:
         return frozenset((*plant.coordinates, *followed_units(plant)))

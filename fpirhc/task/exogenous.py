@@ -19,8 +19,8 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression, graph, kind
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression
 
 _LATEST: Latest[ca.Function | None] = Latest(8)
@@ -158,11 +158,7 @@ def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndar
 def check_signals(
     plants: Sequence[Plant], signals: Mapping[str, Exogenous], times: np.ndarray, mistakes: Mistakes
 ) -> None:
-    """Add every mistake of the signals to `mistakes`.
-
-    Args:
-        plants: the model, and the plant of a reality where there is one.
-    """
+    """Add every mistake of the signals to `mistakes`. `plants`: the model, and the plant of a reality where there is one."""
     units: dict[str, str] = {}
     for plant in plants:
         for name in outside_names(plant):

@@ -233,7 +233,6 @@ class ExternalPlant(Checked):
 
     @cached_property
     def _present(self) -> list[Body]:
-        """The body of the present run."""
         return [] if self.body is None else [self.body]
 
     @cached_property

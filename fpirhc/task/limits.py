@@ -141,8 +141,6 @@ class Ellipsoid(Limit):
 
 @dataclass(frozen=True, eq=False)
 class _Box(Limit):
-    """An input or a state."""
-
     part: str  # of a stage, 'input' or 'state', which may have entries of one name
     name: str  # of the entry
     lower: float  # lower end of the interval

@@ -13,6 +13,7 @@ from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
@@ -193,8 +194,7 @@ class Reality(Checked):
     def _tied(self, model: Plant, start: np.ndarray, free: Sequence[int]) -> dict[int, Tied]:
         """Return what the derivatives of the model's start say of states that are no derivatives here, by place of the state.
 
-        Args:
-            start: first state of the model, shape (nx,).
+        `start`: first state of the model, shape (nx,).
         """
         shared, elements = self.shared(model), self.plant.state.elements
         tied: dict[int, Tied] = {}
@@ -209,6 +209,11 @@ class Reality(Checked):
                 raise InvalidProblem(
                     f"reality: {e} is {start[k]:.4g} at the start of the model and depends on its states {names}; give the first "
                     f"values of all but one: Reality(start={{'{elements[min(on)]}': ...}})"
+                )
+            for i in on & set(tied):
+                raise InvalidProblem(
+                    f"reality: {e} and another derivative at the start of the model say what its state {elements[i]} is; give its "
+                    f"first value: Reality(start={{'{elements[i]}': ...}})"
                 )
             tied |= {i: (value, float(start[k])) for i in on}
         return tied
@@ -333,9 +338,7 @@ def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
 def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name: str, mistakes: Mistakes) -> None:
     """Add what is wrong with the coordinate of a reality that stands for a coordinate of the model.
 
-    Args:
-        seen: name of the model's coordinate -> name of what is measured in its place.
-        name: of the model's coordinate.
+    `seen`: name of the model's coordinate -> name of what is measured in its place. `name`: of the model's coordinate.
     """
     own, units, unit = seen.get(name, name), _quantities_of(plant), model.coordinates[name]
     if own not in units:
@@ -403,7 +406,7 @@ def settled(
 ) -> np.ndarray | None:
     """Return the state in which the rates of its free entries are zero; None where there is no such state.
 
-    Where many values are at rest, a near one is taken, see `fpirhc.symbolic.roots`.
+    Where many values are at rest, a near one is taken, see `fpirhc.task.reality`.
 
     Args:
         state: shape (nx,); its free entries are the first guess.
@@ -411,8 +414,6 @@ def settled(
         parameters: shape (np,).
         tied: by place of a free entry, a quantity that has a value there, in place of its rate.
     """
-    from fpirhc.symbolic.roots import Equations  # of a start that must settle alone
-
     places = list(free)
     held, u, p = plant.symbols()
     x = ca.SX(held)
@@ -427,3 +428,60 @@ def settled(
     at = np.array(state, dtype=float)
     at[places] = root.at
     return at
+
+
+_STEPS = 60
+_SMALL = 1e-10  # last step, relative
+
+
+@dataclass(frozen=True, eq=False)
+class Root:
+    """Where Newton's method has come to rest.
+
+    Args:
+        at: the unknowns, shape (n,).
+        left: largest equation before the last step, each in units of its largest slope. It is large where the method rests at a
+            point that solves nothing.
+        first: the same at the guess.
+    """
+
+    at: npt.NDArray[np.float64]
+    left: float
+    first: float
+
+
+class Equations:
+    """Equations r(z, data) = 0.
+
+    Args:
+        unknown: z, a column of symbols.
+        known: the data, symbols.
+        residual: r, expressions of both.
+    """
+
+    def __init__(self, unknown: ca.SX, known: Sequence[ca.SX], residual: ca.SX) -> None:
+        slope = ca.jacobian(residual, unknown)
+        both = [ca.densify(residual), ca.densify(slope)]
+        self._values = ca.Function("fpirhc_equations", [unknown, *known], both)
+
+    def root(self, guess: npt.NDArray[np.float64], *known: npt.NDArray[np.float64]) -> Root | None:
+        """Return the root that the method finds from a guess; None where it does not come to rest, or meets what is no number.
+
+        A step is the shortest of those that solve the linear equations best, z - r'(z)^+ r(z): where many points are roots it
+        goes to a near one.
+        """
+        at, first = np.array(guess, dtype=float), None
+        for _ in range(_STEPS):
+            residual, slope = (np.asarray(m.full()) for m in self._values(at, *known))
+            if not (np.isfinite(residual).all() and np.isfinite(slope).all()):
+                return None
+            sizes = np.abs(slope).max(axis=1, initial=0.0)  # rows differ by powers of the fastest rate
+            sizes[sizes == 0] = 1.0
+            scaled = residual.ravel() / sizes
+            left = float(np.abs(scaled).max(initial=0.0))
+            first = left if first is None else first
+            step = np.linalg.lstsq(slope / sizes[:, None], -scaled, rcond=None)[0]
+            at += step
+            if np.abs(step).max(initial=0.0) <= _SMALL * (1 + np.abs(at).max(initial=0.0)):
+                return Root(at, left, first)
+        return None

@@ -22,8 +22,8 @@ from fpirhc.plant.maps import time_derivatives
 from fpirhc.plant.motion import followed, followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, live_numbers, nominal
 

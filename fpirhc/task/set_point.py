@@ -25,9 +25,8 @@ from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.functions import exp, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import LiveNumber, live_numbers, nominal
+from fpirhc.symbolic.live import LiveNumber, exp, live_numbers, nominal, power
 from fpirhc.task.reference import Reference, Steps, pairs
 
 _GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes

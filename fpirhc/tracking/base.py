@@ -16,9 +16,8 @@ from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import GAP, Block, Delay, is_long
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.live import remembered
+from fpirhc.symbolic.live import numbers, remembered
 
 
 @dataclass(frozen=True)

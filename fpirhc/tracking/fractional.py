@@ -19,9 +19,8 @@ from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import GAP, Block, straightened
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import following, live_numbers, nominal, settled
+from fpirhc.symbolic.live import following, live_numbers, nominal, power, settled
 from fpirhc.tracking.base import ROOM, IntegralLaw, Useful, error_chains, law_signals, own_errors
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size

@@ -21,8 +21,8 @@ from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
-from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.live import power
 from fpirhc.tracking.base import (
     Feedback,
     IntegralLaw,

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from attack.problems import LINE
-from fpirhc.cli.discovery import shipped
 from fpirhc.cli.main import main
+from fpirhc.cli.verb import shipped
 
 CHEAP = ("accept", "check", "compare", "completion", "list", "new", "review", "run", "solve", "tune")
 WORDS = (

@@ -10,8 +10,7 @@ import pytest
 from blessed import write_problems
 
 import fpirhc as fp
-from fpirhc.baselines.bands import BANDED, Expected, Metric
-from fpirhc.baselines.baseline import Baseline, Settings, to_text
+from fpirhc.baselines.baseline import BANDED, Baseline, Expected, Metric, Settings, to_text
 from fpirhc.baselines.check import new_metrics, new_settings, read_baseline
 from fpirhc.baselines.judging import BETTER, CHANGED, HOLDS, WORSE, Judgement, Row, ignoring, judge
 from fpirhc.baselines.measuring import FINISHED, Measurement

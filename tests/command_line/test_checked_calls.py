@@ -12,7 +12,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.errors import InvalidField
 from fpirhc.fields.checked import checks_of
-from fpirhc.fields.expected import Anything
+from fpirhc.fields.kinds import Anything
 
 TASK = fp.load_problem("two_mass")
 PROBLEM, CTC = TASK.problem, TASK.controllers["CTC"]

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from fpirhc.cli.discovery import shipped
 from fpirhc.cli.main import main
+from fpirhc.cli.verb import shipped
 from fpirhc.cli.verbs.completion import SHELLS, script
 from fpirhc.errors import NotSupported
 

@@ -14,8 +14,18 @@ import pytest
 from blessed import LINE, NOISY, write_problems
 
 import fpirhc as fp
-from fpirhc.baselines.bands import BANDED, EXACT, FACTOR, KINDS, TIGHT, Expected, expected
-from fpirhc.baselines.baseline import fingerprint, settings_of, to_text
+from fpirhc.baselines.baseline import (
+    BANDED,
+    EXACT,
+    FACTOR,
+    KINDS,
+    TIGHT,
+    Expected,
+    expected,
+    fingerprint,
+    settings_of,
+    to_text,
+)
 from fpirhc.baselines.check import read_baseline
 from fpirhc.baselines.judging import Judgement, Row, judge
 from fpirhc.baselines.measuring import (

@@ -16,16 +16,15 @@ import pytest
 from test_cli import GOOD, HORIZON, PLANNERS, TIGHT
 
 import fpirhc as fp
-from fpirhc.cli import discovery
+from fpirhc.cli import verb as discovery
 from fpirhc.cli import verbs as package
-from fpirhc.cli.discovery import shipped
 from fpirhc.cli.main import main
 from fpirhc.cli.output import reproducing
-from fpirhc.cli.verb import OF_EVERY_VERB, ExitCode
+from fpirhc.cli.verb import OF_EVERY_VERB, ExitCode, shipped
 from fpirhc.probing.probe import Probe, probe
 from fpirhc.probing.rule import Rule
 from fpirhc.problem_files.shipped import shipped_problems
-from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
+from fpirhc.studies.open_loop import optimiser_choices
 
 ROOT = Path(__file__).resolve().parents[2]
 VERBS = tuple(shipped().values())

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.contraction.large_errors import step_for_basin
+from fpirhc.contraction.delayed import step_for_basin
 from fpirhc.controllers.base import (
     Controller,
     clip,

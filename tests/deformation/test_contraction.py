@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fpirhc import RFPT, Affine, RFPTVector, Rotation, Sigmoid
-from fpirhc.contraction.measured import identified_factor
 from fpirhc.contraction.spectrum import (
     Spectrum,
     assess_gain,
     check_gain,
+    identified_factor,
     linear_limit,
     predicted_factor,
     response_jacobian,

@@ -21,7 +21,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.export.device import Device
 from fpirhc.export.footprint import operations, worst_case
 from fpirhc.export.target import device_of, target_called, write
-from fpirhc.plant.inverse import NEWTON_ITERATIONS
+from fpirhc.plant.motion import NEWTON_ITERATIONS
 from fpirhc.symbolic.native import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

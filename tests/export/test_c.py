@@ -17,8 +17,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.errors import InvalidName, NotSupported, OutputError
 from fpirhc.export.device import Device, default_name, identifiers
-from fpirhc.export.samples import with_faults
-from fpirhc.export.target import device_of, target_called, targets, write
+from fpirhc.export.target import device_of, target_called, targets, with_faults, write
 from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.symbolic.program import generate

@@ -19,8 +19,7 @@ from fpirhc.cli.main import main
 from fpirhc.errors import InvalidField, InvalidValue, OutputError
 from fpirhc.export.cortex import Image
 from fpirhc.export.device import Device
-from fpirhc.export.processor import Processor
-from fpirhc.export.target import device_of, target_called, write
+from fpirhc.export.target import Processor, device_of, target_called, write
 from fpirhc.symbolic.native import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

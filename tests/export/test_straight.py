@@ -13,7 +13,7 @@ import pytest
 
 from fpirhc.export.device import c_of
 from fpirhc.symbolic.driver import every_finite
-from fpirhc.symbolic.functions import nan_where
+from fpirhc.symbolic.live import nan_where
 from fpirhc.symbolic.native import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

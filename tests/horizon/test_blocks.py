@@ -11,7 +11,7 @@ from plants import known, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.horizon.consistent_state import consistent_state
+from fpirhc.horizon.nominal import consistent_state
 
 PATIENT = fp.load_problem("anaesthesia").problem.plant
 LIGHT = np.array([2.0, 0.6, 0.1, 1.5])  # mg/l

@@ -12,7 +12,7 @@ from plants import chain, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.horizon.rollout import reduced_gradient, rollout
+from fpirhc.horizon.problem import reduced_gradient, rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.full_space import auxiliary_gradient, auxiliary_hessian

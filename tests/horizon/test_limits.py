@@ -13,7 +13,7 @@ from plants import known, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, NotSupported
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic.evaluate import Evaluator

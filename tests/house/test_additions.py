@@ -122,7 +122,7 @@ def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 def test_members_from_abroad_are_found_and_keep_the_laws(abroad: Path) -> None:
     """Every family lists them, `fp.NAME` finds them by their file, the laws try their examples; the optimiser is a choice."""
     script = (
-        "import json; import fpirhc as fp; from fpirhc.studies.comparison.optimiser_choices import optimiser_choices\n"
+        "import json; import fpirhc as fp; from fpirhc.studies.open_loop import optimiser_choices\n"
         "from fpirhc.members import FAMILIES, examples, member_classes\n"
         "from fpirhc.conformance import check_deformation, check_optimiser, check_tracking\n"
         "mine = lambda f: [e for e in examples(f) if type(e).__module__.startswith('abroad')]\n"

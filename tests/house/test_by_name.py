@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.by_name import ByName
 from fpirhc.errors import InvalidName
+from fpirhc.fields.checked import ByName
 from fpirhc.problem_files.problem_file import load_problem
 
 TASK = load_problem("two_mass")

@@ -26,7 +26,7 @@ from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Rea
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.simulation.lyapunov_view import lyapunov_view
 from fpirhc.studies.comparison.optimality import measure_optimality
-from fpirhc.studies.comparison.optimiser_choices import with_optimisers
+from fpirhc.studies.open_loop import with_optimisers
 
 TRACK = fp.Exponential(rate=6.0)
 PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))

@@ -15,14 +15,13 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import status_of
 from fpirhc.optimisers.nlp import Ipopt, Osqp, SequentialQuadratic
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import is_finite
-from fpirhc.symbolic.functions import SMOOTHING, signed_power
+from fpirhc.symbolic.live import SMOOTHING, signed_power
 
 PLANT = fp.Plant(
     coordinates={"y": "m"},

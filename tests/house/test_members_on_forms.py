@@ -27,7 +27,7 @@ from fpirhc.conformance.loops import anything
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.members import examples, member_classes
-from fpirhc.simulation.sample import raw_measurements
+from fpirhc.simulation.step_arguments import raw_measurements
 
 REPLAYED = 20
 NEAR = 0.2  # m, rms in the last quarter; that of the reference is 0.42

@@ -14,8 +14,8 @@ from plants import linear, pendulum
 from plants import simulated as run
 
 import fpirhc as fp
+from fpirhc.controllers.model_inputs import ResponsePairs
 from fpirhc.controllers.replanning import Replanning
-from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.symbolic.expression import Signals
 
 PERIOD = 0.01

@@ -12,7 +12,7 @@ import fpirhc as fp
 from fpirhc.conformance.laws import check_live
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.receding_horizon import StopRun
-from fpirhc.symbolic.functions import nan_where
+from fpirhc.symbolic.live import nan_where
 
 MAP = fp.Sigmoid(gain=-0.3, scale=50.0)
 CONTROLLERS: dict[str, tuple[Controller, list[str]]] = {

@@ -39,7 +39,7 @@ def iterates(ocp, data, first, count):
 )
 def test_no_bound_is_below_the_true_error(name):
     """On early and late iterates of every shipped problem: distance to the optimum, error of any input, and suboptimality."""
-    from fpirhc.horizon.rollout import rollout
+    from fpirhc.horizon.problem import rollout
 
     ocp, data, first = first_horizon(name)
     counted = 0

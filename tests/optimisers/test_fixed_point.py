@@ -15,8 +15,8 @@ from plants import pendulum
 
 import fpirhc as fp
 from fpirhc.horizon.hessian_models import GaussNewton
+from fpirhc.horizon.problem import reduced_gradient
 from fpirhc.horizon.riccati import box_policy
-from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import judge

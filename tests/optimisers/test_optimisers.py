@@ -16,7 +16,7 @@ from plants import chain, known
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.problem import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import judge

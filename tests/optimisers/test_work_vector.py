@@ -84,7 +84,7 @@ def test_the_first_plan_of_a_run_is_not_compiled(monkeypatch):
         sought.append(function.name())
         return SimpleNamespace(compiled=False)
 
-    monkeypatch.setattr("fpirhc.optimisers.plan_library.native", native)
+    monkeypatch.setattr("fpirhc.optimisers.base.native", native)
     task = fp.load_problem("van_der_pol")
     problem = replace(task.problem, duration=10 * task.problem.period, measure_from=0.0)
     with compiled_plans():

@@ -19,7 +19,7 @@ from test_outputs import depth_error as rms
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem
-from fpirhc.horizon.consistent_state import consistent_state
+from fpirhc.horizon.nominal import consistent_state
 from fpirhc.plant.disturbed import disturbed
 from fpirhc.studies.comparison.entry import information
 

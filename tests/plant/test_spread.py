@@ -12,8 +12,8 @@ from scipy import stats
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.plant.parameter import EXAMPLES, TAILS
+from fpirhc.plant.plant import exact_ranges
 from fpirhc.review.grid import review_grid
 from fpirhc.studies.scenarios.draws import COMPARING, draw
 

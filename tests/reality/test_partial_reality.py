@@ -236,3 +236,27 @@ def test_a_speed_of_two_states_is_asked_for():
     ):
         held_at_speed(plant)
     assert held_at_speed(plant, belt=0.5) == pytest.approx([0.1, 0.5, 0.3])
+
+
+def test_two_speeds_of_one_state_are_refused():
+    """The speed of two carts on one belt cannot start as that of both; a stated one starts as stated."""
+    plant = fp.Plant.of_states(
+        states={"y": "m", "z": "m", "belt": "m/s"},
+        inputs={"u": "N"},
+        parameters={"mass": fp.Parameter(approximate=1.3, exact=1.3, unit="kg")},
+        rates=lambda x, u, p: {"y": x.belt, "z": -x.belt, "belt": (u.u - 0.5 * x.belt) / p.mass},
+        outputs={"place": fp.Output("m", lambda x, _: x.y)},
+    )
+    model = fp.Plant(
+        coordinates={"y": "m", "z": "m"},
+        inputs={"u": "N"},
+        order=2,
+        parameters={"mass": fp.Parameter(approximate=1.0, exact=1.0, unit="kg")},
+        response=lambda q, v, u, p: {"y": (u.u - 0.5 * v.y) / p.mass, "z": -u.u / p.mass},
+        controlled=["y"],
+    )
+    start = np.array([0.1, 0.0, 0.2, 0.3])
+    with pytest.raises(InvalidProblem, match=r"z' and another derivative .* its state belt is; give .*'belt': \.\.\."):
+        fp.Reality(plant).start_state(model, start, np.array([1.0]))
+    stated = fp.Reality(plant, start={"belt": 0.5}).start_state(model, start, np.array([1.0]))
+    assert stated == pytest.approx([0.1, 0.0, 0.5])

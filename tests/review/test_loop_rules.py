@@ -11,10 +11,12 @@ from chains import chain, coupled, errors_after_request, linear_loop, linear_pai
 from sampled import edge, lag, poles, resonance
 
 import fpirhc as fp
-from fpirhc.contraction.delayed import bearable_lag, damped_product, resonant_limit
-from fpirhc.contraction.large_errors import (
+from fpirhc.contraction.delayed import (
     basin_of_plain_form,
+    bearable_lag,
+    damped_product,
     least_product,
+    resonant_limit,
     slowest_iteration,
     step_for_basin,
     two_cycle_amplitudes,

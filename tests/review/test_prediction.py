@@ -13,7 +13,7 @@ from chains import chain
 from forms import named_again
 
 import fpirhc as fp
-from fpirhc.contraction.large_errors import least_product
+from fpirhc.contraction.delayed import least_product
 from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.review.prediction import exactly, nominal_run, null_errors, response_errors

@@ -13,7 +13,7 @@ from chains import chain, errors_after_request
 from sampled import lag, poles
 
 import fpirhc as fp
-from fpirhc.contraction.large_errors import least_product
+from fpirhc.contraction.delayed import least_product
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation import Deformation
 from fpirhc.review.question import ControllerQuestion, ProblemQuestion, known_questions

@@ -18,9 +18,8 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
-from fpirhc.sensing.base import StateObserver
-from fpirhc.sensing.observability import unobservable
-from fpirhc.simulation.sample import raw_measurements
+from fpirhc.sensing.base import StateObserver, unobservable
+from fpirhc.simulation.step_arguments import raw_measurements
 
 CTC = fp.ComputedTorque(fp.Exponential(rate=0.5))
 FPI = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.Affine(gain=-0.5))

@@ -20,7 +20,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.sensing.base import StateObserver
-from fpirhc.simulation.sample import raw_measurements
+from fpirhc.simulation.step_arguments import raw_measurements
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=4.0))
 HALF: dict[str, Any] = {"measured": {"y": 1e-3}, "noise": {"y": 0.5}, "start": {"y": 1.0, "y'": 1.0}}

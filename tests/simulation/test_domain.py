@@ -23,7 +23,7 @@ from fpirhc.deformation.base import Deformation, Wrapper, memory_of_map
 from fpirhc.members import Example, examples
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.ranges import Dropped
-from fpirhc.simulation.sample import raw_measurements
+from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import Expression
 from fpirhc.symbolic.layout import Layout, scalar

@@ -22,7 +22,7 @@ from fpirhc.conformance.laws import keep
 from fpirhc.conformance.loops import Trial
 from fpirhc.controllers.base import Controller
 from fpirhc.members import examples
-from fpirhc.simulation.sample import raw_measurements
+from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.status import Status
 from fpirhc.studies.comparison.timing import measure_cycle
 from fpirhc.symbolic.native import find_compiler

@@ -17,7 +17,7 @@ from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.plausible import JUMPS, response_jumps
 from fpirhc.simulation.path import true_response
-from fpirhc.simulation.sample import raw_measurements
+from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import find_compiler

@@ -17,13 +17,12 @@ import pytest
 from test_scenarios import LINE
 
 import fpirhc as fp
-from fpirhc.broken import attempted
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
 from fpirhc.contraction import spectrum
 from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import NotSupported
-from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.evaluate import Evaluator, attempted
 
 COMMAND = (
     "compare",

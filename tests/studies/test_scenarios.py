@@ -27,7 +27,7 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
-from fpirhc.plant.mismatch import exact_ranges
+from fpirhc.plant.plant import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import is_late, scaled
 from fpirhc.studies.scenarios import paired, running

@@ -9,7 +9,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.errors import NotSupported
 from fpirhc.symbolic.enclosures import Box, Enclosure
-from fpirhc.symbolic.roots import Equations
+from fpirhc.task.reality import Equations
 
 X = ca.SX.sym("x", 3)
 a, b, c = ca.vertsplit(X)

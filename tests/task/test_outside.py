@@ -318,7 +318,7 @@ def test_samples_say_what_is_wrong_with_them():
 
 def test_scenarios_do_not_draw_signals():
     """Their values are those of the problem; the other parameters are drawn."""
-    from fpirhc.plant.mismatch import exact_ranges
+    from fpirhc.plant.plant import exact_ranges
 
     ranges = exact_ranges(room(OUTSIDE), 20.0)
     assert ranges["ambient"] == (283.0, 283.0)

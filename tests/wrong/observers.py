@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.sensing.base import StateObserver, values_of
-from fpirhc.sensing.observability import unobservable
+from fpirhc.sensing.base import StateObserver, unobservable, values_of
 from fpirhc.symbolic.layout import Layout, Signal
 
 

@@ -11,7 +11,7 @@ import casadi as ca
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
-from fpirhc.horizon.rollout import reduced_gradient
+from fpirhc.horizon.problem import reduced_gradient
 from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, sane, shift, status_of
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal

@@ -90,7 +90,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.html import render
     from fpirhc.report.terminal import announce_backend, progress_bars
     from fpirhc.studies.comparison.compare import compare, select
-    from fpirhc.studies.comparison.optimiser_choices import with_optimisers
+    from fpirhc.studies.open_loop import with_optimisers
     from fpirhc.studies.tuning.tuned_file import noted, read_tuned, with_tuned
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None

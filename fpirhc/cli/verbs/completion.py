@@ -8,8 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from fpirhc.cli.discovery import known
-from fpirhc.cli.verb import ExitCode, Verb
+from fpirhc.cli.verb import ExitCode, Verb, known
 
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 FOLDERS, FILES = ("out", "baselines"), ("tuned", "markdown")  # destinations of options

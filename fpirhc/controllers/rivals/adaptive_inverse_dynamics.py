@@ -10,9 +10,8 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, bounded, closing_blocks, desired_blocks, fed, like
-from fpirhc.controllers.model_inputs import MEASURED_TIME
+from fpirhc.controllers.model_inputs import MEASURED_TIME, ResponsePairs
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
-from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
@@ -24,7 +23,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import following, live_numbers, nominal, settled
-from fpirhc.symbolic.queue import Queue, room
+from fpirhc.task.dead_time import Queue, room
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, integral_signal
 from fpirhc.tracking.linear_law import Exponential

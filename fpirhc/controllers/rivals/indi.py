@@ -15,8 +15,8 @@ from fpirhc.fields.kinds import Accuracy, Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
-from fpirhc.symbolic.functions import cos, exp, sqrt
 from fpirhc.symbolic.layout import Expression, Layout, discrete, scalar
+from fpirhc.symbolic.live import cos, exp, sqrt
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 

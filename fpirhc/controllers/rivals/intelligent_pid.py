@@ -23,8 +23,8 @@ from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
-from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
+from fpirhc.symbolic.live import numbers
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, own_errors
 

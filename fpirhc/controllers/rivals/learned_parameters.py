@@ -18,14 +18,14 @@ import numpy as np
 
 from fpirhc.controllers.base import clip, like
 from fpirhc.controllers.contract import refuse
-from fpirhc.controllers.response_pairs import ResponsePairs
+from fpirhc.controllers.model_inputs import ResponsePairs
 from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, is_finite, pair
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 

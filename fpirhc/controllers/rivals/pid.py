@@ -1,7 +1,4 @@
-"""PID control, without any model: one input per controlled coordinate.
-
-Theory: docs/theory-rivals.md.
-"""
+"""PID control, without any model: one input per controlled coordinate. Theory: docs/theory-rivals.md."""
 
 from __future__ import annotations
 
@@ -20,9 +17,8 @@ from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
-from fpirhc.symbolic.functions import quotient
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.live import nominal, quotient
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import (
     Useful,

@@ -16,9 +16,8 @@ from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.functions import numbers, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import Values, following, live_numbers, settled
+from fpirhc.symbolic.live import Values, following, live_numbers, numbers, power, settled
 from fpirhc.tracking.base import error_chains
 
 

@@ -18,8 +18,8 @@ from fpirhc.plant.motion import derivative_unit, places
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
+from fpirhc.symbolic.live import numbers
 from fpirhc.task.problem import Problem
 
 
@@ -161,7 +161,6 @@ class SlotineLi(Controller):
 
 
 def _rates(problem: Problem, name: str) -> Signal:
-    """A signal with a velocity of every coordinate."""
     plant = problem.plant
     return vector(name, plant.names, [derivative_unit(plant.coordinates[c], 1, plant.time_unit) for c in plant.names])
 

@@ -1,7 +1,4 @@
-"""Schedules of time slots: which slot a control cycle belongs to.
-
-Theory: docs/theory-rivals.md.
-"""
+"""Schedules of time slots: which slot a control cycle belongs to. Theory: docs/theory-rivals.md."""
 
 from __future__ import annotations
 
@@ -26,9 +23,8 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import FINITE, Signals
-from fpirhc.symbolic.functions import rounded
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import expressed, following, live_numbers, nominal, settled
+from fpirhc.symbolic.live import expressed, following, live_numbers, nominal, rounded, settled
 from fpirhc.task.problem import Problem
 
 SlotSpans = tuple[tuple[str, float], ...]
@@ -218,8 +214,7 @@ class Mode:
     def start(self, before: Mode, held: float = 0.0) -> np.ndarray:
         """Return the matrix from z at the end of the slot `before` to z at the start of this one; the command is continuous.
 
-        Args:
-            held: time before its end at which z is taken, since the last command was given then: the cycle of a map.
+        `held`: time before its end at which z is taken, since the last command was given then: the cycle of a map.
         """
         n = self.own.size
         matrix, ended = np.zeros((n + 2, n + 2)), before.over(held)[:n]
@@ -240,9 +235,7 @@ def linear_modes(
 ) -> tuple[list[Mode], str]:
     """Return the modes at the reference's last point; where there are none an empty list and the reason.
 
-    Args:
-        parameters: of the plant, shape (np,).
-        blend: time constant of the offset at a switch, s; 0 leaves the offset out.
+    `parameters`: of the plant, shape (np,). `blend`: time constant of the offset at a switch, s; 0 leaves the offset out.
     """
     other = [c.slot.coordinate for c in channels if c.slot.tracking.feedback(c.chain.order) is None]
     if other:

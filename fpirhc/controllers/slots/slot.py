@@ -117,7 +117,6 @@ def _differences(plant: Plant, chain: OutputChain) -> int:
 
 
 def _against(problem: Problem, deformation: Deformation, differences: int) -> Iterator[str]:
-    """Reasons against a deformation in a slot."""
     estimator = problem.sensing.estimator
     at_once = estimator.of_steps or (estimator.shows_response and differences < 2)
     if not at_once:
@@ -143,8 +142,7 @@ def for_channel(
 ) -> Block:
     """Return the block on the slot's own copies of its signals. The memory of the block starts anew with every slot.
 
-    Args:
-        first: (signals) -> values with which the memory starts, by name; signals that are not named keep their own start.
+    `first`: (signals) -> values with which the memory starts, by name; signals that are not named keep their own start.
     """
 
     def renamed(signal: Signal) -> Signal:
@@ -191,8 +189,7 @@ def delays_for_channel(delays: tuple[Delay, ...], one: Channel) -> list[Delay]:
 def integrators(plant: Plant, quantities: Mapping[str, tuple[str, int]], inputs: Sequence[str]) -> Plant:
     """Return the plant y^(r) = u of some quantities, in the time of another plant.
 
-    Args:
-        quantities: (unit, order) of every quantity, by name.
+    `quantities`: (unit, order) of every quantity, by name.
     """
     names, orders = tuple(quantities), {name: order for name, (_, order) in quantities.items()}
 

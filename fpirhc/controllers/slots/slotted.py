@@ -1,7 +1,4 @@
-"""Time slots: one input serves several coordinates in turn.
-
-Theory: docs/theory-rivals.md.
-"""
+"""Time slots: one input serves several coordinates in turn. Theory: docs/theory-rivals.md."""
 
 from __future__ import annotations
 
@@ -55,8 +52,8 @@ from fpirhc.status import Status
 from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
-from fpirhc.symbolic.functions import ceil, exp, signed, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar
+from fpirhc.symbolic.live import ceil, exp, signed, stays
 from fpirhc.task.problem import Problem
 
 
@@ -490,8 +487,7 @@ def switch_block(channels: Sequence[Channel]) -> Block:
 def join_block(problem: Problem, measured: Signal, one: Channel, blend: float, blank: int) -> Block:
     """Block that joins the slot's law to the plant's last motion: the desired response and the pair of the last cycle.
 
-    Args:
-        measured: signal of y^(r) of every slot.
+    `measured`: signal of y^(r) of every slot.
     """
     decay = exp(-problem.period / blend) if live.nominal(blend) > 0 else 0.0
     place = problem.plant.input.elements.index(one.chain.input)

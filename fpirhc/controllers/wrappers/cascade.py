@@ -31,11 +31,9 @@ from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay
 from fpirhc.symbolic.expression import Signals, expression, is_finite, kind
-from fpirhc.symbolic.functions import largest
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal, scalar
-from fpirhc.symbolic.live import nominal
-from fpirhc.symbolic.queue import MOST, Queue, every
-from fpirhc.task.dead_time import DeadTime
+from fpirhc.symbolic.live import largest, nominal
+from fpirhc.task.dead_time import MOST, DeadTime, Queue, every
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Reference, Steps
 

@@ -14,7 +14,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, command_before, like
 from fpirhc.controllers.contract import ControllerWrapper, Planner, require_controlled_response, with_setting
-from fpirhc.controllers.response_pairs import ResponsePairs
+from fpirhc.controllers.model_inputs import ResponsePairs
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
@@ -22,8 +22,8 @@ from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import GAP, Block, Delay
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, is_finite
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal, discrete
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
@@ -37,7 +37,7 @@ _MODELLED: Latest[Problem] = Latest(8)
 class Estimating(ControllerWrapper):
     """The wrapped controller with the parameters of its model corrected every cycle.
 
-    Behind dead time or an estimator, a response belongs to an older state and command; see `fpirhc.controllers.response_pairs`.
+    Behind dead time or an estimator, a response belongs to an older state and command; see `fpirhc.controllers.model_inputs`.
 
     Args:
         controller: any controller that uses its model.

@@ -9,7 +9,7 @@ from fpirhc.controllers.contract import ControllerWrapper, PlantModel
 from fpirhc.plant.motion import known_exactly
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.task.exogenous import really_known, signals_of
 from fpirhc.task.problem import Problem
 

@@ -1,7 +1,4 @@
-"""A controller that acts on the state in which its command will act.
-
-Theory: docs/theory-rivals.md.
-"""
+"""A controller that acts on the state in which its command will act. Theory: docs/theory-rivals.md."""
 
 from __future__ import annotations
 
@@ -31,11 +28,9 @@ from fpirhc.plant.motion import forcing_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.functions import rounded
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import expressed, nominal
-from fpirhc.symbolic.queue import MOST, Queue, room
-from fpirhc.task.dead_time import DeadTime
+from fpirhc.symbolic.live import expressed, nominal, rounded
+from fpirhc.task.dead_time import MOST, DeadTime, Queue, room
 from fpirhc.task.problem import Problem
 
 

@@ -17,9 +17,9 @@ from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, me
 from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne
-from fpirhc.symbolic.functions import largest, stays
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
-from fpirhc.symbolic.queue import MOST, Cycles, Queue, every, longest_of, several
+from fpirhc.symbolic.live import largest, stays
+from fpirhc.task.dead_time import MOST, Cycles, Queue, every, longest_of, several
 
 __all__ = ["MOST", "Increment", "Paired"]
 

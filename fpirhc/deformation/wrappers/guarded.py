@@ -1,7 +1,4 @@
-"""Watches an iteration that may leave its basin of attraction, and brings it back.
-
-Theory: docs/theory-maps.md.
-"""
+"""Watches an iteration that may leave its basin of attraction, and brings it back. Theory: docs/theory-maps.md."""
 
 from __future__ import annotations
 

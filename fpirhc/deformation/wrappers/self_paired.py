@@ -1,7 +1,4 @@
-"""An unknown dead time: estimated and logged, or estimated and used.
-
-Theory: docs/theory-maps.md.
-"""
+"""An unknown dead time: estimated and logged, or estimated and used. Theory: docs/theory-maps.md."""
 
 from __future__ import annotations
 

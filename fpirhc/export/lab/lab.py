@@ -162,9 +162,9 @@ def _mechanism(ready: Simulator, pictures: Sequence[Picture], without: dict[str,
 
 def _usual(problem: Problem, controller: Controller) -> list[str]:
     """Gains and rates of a controller, the limits of inputs that are finite, dead times, and the numbers of the reference."""
-    found = [path for name in _SETTINGS for path in paths_to(name, controller) if not path.startswith("optimiser.")]
+    own = [path for name in _SETTINGS for path in paths_to(name, controller) if not path.startswith("optimiser.")]
     return [
-        *found,
+        *own,
         *(f"reference.{path}" for name in _OF_REFERENCE for path in paths_to(name, problem.reference)),
         *(f"limits.inputs.{name}" for name, ends in problem.limits.inputs.items() if np.isfinite(ends).any()),
         *(f"dead_time.inputs.{name}" for name in problem.dead_time.inputs),
@@ -187,12 +187,12 @@ def _with_room(problem: Problem, controller: Controller) -> Problem:
 
 def _with_live(problem: Problem, controller: Controller, wanted: list[str], without: dict[str, str]) -> Simulator:
     """The loop with those of the settings that it can keep open; reasons for the others."""
-    kept: list[str] = []
+    open_paths: list[str] = []
     ready = simulator(problem, controller, compiled=False)
     for path in wanted:
         try:
-            ready = simulator(problem, controller, compiled=False, live=[*kept, path])
-            kept.append(path)
+            ready = simulator(problem, controller, compiled=False, live=[*open_paths, path])
+            open_paths.append(path)
         except FpirhcError as error:
             without[path] = str(error)  # of the last controller, which adapts where only one does
     return ready

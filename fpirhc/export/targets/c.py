@@ -16,8 +16,7 @@ import numpy as np
 from fpirhc.controllers.gate import HELD
 from fpirhc.export.binaries import own_compiler, program
 from fpirhc.export.device import Device, identifiers, literal
-from fpirhc.export.samples import recorded
-from fpirhc.export.target import Target
+from fpirhc.export.target import Target, recorded
 from fpirhc.simulation.clock import LONGEST, MEMORY
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.status import Status

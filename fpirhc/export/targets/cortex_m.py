@@ -12,8 +12,7 @@ from pathlib import Path
 
 from fpirhc.export.binaries import arm_programs
 from fpirhc.export.device import Device
-from fpirhc.export.samples import recorded
-from fpirhc.export.target import Target
+from fpirhc.export.target import Target, recorded
 from fpirhc.export.targets.c import filled, layout_of, sources
 
 

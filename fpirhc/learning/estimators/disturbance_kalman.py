@@ -20,8 +20,8 @@ from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import quantities, response_names
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression
-from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import Following, following, live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
@@ -241,11 +241,9 @@ class DisturbanceKalman(ParameterEstimator):
         return bool(self._responses(plant)) and response_age(plant) > 0
 
     def _responses(self, plant: Plant) -> tuple[str, ...]:
-        """Names of the measured responses."""
         return tuple(n for n in self.measured if n in response_names(plant))
 
     def _measured(self, model: Plant, seen: Seen) -> Expression:
-        """The measured quantities as a column."""
         states = {e: seen.state[k] for k, e in enumerate(model.state.elements)}
         responses = {e: seen.response[k] for k, e in enumerate(response_names(model))}
         outputs = {} if seen.output is None else {e: seen.output[k] for k, e in enumerate(model.output.elements)}

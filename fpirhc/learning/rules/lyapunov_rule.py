@@ -10,8 +10,8 @@ import casadi as ca
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Positive
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
-from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.live import numbers
 
 
 @dataclass(frozen=True, eq=False)

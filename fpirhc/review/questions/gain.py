@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.broken import attempted
-from fpirhc.contraction.large_errors import two_cycle_amplitudes, two_cycle_limit
+from fpirhc.contraction.delayed import two_cycle_amplitudes, two_cycle_limit
 from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
@@ -27,6 +26,7 @@ from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
 from fpirhc.review.questions.margins import keeps_margins
 from fpirhc.review.questions.right_model import RIGHT_MODEL, leaves_right_model_alone
 from fpirhc.review.questions.speed import fast_enough, gain_times, plan_keeps_up
+from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
 MARGIN = 2.0
@@ -228,8 +228,7 @@ def _case_with(case: Case, gain: float) -> Case:
 def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> str:
     """Return what a review says of the gain: the recommended one where errors grow, else whether it is too small, else nothing.
 
-    Args:
-        grows: whether the iteration is no contraction along the run.
+    `grows`: whether the iteration is no contraction along the run.
     """
     if controller.deforms == "target" or not controller.deformation.adapts:
         return ""

@@ -13,14 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.by_name import FoundByName
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import refuse_without, resolved, without_deformation
 from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotContractive, nearest
-from fpirhc.fields.checked import checked_call
+from fpirhc.fields.checked import FoundByName, checked_call
 from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, review_grid

@@ -29,9 +29,8 @@ from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.questions.speed import law_of
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
-from fpirhc.symbolic.roots import Equations
 from fpirhc.task.problem import Problem
-from fpirhc.task.reality import Reality
+from fpirhc.task.reality import Equations, Reality
 
 Guided: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
 _LEFT = 1e-6  # of an equation, relative to the size of its terms

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from fpirhc.contraction.large_errors import basin_of_plain_form
+from fpirhc.contraction.delayed import basin_of_plain_form
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.chain import derivatives_function

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.contraction.delayed import bearable_lag
-from fpirhc.contraction.large_errors import least_product
+from fpirhc.contraction.delayed import bearable_lag, least_product
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation

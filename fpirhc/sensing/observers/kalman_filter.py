@@ -24,12 +24,11 @@ from fpirhc.sensing.base import (
     first_covariance,
     name_mistakes,
     require_named,
+    unobservable,
     values_of,
 )
-from fpirhc.sensing.observability import unobservable
-from fpirhc.symbolic.functions import overlaid
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.live import nominal, overlaid
 
 _STATE, _COVARIANCE, _VARIANCES = "observer_state", "observer_covariance", "observer_variances"
 

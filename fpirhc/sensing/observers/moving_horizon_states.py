@@ -31,9 +31,9 @@ from fpirhc.sensing.base import (
     first_covariance,
     name_mistakes,
     require_named,
+    unobservable,
     values_of,
 )
-from fpirhc.sensing.observability import unobservable
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _STAYS = 0.1  # share of its distance from a bound that a step leaves at least
@@ -48,9 +48,8 @@ class Interior:
     """
 
     elements: tuple[str, ...]  # names of the states
-    bounds: Mapping[str, tuple[float, float]] = field(
-        default_factory=dict
-    )  # state -> (lower, upper); an end may be infinite
+    # state -> (lower, upper); an end may be infinite
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     barrier: float = 1.0  # weight mu of the logarithm
 
     @property
@@ -218,7 +217,6 @@ class Smoother:
         return tuple(ca.SX.sym(name, n) for name, n in sizes.items())
 
     def _acted(self, row: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """The command and the parameters of a row."""
         at, count = 2 + len(self.measured), self.model.plant.input.size
         values = dict(zip(self._signals, ca.vertsplit(row[at + count :]), strict=True)) if self._signals else {}
         parameters = [values.get(k, p[k]) for k in range(p.numel())]

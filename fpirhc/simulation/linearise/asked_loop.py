@@ -30,7 +30,7 @@ from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
 from fpirhc.task.disturbance import Step as Jump
 from fpirhc.task.problem import Problem

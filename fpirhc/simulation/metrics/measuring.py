@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 
-from fpirhc.broken import attempted
-from fpirhc.by_name import ByName, FoundByName
 from fpirhc.errors import InvalidName, nearest
-from fpirhc.fields.checked import checked_call
+from fpirhc.fields.checked import ByName, FoundByName, checked_call
 from fpirhc.members import within
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
+from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
 GROUP = "fpirhc.metrics"  # of entry points; each leads to a Metric or to a tuple of them
@@ -189,7 +188,7 @@ def measure(problem: Problem, run: Run, metrics: Sequence[Metric] | None = None)
 class Column:
     """One number of every run."""
 
-    metric: Metric  # the metric
+    metric: Metric
     element: str  # of the metric; '' for a single number
     unit: str  # of the number
 

@@ -18,7 +18,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.plant.motion import with_space
 from fpirhc.review.questions.horizon import EFFORT_CHANGE, EFFORT_FACT, MANY
 from fpirhc.review.questions.slew import SPARE
-from fpirhc.simulation.held_input import HeldInput
+from fpirhc.simulation.loop import HeldInput
 from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.simulate import judged_run, simulator
 from fpirhc.status import Status
@@ -40,9 +40,8 @@ class Yardstick:
     # alone has for an error, because disturbances and not the reference move it
     ranges: Mapping[str, float] = field(default_factory=dict)
     turns: Mapping[str, float] = field(default_factory=dict)  # a quarter turn for angles whose references do not move
-    alone: Mapping[str, float] = field(
-        default_factory=dict
-    )  # rms error of the plant left alone; empty where it is not known
+    # rms error of the plant left alone; empty where it is not known
+    alone: Mapping[str, float] = field(default_factory=dict)
 
     def beyond(self, entry: Entry, name: str) -> str:
         """What the rms error of a coordinate exceeds, in words: the range of its reference, or a quarter turn; else nothing."""

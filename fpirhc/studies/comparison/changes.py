@@ -14,7 +14,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from fpirhc.by_name import FoundByName
+from fpirhc.fields.checked import FoundByName
 from fpirhc.plant.motion import followed_units
 from fpirhc.summary import numbers_written_out, written_out
 from fpirhc.task.problem import Problem

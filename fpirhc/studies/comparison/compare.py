@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from typing import cast
 
-from fpirhc.broken import attempted
 from fpirhc.contraction.spectrum import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
@@ -46,6 +45,7 @@ from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_t
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.studies.tuning.objective import objective
 from fpirhc.studies.view import Progress, circumstances
+from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
 

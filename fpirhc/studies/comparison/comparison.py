@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
+from fpirhc.fields.checked import FoundByName
 from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.metrics import Metric, Metrics
 from fpirhc.simulation.metrics.measuring import Column as Number
@@ -96,7 +96,6 @@ class Comparison(Study, FoundByName):
 
 
 def _view(comparison: Comparison) -> View:
-    """Return what is said of a comparison."""
     entries = comparison.entries
     ended = [f"{e.name} ended early: {e.run.stop}" for e in entries if e.run.stop]
     notes = [f"{e.name}: {note}" for e in entries for note in e.notes]

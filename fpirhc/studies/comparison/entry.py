@@ -44,11 +44,7 @@ class Information:
 
 
 def information(problem: Problem, controller: Controller, loop: Composite, cycles: int) -> Information:
-    """Return what a controller uses, and when.
-
-    Args:
-        cycles: from plan to plan; 1 for a controller that does not plan.
-    """
+    """Return what a controller uses, and when. `cycles`: from plan to plan; 1 for a controller that does not plan."""
     waits = cycles > 1 and controller.learns and not _acts_at_once(controller)
     return Information(_used(problem, loop), _rate(controller, cycles), waits)
 
@@ -155,7 +151,7 @@ class Entry:
     """One controller of a comparison."""
 
     name: str  # name of the controller
-    run: Run  # its run
+    run: Run
     metrics: Metrics  # metrics of the run
     cycle: CycleTime | None  # time of a control cycle; None for a run that is too short
     adaptive: bool  # whether the controller adapts

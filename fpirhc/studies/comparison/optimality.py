@@ -10,7 +10,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.reference_states import own_signals
 from fpirhc.errors import FpirhcError
-from fpirhc.horizon.consistent_state import consistent_state
+from fpirhc.horizon.nominal import consistent_state
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -19,8 +19,7 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.summary import written_out
-from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Evaluator, Latest
 from fpirhc.symbolic.native import native
 from fpirhc.task.exogenous import model_values, previewed_values, rows_of, signals_of
 from fpirhc.task.problem import Problem, cycles_per_plan

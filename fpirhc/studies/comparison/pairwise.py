@@ -15,11 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fpirhc.broken import attempted
-from fpirhc.by_name import FoundByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.errors import FpirhcError
+from fpirhc.fields.checked import FoundByName
 from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.review.questions.gain import reviewed_gain
 from fpirhc.review.questions.reached_parameters import not_reached
@@ -35,6 +34,7 @@ from fpirhc.studies.comparison.entry import Entry, no_bound_because
 from fpirhc.studies.comparison.timing import measure_price
 from fpirhc.studies.comparison.verdict import beaten_by, judge
 from fpirhc.summary import in_percent, numbers_written_out
+from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
 _LARGER = (Outcome.WORSE, Outcome.MIXED)

@@ -11,7 +11,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.sample import raw_measurements
+from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import without_warning
 from fpirhc.task.problem import Problem, cycles_per_plan

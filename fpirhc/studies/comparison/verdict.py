@@ -63,10 +63,10 @@ def findings(
         [_by_figure(*pair, figure) for pair in ordered] if figure is not None and figure.metric is not None else []
     )
     judged = [_told_of_partner(judge(*pair, measure), pair[0] in partners) for pair in ordered] or [_no_pair(entries)]
-    told = {
+    not_followed_pairs = {
         n for f in judged if f.outcome is Outcome.NOT_COMPARABLE and f.ratios for n in f.pair or ()
     }  # by `not_followed`
-    left = (leaves_reference(entry, measure) for entry in entries if entry.name not in told)
+    left = (leaves_reference(entry, measure) for entry in entries if entry.name not in not_followed_pairs)
     judged += [Finding(text) for text in left if text]
     judged += [Finding(_of(e, text)) for e in entries if not e.adaptive and (text := stuck_cause(e))]
     judged += [Finding(f"{name} is not judged: {why}.") for name, why in (unjudged or {}).items()]

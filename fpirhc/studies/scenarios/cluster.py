@@ -319,9 +319,7 @@ def run_jobs(
 ) -> tuple[list[list[dict[str, Any]]], float]:
     """Answer jobs on a worker; return the records of each and the seconds that they took.
 
-    Args:
-        greeting: facts on which the client's numbers depend.
-        jobs: (numbers of scenarios, name of the controller).
+    `greeting`: facts on which the client's numbers depend. `jobs`: (numbers of scenarios, name of the controller).
     """
     with _ONE_AT_A_TIME:
         try:

@@ -2,7 +2,7 @@
 
 Random scenario k of a seed is always the same: its numbers come from a stream of its own, `SeedSequence(seed, spawn_key=(use, k))`,
 whatever the number of scenarios, of processes and of controllers, and in whatever order they run. Every exact parameter
-is drawn from its range (see `fpirhc.plant.mismatch`): by its own spread, or without one multiplied by a factor of its own, the
+is drawn from its range (see `fpirhc.plant.plant`): by its own spread, or without one multiplied by a factor of its own, the
 logarithm of which is uniform between log(1 - P/100) and log(1 + P/100). Dead times are those of the problem, or P percent shorter
 or longer, rounded away from it to whole cycles: another length of a queue is another loop, so there are three and no more.
 """
@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from fpirhc.controllers.contract import Controller, resolved
-from fpirhc.plant.mismatch import Parametric, drawn, exact_ranges
+from fpirhc.plant.plant import Parametric, drawn, exact_ranges
 from fpirhc.review.grid import is_late, live_paths, roomy, scaled
 from fpirhc.task.cases import START, Cases
 from fpirhc.task.problem import Problem
@@ -138,7 +138,7 @@ class Scenarios(ABC):
 class RandomScenarios(Scenarios):
     """Scenarios with drawn parameters and dead times."""
 
-    of: Problem  # the problem
+    of: Problem
     seed: int  # of the study
     use: int  # `COMPARING` or `TUNING`
     percent: float  # range of the exact parameters, percent
@@ -188,8 +188,8 @@ class RandomScenarios(Scenarios):
 class NamedCases(Scenarios):
     """Scenarios that are the cases of a problem file."""
 
-    cases: Cases  # the cases
-    of: Problem  # the problem
+    cases: Cases
+    of: Problem
     seed: int  # of the study; a case without a seed of its own has noise of this one and of its place among the cases
     _built: dict[object, Problem] = field(default_factory=dict, init=False)
     _shared_builds: dict[object, Problem] = field(default_factory=dict, init=False)

@@ -103,9 +103,8 @@ class Ledger:
         self._waiting, self._forced, self._end = 0, time.monotonic(), 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open(
-                "a+b", buffering=0
-            )  # a disk that is full shows in the write itself, and never when the file is closed
+            # a disk that is full shows in the write itself, and never when the file is closed
+            self._file = path.open("a+b", buffering=0)
         except OSError as error:
             raise OutputError(f"cannot write to '{path}': {error.strerror}; choose another folder with --out") from None
         try:

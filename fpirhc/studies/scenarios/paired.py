@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.by_name import FoundByName
+from fpirhc.fields.checked import FoundByName
 from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.studies.scenarios.quantiles import Quantiles
 from fpirhc.studies.tuning.objective import Objective
@@ -86,8 +86,7 @@ def verdict(
 ) -> tuple[str, ...]:
     """Return sentences: every controller against the baseline, failures, and controllers that were not run.
 
-    Args:
-        figure: by which controllers are compared; None: the relative error.
+    `figure`: by which controllers are compared; None: the relative error.
     """
     figure = figure or Objective()
     sentences = [_sentence(summaries[0], s, what, figure) for s in summaries[1:]]
@@ -175,7 +174,7 @@ def share_interval(count: int, total: int) -> tuple[float, float]:
 class ConfidenceInterval:
     """A median and its interval at level `LEVEL`."""
 
-    median: float  # the median
+    median: float
     low: float  # lower end of the interval
     high: float  # upper end of the interval
 

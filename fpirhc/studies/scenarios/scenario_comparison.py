@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
-from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidName, nearest
+from fpirhc.fields.checked import FoundByName
 from fpirhc.simulation.metrics.measuring import Column as Number
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.scenarios.paired import Record, Summary, noun

@@ -275,8 +275,7 @@ class Joined:
 def merge_shards(folders: Sequence[Path], out: Path) -> Joined:
     """Join the results of several folders; what stands in two of them is kept once.
 
-    Args:
-        out: folder of the whole; it may hold some results already.
+    `out`: folder of the whole; it may hold some results already.
     """
     header = header_of(folders[0] / LEDGER)
     with Ledger(out / LEDGER, header, RecordFields) as whole:

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidProblem, InvalidValue, package
-from fpirhc.fields.checked import Checked, checked_call
+from fpirhc.fields.checked import Checked, FoundByName, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings

@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fpirhc.contraction.measured import identified_factor, jacobians_along
-from fpirhc.contraction.spectrum import Spectrum, predicted_factor
+from fpirhc.contraction.spectrum import Spectrum, identified_factor, jacobians_along, predicted_factor
 from fpirhc.simulation.metrics.base import Metric, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent

@@ -10,7 +10,7 @@ from fpirhc.controllers.reference_states import given_signals, own_signals
 from fpirhc.simulation.metrics.base import Metric, by_name, coordinate_unit, measured_cycles
 from fpirhc.simulation.metrics.summed import Cycle, Measured, Summed, Term, larger
 from fpirhc.simulation.run import Run
-from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.task.problem import Problem
 
 
