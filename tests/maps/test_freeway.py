@@ -226,6 +226,7 @@ def test_the_published_signs_are_no_minimum() -> None:
     Within .1 veh h after 96 steps. The rates differ by up to .65 in the first minutes, where the source meters for nothing.
     """
     coordinated = task("freeway_coordinated").problem
+    assert coordinated.horizon is not None
     problem = replace(
         coordinated,
         signals=task("freeway_economic").problem.signals,
@@ -243,7 +244,7 @@ def test_the_published_signs_are_no_minimum() -> None:
 def test_the_program_of_the_source_has_its_signs_and_rates() -> None:
     """States and inputs of a horizon, zeros as the first guess, and IPOPT, as there; its first plan ends after 500 iterations."""
     plant = over(task("freeway_coordinated").problem.plant, T)
-    program, iterations = program_of_source(plant), []
+    program, iterations = program_of_source(plant), list[int]()
     parameters = with_demands(plant, 100 + STEPS)
     state, last = np.array(task("freeway_coordinated").problem.start_state), np.array([1.0, 78.0, 72.5])
     guess: Any = 0.0
@@ -281,7 +282,8 @@ def program_of_source(plant: fp.Plant) -> ca.Function:
     cost = T * (2 * ca.sum2(ca.sum1(x[:6, :])) + ca.sum2(ca.sum1(x[12:, :]))) + 0.4 * ca.sumsqr(change)
     program = {"x": ca.vertcat(ca.vec(x), ca.vec(u)), "p": p, "f": cost, "g": ca.vertcat(*gaps)}
     quiet = {"max_iter": 500, "sb": "yes", "print_level": 0}
-    return ca.nlpsol("source", "ipopt", program, {"expand": True, "print_time": False, "ipopt": quiet})
+    options: dict[str, Any] = {"expand": True, "print_time": False, "ipopt": quiet}
+    return ca.nlpsol("source", "ipopt", program, options)
 
 
 def bounds_of_source() -> dict[str, Any]:

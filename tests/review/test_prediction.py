@@ -16,10 +16,10 @@ import fpirhc as fp
 from fpirhc.contraction.delayed import least_product
 from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.review.prediction import exactly, nominal_run, null_errors, response_errors
+from fpirhc.review.prediction import nominal_run, null_errors, response_errors
 from fpirhc.review.response_prediction import majorant, tube
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
-from fpirhc.simulation.model_as_plant import shortened
+from fpirhc.simulation.model_as_plant import exactly, shortened
 
 SCALES = {"two_mass": 20.0, "mrac_pendulum": 50.0}  # m/s^2, rad/s^2; 50 for the others
 
