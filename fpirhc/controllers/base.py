@@ -98,7 +98,8 @@ def reference_block(problem: Problem) -> Block:
 
 def error_signal(problem: Problem, name: str) -> Signal:
     """Return a signal that holds an error of every judged coordinate."""
-    units = [followed_units(problem.plant)[c] for c in problem.judged_names]
+    every = followed_units(problem.plant)
+    units = [every[c] for c in problem.judged_names]
     return vector(name, problem.judged_names, units)
 
 

@@ -131,7 +131,8 @@ class Block:
                 raise InvalidShape(
                     f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {signal.size}"
                 )
-            results.append(_dense_column(value))
+            is_column = value.is_dense() and value.is_column()  # not built anew, which costs more than most operations
+            results.append(value if is_column else ca.densify(value.reshape((value.numel(), 1))))
         keys = list(self._results)
         name, columns = PREFIX + self.name, list(symbols.values())
         function = ca.Function(name, columns, results, list(symbols), keys, {"allow_free": True})
@@ -356,11 +357,6 @@ def every(block: Block, cycles: int) -> Block:
 
     name = f"{block.name}_every_{cycles}"
     return Block(name, block.inputs, block.writes, step, own, opaque=True, derived=block.derived)
-
-
-def _dense_column(value: Matrix) -> Matrix:
-    """Return all entries as a column; what is one already is not built anew, which costs more than most operations."""
-    return value if value.is_dense() and value.is_column() else ca.densify(value.reshape((value.numel(), 1)))
 
 
 def _settings(signals: Iterable[Signal]) -> Layout:
