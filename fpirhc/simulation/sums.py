@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -103,13 +102,15 @@ class Sums:
         pairs = zip(self._summed, rest, strict=True)
         return {m.name: one.result(part, run) for (m, one), part in pairs}, outside[:, -1] != 0
 
-    def _row(self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, list[Any]]], run: Run) -> Values:
+    def _row(
+        self, k: int, problem: Problem, columns: Mapping[str, Mapping[str, list[float | None]]], run: Run
+    ) -> Values:
         """The metrics of the k-th run; `run` has what was kept of it."""
         of_logs = measure(problem, run, self._of_logs).values
         row: Values = {}
         for metric in self.metrics:
             if metric.name in columns:
-                row[metric.name] = {e: v[k] for e, v in columns[metric.name].items() if v[k] is not None}
+                row[metric.name] = {e: one for e, v in columns[metric.name].items() if (one := v[k]) is not None}
             elif metric.name in of_logs:
                 row[metric.name] = dict(of_logs[metric.name])
         return row

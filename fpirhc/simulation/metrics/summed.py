@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from typing import Any, TypeAlias
+from typing import TypeAlias, cast
 
 import casadi as ca
 import numpy as np
@@ -18,7 +18,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 
-Term: TypeAlias = Any  # ca.SX of one cycle, or an array with a column for each: no type is both
+Term: TypeAlias = ca.SX  # of one cycle, or an array with a column for each: operators are all that is used of both
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +40,14 @@ class Cycle:
     measured: Term
     before: Mapping[str, Term] = field(default_factory=dict)
     first: Mapping[str, Term] = field(default_factory=dict)
-    begun: Term = 0
-    constants: Term = None
+    begun: Term | int = 0
+    constants: Term = field(default_factory=ca.SX)
 
     def __getitem__(self, name: str) -> Term:
         return self.signals[name]
 
 
-def larger(one: Term, other: Term) -> Term:
+def larger(one: Term, other: Term | float) -> Term:
     """Return the larger of two columns, entry by entry."""
     return (ca.fmax if isinstance(one, ca.SX) or isinstance(other, ca.SX) else np.fmax)(one, other)
 
@@ -144,7 +144,9 @@ class Summed:
         constants = self.constants(about)
         assert constants is not None
         some = {name: values[:, begin:] for name, values in rows.items()}
-        cycle = Cycle(some, number, 1, before, first, number > about.first, constants[:, None])
+        cycle = cast(Callable[..., Cycle], Cycle)(
+            some, number, 1, before, first, number > about.first, constants[:, None]
+        )
         entries = np.broadcast_to(self.term(cycle), (terms, len(number)))
         return np.asarray(entries.max(axis=1, initial=0.0) if self.largest else entries.sum(axis=1))[None]
 
