@@ -42,7 +42,10 @@ RECORDS = 25  # that are timed
 SOME, MORE = 40, 80  # times that they are read in the smaller and the larger file
 TURNS, BLOCK = 4, 64  # of scenarios side by side; the first one compiles
 LARGE = "fishery", ("CTC", "CTC+FPI"), (1_000, 10_000, 100_000)  # studies whose memory is measured
-STUDIES = (("two_mass", ("CTC", "CTC+FPI (eq 6)"), 2000), ("van_der_pol", ("RHC", "RHC+FPI", "RHC exact model"), 600))
+STUDIES = (
+    ("two_mass", ("CTC", "CTC+FPI (eq 6)"), 20_000),
+    ("van_der_pol", ("RHC", "RHC+FPI", "RHC exact model"), 6000),
+)
 
 
 def command(
