@@ -226,7 +226,9 @@ class _ReferenceExpansion:
 
     def growth(self) -> np.ndarray:
         """Largest factor |eigenvalue of dF/ds| by which a motion grows in each stage, shape (N,)."""
-        return np.array([np.abs(np.linalg.eigvals(a)).max() if np.isfinite(a).all() else np.nan for a in self.a])
+        finite, factors = np.isfinite(self.a).all(axis=(1, 2)), np.full(len(self.a), np.nan)
+        factors[finite] = np.abs(np.linalg.eigvals(self.a[finite])).max(axis=1)
+        return factors
 
     def least_curvature(self) -> float:
         """Smallest eigenvalue of a stage's cost Hessian, relative to its largest."""

@@ -151,6 +151,7 @@ class Stepper(Checked):
         self._more = arguments.ages or bool(arguments.beside)
         self._before, self._period = self.memory.slice(CLOCK.name).start, float(problem.period)
         self._skipped = self.memory.slice(f"{SKIPPED}_before").start
+        self._counted = self.signals.slice(SKIPPED).start
         self._late, self._most = 1.5 * self._period, most_missed(problem, bridged)
         warn_of_harm(problem, controller)
 
@@ -325,6 +326,11 @@ class Stepper(Checked):
         says that the number must not stay as it was: change the settings that it follows from only where Python computes it.
         """
         return self._now.outdated()
+
+    @property
+    def skipped(self) -> int:
+        """Number of skipped cycles since the start: the signal 'skipped' of the last step, without the others."""
+        return int(self._arguments.trace[self._counted])
 
     def trace(self) -> dict[str, np.ndarray]:
         """Return every signal of the last step by name.

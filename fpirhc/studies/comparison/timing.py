@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import Stepper
@@ -148,7 +147,7 @@ def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | N
         begin = time.perf_counter_ns()
         _, memory = step(times[k], states[k], realised[k], memory)
         taken[k] = time.perf_counter_ns() - begin
-        skipped[k] = stepper.trace()[SKIPPED][0]
+        skipped[k] = stepper.skipped
     micro = taken / 1e3
     later = micro[1:]
     stride = cycles_per_plan(problem.horizon, problem.period) if problem.horizon and "solve" in run.layout else 1
