@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import errno
-import gc
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -13,15 +12,12 @@ from fpirhc.cli.output import closed_by_reader, crash, interrupted, of_a_problem
 from fpirhc.cli.verb import DEBUG, GROUPS, ExitCode, Known, Parser, aligned, former_names, known, shipped, table
 from fpirhc.summary import printable
 
-_ALLOCATIONS = 20_000  # after which unreachable objects are looked for
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; `--help` ends with SystemExit(0), as argparse does."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     # Matrices of loops are small: threads of the linear algebra wait for one another. NumPy reads this when it is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    gc.set_threshold(_ALLOCATIONS, 20)  # what a loop is built of lives as long as the loop
     try:
         code = int(_run([word for word in words if word != DEBUG]))
         sys.stdout.flush()  # a reader that has gone shows here, and not at the end of the program
