@@ -9,6 +9,8 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.cli.main import main
+from fpirhc.errors import WorkerDied
+from fpirhc.studies.scenarios import scenario_study
 from fpirhc.studies.scenarios.bench import RecordFields
 from fpirhc.studies.scenarios.ledger import Ledger, header_of
 from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios, merge_shards
@@ -100,3 +102,17 @@ def test_a_part_without_scenarios_is_refused(tmp_path, capsys):
         compare_scenarios(
             fp.load_problem("mrac_pendulum"), count=4, percent=10.0, shard=(3, 2), seed=0, folder=tmp_path
         )
+
+
+def test_parts_of_unequal_sizes_belong_together(tmp_path, monkeypatch):
+    """Whether scenarios run side by side is a fact of the whole: 63 of them make parts of 32 and of 31."""
+
+    def stopped(*_: object) -> None:
+        raise WorkerDied("before the first run")
+
+    monkeypatch.setattr(scenario_study, "_completed", stopped)
+    folders, task = [tmp_path / f"part{k}" for k in (1, 2)], fp.load_problem("mrac_pendulum")
+    for k, folder in enumerate(folders, 1):
+        with pytest.raises(WorkerDied):
+            compare_scenarios(task, count=63, percent=10.0, shard=(k, 2), seed=0, folder=folder)
+    assert merge_shards(folders, tmp_path / "all").records == 0

@@ -98,13 +98,14 @@ def compare_scenarios(
     """
     begin = time.perf_counter()
     figure = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
-    numbers = _of_shard(scenario_numbers(task, count, percent, cases), *shard)
+    every = scenario_numbers(task, count, percent, cases)
+    numbers = _of_shard(every, *shard)
     if processes < 1:
         raise InvalidValue(f"processes {processes}: expected at least 1")
     task = with_tuned(task, tuned or {})
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
-    many = compiled and len(numbers) * shard[1] >= SIDE_BY_SIDE
+    many = compiled and len(every) >= SIDE_BY_SIDE  # of all parts, which are joined only where they ran alike
     begun = bool(
         begun_with(folder / LEDGER, "side_by_side", many)
     )  # what was begun one by one is not mixed with the other
