@@ -357,6 +357,15 @@ def test_records_of_a_file_are_what_they_were(seed, tmp_path):
         records[0]
     (tmp_path / "gone").rename(tmp_path / "l.jsonl")
     assert (records[-1], len(records), records != wanted[1:]) == (wanted[-1], 300, True)
+    with Ledger(tmp_path / "l.jsonl", {}) as again:
+        assert again.records == wanted
+    (tmp_path / "l.jsonl").unlink()
+    with Ledger(tmp_path / "l.jsonl", {"seed": 1}) as other:
+        for one in reversed(wanted):
+            other.append(one)
+    with pytest.raises(OutputError, match="holds the results of another study by now"):
+        records[0]
+    assert other.records == wanted[::-1]
 
 
 def test_a_record_takes_eight_bytes(tmp_path):

@@ -29,11 +29,12 @@ class Records(Sequence[Mapping[str, Any]]):
 
     Args:
         path: of the file.
+        head: its first line; records of a file that begins with another one are not read.
         places: of the records' lines, in bytes from the start.
     """
 
-    def __init__(self, path: Path, places: Iterable[int] = ()) -> None:
-        self._path, self._places = path, array("Q", places)
+    def __init__(self, path: Path, head: bytes, places: Iterable[int] = ()) -> None:
+        self._path, self._head, self._places = path, head, array("Q", places)
 
     def append(self, place: int) -> None:
         """Add the record of the line that starts there."""
@@ -41,7 +42,7 @@ class Records(Sequence[Mapping[str, Any]]):
 
     def at(self, numbers: Iterable[int]) -> Records:
         """Return some of the records."""
-        return Records(self._path, (self._places[k] for k in numbers))
+        return Records(self._path, self._head, (self._places[k] for k in numbers))
 
     def __iter__(self) -> Iterator[Mapping[str, Any]]:
         try:
@@ -52,6 +53,11 @@ class Records(Sequence[Mapping[str, Any]]):
                 "they are read"
             ) from None
         with file:
+            if file.readline() != self._head:
+                raise OutputError(
+                    f"'{self._path}' holds the results of another study by now, and these records are gone; give every study a "
+                    "folder of its own with --out"
+                )
             for place in self._places:
                 file.seek(place)
                 record = _parsed(self._path, file.readline())
@@ -133,7 +139,7 @@ class Ledger:
 
     def _write(self, value: Mapping[str, Any]) -> int:
         """The place where the line begins."""
-        line, place = _text({**value, _SUM: _sum(value)}).encode() + b"\n", self._end
+        line, place = _line(value), self._end
         try:
             written = self._file.write(line)
             while written < len(line):
@@ -162,7 +168,7 @@ class Ledger:
 
     def _read(self, header: dict[str, Any]) -> Records:
         """The records, one line after the other; a torn last line is cut off."""
-        records, summed = Records(self._path), True
+        records, summed = Records(self._path, _line(header)), True
         for number, text in enumerate(self._whole_lines(), 1):
             line = _parsed(self._path, text, f", line {number}")
             if number == 1:
@@ -178,7 +184,9 @@ class Ledger:
                 raise OutputError(f"'{self._path}', line {number} is damaged: its checksum does not fit; {what}")
             if number == 1 and line != header:
                 raise OutputError(_refusal(self._path, line, header))
-            if number > 1:
+            if number == 1:
+                records = Records(self._path, text)  # older files have no checksum in it
+            else:
                 records.append(self._end)
             self._end += len(text)
         if self._end != self._file.seek(0, os.SEEK_END):
@@ -244,6 +252,11 @@ def _parsed(path: Path, text: bytes, where: str = "") -> dict[str, Any]:
     if not isinstance(value, dict):
         raise OutputError(f"'{path}'{where} is damaged; remove the file to begin again")
     return value
+
+
+def _line(value: Mapping[str, Any]) -> bytes:
+    """With its checksum."""
+    return _text({**value, _SUM: _sum(value)}).encode() + b"\n"
 
 
 def _text(value: Mapping[str, Any]) -> str:
