@@ -28,7 +28,7 @@ class InForce:
     numbers: Mapping[str, float]  # of all live settings at the start, by path
     # (first cycle, places in the memory, values) of every change, in the order of time
     patches: Sequence[tuple[int, np.ndarray, np.ndarray]]
-    # what was in force when, as plain data: [time in s, {path: number}],
+    # what was in force when, as plain data: pairs of a time in s and {path: number}
     record: Sequence[tuple[float, Mapping[str, float]]]
     later: Sequence[tuple[int, Problem]] = ()  # (first cycle, problem) of every change, for the tables of the run
 
