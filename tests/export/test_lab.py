@@ -19,6 +19,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.contraction.spectrum import factors_along, response_jacobians
+from fpirhc.controllers.contract import Controller
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.export.lab import lab as module
 from fpirhc.export.lab.lab import Lab, make_lab, page
@@ -190,6 +191,21 @@ def test_a_slider_stays_inside_the_bounds_of_its_setting(short):
                 low, high = live.bounds(slider.path)
                 assert low - 1e-6 * abs(low) <= slider.low
                 assert slider.high <= high + 1e-6 * abs(high)
+
+
+def test_a_slider_of_two_loops_with_other_numbers_is_accepted_by_both(monkeypatch):
+    """The first one may go to -3.36 and would be shown to -3.6; the second one, which begins at -0.1, ends at -2.67."""
+    monkeypatch.setattr(module, "package", lambda *_: None)
+    task, law = fp.load_problem("two_mass"), fp.Exponential(rate=6.0)
+    maps = {"steep": fp.Sigmoid(gain=-0.9, shift=0.3, scale=50.0), "slow": fp.Affine(gain=-0.1)}
+    controllers: dict[str, Controller] = {name: fp.ComputedTorque(law, one) for name, one in maps.items()}
+    problem = replace(task.problem, duration=0.3, measure_from=0.0)
+    lab = make_lab("pair", "", "two_mass", problem, controllers, live=["deformation.gain"])
+    [slider] = [s for s in lab.sliders if s.path == "deformation.gain"]
+    assert slider.low == pytest.approx(-8 / 3, rel=1e-5)
+    for loop in lab.loops:
+        for end in (slider.low, slider.high):
+            loop.ready.live.changed({slider.path: end})  # is not refused
 
 
 def test_what_has_no_lab(monkeypatch):

@@ -279,11 +279,12 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
         having = [loop for loop in loops if path in loop.ready.live.paths]
         value = having[0].ready.live.start[path]
         size = max(abs(value), 1e-3)
-        reach = max(_SPAN + 1, _WAIT * having[0].ready.problem.period / size)  # farther no slider goes
-        low, high = (
-            max(ends) if which == 0 else min(ends)
-            for which, ends in enumerate(zip(*(loop.ready.live.bounds(path, reach) for loop in having), strict=True))
-        )
+        farthest = max(_SPAN * size, _WAIT * having[0].ready.problem.period)  # no slider goes beyond
+        bounds = []
+        for live in (loop.ready.live for loop in having):
+            own = abs(live.start[path])  # a loop may begin with another number
+            bounds.append(live.bounds(path, (farthest + own) / max(own, 1e-3)))
+        low, high = max(low for low, _ in bounds), min(high for _, high in bounds)
         low, high = (
             max(low, value / _SPAN if low > 0 else min(value / _SPAN, value * _SPAN, value - size)),
             min(high, max(value / _SPAN, value * _SPAN))
