@@ -360,7 +360,11 @@ class Parametric(Protocol):
 
 
 def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, float]]:
-    """Return the least and the largest value of every exact parameter. `mismatch`: percent."""
+    """Return the least and the largest value of every exact parameter, |p - p_exact| <= P/100 |p_exact| for P percent, P < 100.
+
+    p_exact is the value in the problem file: a parameter keeps its sign, and zero stays zero. One with a `spread` lies in P/100 of
+    that spread; where all parameters have one, P may be 100 and more.
+    """
     check_mismatch(plant, mismatch)
     ranges = {name: _range(parameter, mismatch) for name, parameter in plant.parameters.items()}
     mistakes = Mistakes("mismatch")

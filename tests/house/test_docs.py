@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import runpy
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ from fpirhc.members import FAMILIES, member_classes
 from fpirhc.simulation.loop import close_loop
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
+PACKAGE = Path(fp.__file__).parent
 NEEDED = {  # page -> packages of an extra
     "simulators": ("tclab", "gymnasium"),
     "outside-car": ("vehiclemodels",),
@@ -171,6 +173,28 @@ def test_problem_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     Path("pendulum.py").write_text(code)
     assert main(["compare", "pendulum.py"]) == 0
     assert "RHC+FPI lowers the rms error of angle" in capsys.readouterr().out.replace("\n", " ")
+
+
+# Pages of theory name modules that are there
+
+
+def is_there(name: str) -> bool:
+    """Whether a dotted name is that of a module of the package, or of something in one."""
+    if (PACKAGE / name.replace(".", "/")).with_suffix(".py").is_file():
+        return True
+    module, _, last = name.rpartition(".")
+    file = (PACKAGE / module.replace(".", "/")).with_suffix(".py")
+    return file.is_file() and hasattr(import_module(f"fpirhc.{module}"), last)
+
+
+def test_modules_that_pages_of_theory_name_are_there():
+    """In headings, and wherever a dotted name begins with a package: small modules become part of their neighbours at times."""
+    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    texts = {page.stem: page.read_text(encoding="utf-8") for page in DOCS.glob("theory-*.md")}
+    named = [(page, n) for page, text in texts.items() for n in re.findall(r"`(?:fpirhc\.)?([a-z_]+(?:\.\w+)+)`", text)]
+    named = [(page, n) for page, n in named if n.split(".")[0] in packages and not n.endswith((".c", ".js", ".py"))]
+    assert len(named) > 80
+    assert [one for one in named if not is_there(one[1])] == []
 
 
 # The page of all problems is the one that its command writes from baselines and tables
