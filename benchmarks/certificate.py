@@ -21,7 +21,7 @@ from table import write_table
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.plant.plant import exact_ranges
-from fpirhc.review.prediction import exactly
+from fpirhc.simulation.model_as_plant import exactly
 from fpirhc.simulation.simulate import simulator
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "certificate.md"

@@ -12,7 +12,7 @@ variance 0.610, 0.565, 0.597, 0.265, 0.346 and 0.209, and a clearance between co
 
 Their drug moves slower than the pump believes, and their curves spread twice as far as those of the measured people.
 
-The paper is not at hand; these are the numbers of transcriptions. A first version had the two steepnesses exchanged. The rows
+The numbers are those of transcriptions, not of the paper itself. A first version had the two steepnesses exchanged. The rows
 "tuned here" are no blind test: of some dozens of PID laws and of cascades in a loop of numpy, they kept most of the first fifty in
 the range, each with the model's curve as it is.
 
