@@ -65,9 +65,9 @@ class Optimum:
 
     def __call__(self, time: float, state: np.ndarray) -> np.ndarray:
         """Return the first inputs of the plan of this cycle."""
-        found = self._solver(x0=self._last, p=np.r_[state, time], **self._bounds)
+        solution = self._solver(x0=self._last, p=np.r_[state, time], **self._bounds)
         assert self._solver.stats()["success"]
-        self._last = np.asarray(found["x"]).ravel()
+        self._last = np.asarray(solution["x"]).ravel()
         return self._last[:2]
 
 

@@ -56,7 +56,16 @@ _LARGEST = 20_000_000  # bytes; a baseline has some tens of thousands
 
 
 def read_baseline(path: Path, metrics: Sequence[run_metrics.Metric] | None = None) -> Baseline:
-    """Return the baseline in a file."""
+    """Return the baseline in a file.
+
+    Args:
+        path: path of the file.
+        metrics: metrics of the problem's runs; None: names are not checked.
+
+    Raises:
+        BaselineError: the file is missing, damaged, edited by hand, of a newer format, of another problem, or compares
+            nothing.
+    """
     try:
         if path.stat().st_size > _LARGEST:
             raise BaselineError(f"'{path.name}' is larger than {_LARGEST / 1e6:.0f} MB and no baseline; {_ACCEPT}")
@@ -393,6 +402,11 @@ def accept(
         baselines: folder of the baselines; None: the one beside the problem file.
         working: a folder of the project, outside of which nothing is written; None: the current folder.
         progress: function of (problem, runs done, runs in all) that is called after every run.
+
+    Raises:
+        InvalidValue: no reason, or too few seeds.
+        BaselineError: the baseline would compare nothing.
+        OutputError: the file cannot be written, or lies outside of the project.
     """
     require_reason(reason)
     if seeds < 2 or seed < 0:

@@ -282,6 +282,9 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
     """Return a composed step as one block.
 
     `feeds`: name of a signal that the step reads -> the signal that it is given instead.
+
+    Args:
+        feeds: name of a signal that the step reads -> the signal that it is given instead.
     """
     reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
 

@@ -77,6 +77,9 @@ def identify(
         measured: f, shape (cycles, n).
         modelled: m of the same cycles, shape (cycles, n).
         usable: which cycles count; None: all.
+
+    Raises:
+        InvalidValue: fewer than 40 cycles, or a model response that does not move.
     """
     cycles = len(measured)
     if cycles < LEAST_CYCLES:

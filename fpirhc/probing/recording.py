@@ -158,6 +158,13 @@ def read_recording(path: Path, problem: Problem) -> Record:
     Its columns are "time", every input by name (the command that is sent at this time;
     "input NAME" where a coordinate has the same name), the elements of the model's state, and the
     responses ("q1''"); a response without a column is the difference of its lower derivative over a cycle.
+
+    Args:
+        path: of the file.
+        problem: whose model and period it is of.
+
+    Raises:
+        InvalidValue: missing columns, other times than those of the period, entries that are no numbers; all mistakes together.
     """
     columns = columns_of(path)
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
@@ -272,6 +279,15 @@ def replay(problem: Problem, controller: Controller, recording: Path) -> Replay:
     Columns of the CSV file are "time", what the problem's controller is given ("q1", "q1'", "q1''", or what its sensors show), and
     the inputs that were sent, where they are known. A response ("q1''") without a column is the difference of its lower
     derivative. An empty entry is a sample that was lost: the cycle is skipped, as it would have been.
+
+    Args:
+        problem: the task.
+        controller: any controller.
+        recording: path of the file.
+
+    Raises:
+        InvalidValue: a file that is no table of numbers.
+        InvalidProblem: missing columns, or times that are not a period apart; all together.
     """
     columns = columns_of(recording)
     stepper = Stepper(problem, controller, compiled=False)

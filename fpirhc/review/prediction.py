@@ -96,6 +96,11 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
 
     Where states move by themselves, or outputs are controlled, the plant runs under the controller that knows it: a wrong model
     has them elsewhere. Else a right model moves alike, whichever it is, and the model runs as its own plant.
+
+    Raises:
+        NotSupported: a reality, dead time, estimated responses, a controller that does not track or plan with one model.
+        NoAnswer: a run that ends early.
+        FpirhcError: every error that the controller raises about the problem.
     """
 
     def run(own: Plant) -> Run:

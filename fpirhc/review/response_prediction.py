@@ -172,6 +172,16 @@ def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.nda
     """Return the bound of |y_k - y^_k| (cycles + 1, ny) that the response errors allow, with y^_k the outputs of the nominal run.
 
     `exact`: exact parameters, shape (np,); None: the plant's.
+
+    Args:
+        nominal: the nominal run.
+        errors: the response errors that the deformation leaves.
+        gain: effective gain of the deformation.
+        exact: exact parameters, shape (np,); None: the plant's.
+
+    Raises:
+        NotSupported: coordinates or outputs that are not controlled, no linear loop, one that does not converge even with the
+            right model.
     """
     plant = nominal.plant
     free = [n for n in plant.chains if not plant.response_orders.get(n)]

@@ -332,6 +332,10 @@ def unobservable(slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> n
     """Return an orthonormal basis of the errors that never show, shape (nx, number).
 
     `slopes`: A_i, each (nx, nx), in states of size one. `shown`: C_i, each (number, nx), in states of size one.
+
+    Args:
+        slopes: A_i, each (nx, nx), in states of size one.
+        shown: C_i, each (number, nx), in states of size one.
     """
     basis = _kernel(np.vstack([_rows_of_size_one(c) for c in shown]))
     motions = [a / max(np.abs(a).max(), np.finfo(float).tiny) for a in slopes]

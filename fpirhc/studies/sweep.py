@@ -145,7 +145,11 @@ class Sweep(Study):
         )
 
     def of(self, controller: str) -> SweepMap:
-        """Return the map of a controller."""
+        """Return the map of a controller.
+
+        Raises:
+            InvalidName: there is none.
+        """
         result = {one.controller: one for one in self.maps}
         if controller not in result:
             raise InvalidName(f"no map of '{controller}'.{nearest(controller, result)}")
@@ -219,6 +223,12 @@ def sweep(
         controllers: names of controllers; None: all.
         metric: figure of merit, such as 'settling.q1'; None: the problem's headline metric, or the relative error.
         progress: function of (controller, cells done, cells in all).
+
+    Raises:
+        InvalidName: a path that leads nowhere; an unknown metric.
+        InvalidProblem: unknown controllers, gains of the wrong sign.
+        InvalidValue: no setting or more than two, a value that the problem does not accept, a metric without better direction.
+        OutputError: the folder cannot be written, or holds results under other conditions.
     """
     begin = time.perf_counter()
     chosen = select(task, controllers)

@@ -254,6 +254,10 @@ def compose(
     Args:
         name: of the composite and of its Function.
         outputs: names of traced signals that the Function returns once more by themselves, after (memory, trace).
+
+    Raises:
+        InvalidName: a block reads a signal that no earlier block writes, or two blocks write the same signal.
+        InvalidShape: a reader and a writer disagree on a size.
     """
     memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}

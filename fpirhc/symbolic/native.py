@@ -79,6 +79,9 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
     Args:
         required: whether a failure of the compiler is an error; without a compiler `function` is returned as it is all the same.
         calls: number of calls in a row that the compiled Function makes, see `program.chained`; 0: it is `function` itself.
+
+    Raises:
+        CompileError: `required`, and the compiler failed.
     """
     if function.is_a("External"):
         return Native(function, True, "")

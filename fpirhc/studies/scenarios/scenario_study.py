@@ -277,6 +277,13 @@ def merge_shards(folders: Sequence[Path], out: Path) -> Joined:
     """Join the results of several folders; what stands in two of them is kept once.
 
     `out`: folder of the whole; it may hold some results already.
+
+    Args:
+        folders: of parts of one comparison of scenarios.
+        out: folder of the whole; it may hold some results already.
+
+    Raises:
+        OutputError: a folder without results, results under other conditions, or one result that differs between two folders.
     """
     header = header_of(folders[0] / LEDGER)
     with Ledger(out / LEDGER, header, RecordFields) as whole:
