@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from fpirhc.baselines.measuring import FINISHED, NOMINAL, Measurement, Number, Variant, metric_of
@@ -37,8 +37,6 @@ class Baseline:
     varied: Mapping[str, Sequence[str]]  # variants in words, by source
     settings: Settings  # settings of the problem and its controllers
     controllers: Mapping[str, Expected]  # expectations by controller
-    # new names by old names of the file; a file that is written has no old names
-    renamed: Mapping[str, str] = field(default_factory=dict)
 
 
 def to_text(baseline: Baseline) -> str:

@@ -106,7 +106,7 @@ def judge(
     for name in names:
         rows += _rows(name, baseline.controllers.get(name), fresh.get(name), metrics)
     causes = _stale(baseline, settings, list(fresh))
-    notes = [f"{name}: {one.why}" for name, one in fresh.items() if one.why] + _old_names(baseline)
+    notes = [f"{name}: {one.why}" for name, one in fresh.items() if one.why]
     return Judgement(
         baseline.problem,
         tuple(rows),
@@ -116,13 +116,6 @@ def judge(
         notes=tuple(notes),
         causes=causes,
     )
-
-
-def _old_names(baseline: Baseline) -> list[str]:
-    if not baseline.renamed:
-        return []
-    names = ", ".join(f"'{old}' is now '{new}'" for old, new in sorted(baseline.renamed.items()))
-    return [f"the baseline has names of an older version and is read with those of today: {names}"]
 
 
 def ignoring(judgement: Judgement, share: float) -> Judgement:

@@ -26,7 +26,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options."""
     group = parser.getgroup("fpirhc", "baselines of control problems")
     group.addoption("--fpirhc-accept", metavar="REASON", help="measure anew and write baselines, for this reason")
-    group.addoption("--fpirhc-bless", metavar="REASON", help="earlier name of --fpirhc-accept, for one version")
     group.addoption("--fpirhc-no-compile", action="store_true", help="run loops in CasADi's virtual machine")
 
 
@@ -34,11 +33,6 @@ def pytest_configure(config: pytest.Config) -> None:
     """Refuse an empty reason before any test runs."""
     config.stash[_measured] = []
     config.stash[_messages] = []
-    if config.option.fpirhc_bless is not None:
-        config.stash[_messages].append(
-            "the option --fpirhc-bless is now --fpirhc-accept; the next version removes the old name"
-        )
-        config.option.fpirhc_accept = config.option.fpirhc_bless
     reason = config.getoption("--fpirhc-accept")
     if reason is not None and not reason.strip():
         raise pytest.UsageError("--fpirhc-accept needs a reason: say why the new numbers are right")

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 
 from fpirhc.cli.output import closed_by_reader, crash, interrupted, of_a_problem_file, silence_output
-from fpirhc.cli.verb import DEBUG, GROUPS, ExitCode, Known, Parser, aligned, former_names, known, shipped, table
+from fpirhc.cli.verb import DEBUG, GROUPS, ExitCode, Known, Parser, aligned, known, shipped, table
 from fpirhc.summary import printable
 
 
@@ -57,10 +57,6 @@ def _run(words: list[str]) -> ExitCode:
     name, *rest = words
     if name == "help":  # as git, pip and cargo have it
         return _run([*rest[:1], "--help"])
-    if name in former_names():
-        new = former_names()[name]
-        print(f"fpirhc: the command '{name}' is now '{new}'; the next version removes the old name", file=sys.stderr)
-        name = new
     if name not in verbs:
         from fpirhc.errors import InvalidName, nearest
 

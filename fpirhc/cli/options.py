@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
 
@@ -117,9 +115,8 @@ def _number(text: str, digits: str, fits: Callable[[float], bool], expected: str
 
 
 def add_scenarios(parser: Parser, default: int | None, text: str) -> None:
-    """--scenarios N, formerly --seeds."""
+    """--scenarios N."""
     parser.add_argument("--scenarios", type=whole(1), default=default, metavar="N", help=text)
-    parser.add_argument("--seeds", action=Former, type=whole(1), dest="scenarios", new="--scenarios")
 
 
 def add_cases(parser: Parser, text: str) -> None:
@@ -168,26 +165,6 @@ def add_format(parser: Parser, table: str, default: str | None) -> None:
     """--format csv or parquet."""
     text = f"kind of the file with {table} (default: {default or 'no such file'}); parquet needs pyarrow"
     parser.add_argument("--format", choices=("csv", "parquet"), default=default, help=text)
-
-
-class Former(argparse.Action):
-    """An option under its earlier name: accepted for one version with a notice, and not shown in help."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, new: str, **settings: Any) -> None:
-        super().__init__(option_strings, dest, default=argparse.SUPPRESS, help=argparse.SUPPRESS, **settings)
-        self.new = new
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,  # noqa: ARG002 -- argparse gives it to every action
-        namespace: argparse.Namespace,
-        values: Any,
-        option: str | None = None,
-    ) -> None:
-        """Store the value as the new option does."""
-        notice = f"fpirhc: the option {option} is now {self.new}; the next version removes the old name"
-        print(notice, file=sys.stderr)
-        setattr(namespace, self.dest, values)
 
 
 class _Optimisers(argparse._StoreAction):

@@ -31,7 +31,6 @@ class Verb:
         codes: exit codes that this command returns, with their meanings; those of `OF_EVERY_VERB` are added.
         examples: pairs of a command line and a remark; the first one also stands in `fpirhc --help`.
         notes: paragraphs below the examples.
-        former: earlier names, accepted for one version with a notice.
         group: heading under which it stands in `fpirhc --help`, a key of `GROUPS`.
     """
 
@@ -42,7 +41,6 @@ class Verb:
     examples: tuple[tuple[str, str], ...]
     codes: Mapping[ExitCode, str] = field(default_factory=dict)
     notes: str = ""
-    former: tuple[str, ...] = ()
     group: str = "tools"
 
     @property
@@ -238,11 +236,6 @@ def known() -> dict[str, Known]:
             continue
         verbs[point.name] = Known(point.name, f"(of the package {_origin(point)})", "tools", partial(_loaded, point))
     return verbs
-
-
-def former_names() -> dict[str, str]:
-    """Return the present name of every command by its earlier names."""
-    return {old: verb.name for verb in shipped().values() for old in verb.former}
 
 
 def _itself(verb: Verb) -> Verb:

@@ -19,7 +19,7 @@ import numpy as np
 from fpirhc.controllers.reference_states import request_along_reference, request_of_plans
 from fpirhc.deformation.base import Deformation, Identity, automatic, with_inner
 from fpirhc.errors import NotSupported
-from fpirhc.fields.checked import Checked, former_members, replaced, unnamed_inner
+from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import measured_signals, rateless
@@ -35,25 +35,6 @@ from fpirhc.tracking.base import Tracking
 if TYPE_CHECKING:
     from fpirhc.optimisers.base import Optimiser
 
-FORMER = {  # members of earlier versions
-    "around": "hold the inner controller in a field",
-    "check_numbers": "write `check`",
-    "deforms_response": 'write `deforms`: "response", "command" or "target"',
-    "deforms_target": 'write `deforms`: "response", "command" or "target"',
-    "demand": "write `with_defaults`, which returns the controller with its automatic settings chosen",
-    "following_its_model": "have a field `follows_model`",
-    "knows_exact": "write `plant_model`: PlantModel(..., exact=True)",
-    "law": "have a field `tracking`",
-    "linear_around": "leave it out",
-    "model_acts_at_once": "write `planner`: Planner(..., follows_model=True)",
-    "model_plant": "write `plant_model`: PlantModel(plant, signals)",
-    "parameters": "write `plant_model`: PlantModel(plant, signals, given=...)",
-    "stated": "write `with_defaults`, which returns the controller with its automatic settings chosen",
-    "told": "write `plant_model`: PlantModel(plant, signals)",
-    "unadapted": "write `with_deformation`",
-    "with_margins": "have a field `margins`",
-    "with_optimiser": "have a field `optimiser`",
-}
 Deforms = Literal["response", "command", "target"]
 
 
@@ -180,7 +161,6 @@ class Controller(Checked, ABC):
             yield f"{name}: `inner` is the controller that it wraps, or None, got {described(inner)}"
             return
         yield from unnamed_inner(self, Controller)
-        yield from former_members(self, FORMER)
         if not isinstance(getattr(self, "deformation", None), Deformation):
             yield (
                 f"{name} has no `deformation`, which its contract Controller asks for: the map in use. Add the field "

@@ -17,21 +17,11 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
-from fpirhc.fields.checked import Checked, former_members, replaced, unnamed_inner
+from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout
 
-FORMER = {  # members of earlier versions
-    "around": "hold the inner map in a field",
-    "automatic": 'mark the field with the metadata {"automatic": True}',
-    **dict.fromkeys(
-        ("channels", "constant", "error_pole", "leak", "limited", "pairing", "reach", "slows_desired"),
-        "write `iteration`, a value of the class Iteration with all of these",
-    ),
-    "settled": "leave it out",
-    "suited": "write `with_scale_for`, with the same argument",
-}
 Wrapping = TypeVar("Wrapping")
 
 
@@ -199,7 +189,6 @@ class Deformation(Checked, ABC):
             yield f"{type(self).__name__}: `inner` is the map that it is around, or None, got {described(self.inner)}"
         else:
             yield from unnamed_inner(self, Deformation)
-        yield from former_members(self, FORMER)
 
     @property
     def adapts(self) -> bool:

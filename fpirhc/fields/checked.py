@@ -118,14 +118,6 @@ def unnamed_inner(value: object, contract: type) -> Iterator[str]:
             )
 
 
-def former_members(value: object, former: Mapping[str, str]) -> Iterator[str]:
-    """Yield a mistake for every member of an earlier contract that the class of a value still writes: nobody would ask it."""
-    for base in type(value).__mro__:
-        for name, instead in former.items():
-            if name in vars(base) and name not in getattr(base, "__dataclass_fields__", {}):
-                yield f"{base.__name__} writes `{name}`, which its contract does not ask for any more; {instead}"
-
-
 def _abstract(cls: type) -> tuple[str, ...]:
     """Why an abstract class has no values: it is a contract, or lacks methods of one."""
     missing = sorted(getattr(cls, "__abstractmethods__", ()))

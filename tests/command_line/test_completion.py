@@ -49,10 +49,9 @@ def test_commands_are_completed(bash):
 
 
 def test_options_are_completed(bash):
-    """Those of the command, also of two words; former names are not offered."""
+    """Those of the command, also of two words."""
     assert "--ignore-below" in bash("fpirhc check --i")
     assert "--no-compile" in bash("fpirhc run --no")
-    assert "--seeds" not in bash("fpirhc compare --se")
 
 
 def test_problems_are_completed(bash):

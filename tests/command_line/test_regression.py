@@ -467,10 +467,9 @@ def test_pytest_plugin(pytester, blessed):
     assert read_baseline(file) == second
 
 
-@pytest.mark.parametrize("option", ["--fpirhc-accept", "--fpirhc-bless"])
-def test_pytest_plugin_wants_a_reason(option, pytester):
-    """An empty one is refused before anything runs, under the earlier name too."""
+def test_pytest_plugin_wants_a_reason(pytester):
+    """An empty one is refused before anything runs."""
     pytester.makepyfile(test_line=TEST)
-    result = pytester.runpytest_inprocess(option, " ")
+    result = pytester.runpytest_inprocess("--fpirhc-accept", " ")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*needs a reason*"])

@@ -447,28 +447,6 @@ def test_a_reader_that_closes_the_output_ends_it_in_silence():
         assert process.wait() == ExitCode.OUTPUT_CLOSED
 
 
-# --- Earlier names ----------------------------------------------------------------------------------------------------
-
-
-def test_bless_is_accept_for_one_version(folder, capsys):
-    """The command does the same under the earlier name, and says the new one; the function names it."""
-    assert main(["bless", "line.py", "--reason", " "]) == ExitCode.BAD_INPUT
-    printed = capsys.readouterr().err
-    assert "the command 'bless' is now 'accept'" in printed
-    assert "needs a reason" in printed
-    with pytest.raises(fp.FpirhcError, match=r"fpirhc\.bless is called fpirhc\.baselines\.check\.accept now"):
-        getattr(fp, "bless")  # noqa: B009 -- a type checker knows that it is gone
-
-
-@pytest.mark.parametrize("name", ["compare", "tune"])
-def test_seeds_is_scenarios_for_one_version(name, capsys):
-    """The same value under the earlier option, with a notice; the seed is still another option."""
-    options = shipped()[name].parser().parse_args(["two_mass", "--seeds", "7", "--seed", "3"])
-    assert (options.scenarios, options.seed) == (7, 3)
-    assert "the option --seeds is now --scenarios" in capsys.readouterr().err
-    assert "--seeds" not in help_of(name, capsys)
-
-
 # --- probe ------------------------------------------------------------------------------------------------------------
 
 

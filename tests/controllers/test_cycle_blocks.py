@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -25,7 +24,6 @@ from fpirhc.controllers.base import (
 )
 from fpirhc.controllers.check import check_form, checked
 from fpirhc.controllers.contract import (
-    FORMER,
     Planner,
     PlantModel,
     Response,
@@ -45,7 +43,7 @@ from fpirhc.controllers.reference_states import (
 )
 from fpirhc.controllers.sensing_chain import compose_controller, controller_reads, embedded
 from fpirhc.deformation.base import Deformation, with_inner
-from fpirhc.errors import InvalidField, InvalidValue, NotContractive, NotSupported
+from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, compose
 from fpirhc.symbolic.layout import Layout, scalar
@@ -286,21 +284,6 @@ class Planning(Telling):
     """A controller with an optimiser in a field."""
 
     optimiser: Any = "one"
-
-
-def test_a_member_of_an_earlier_contract_is_refused():
-    """Nobody would ask it, so a cheat would not be told, and a wish not be heard."""
-    for name, instead in FORMER.items():
-        former = type("Former", (Telling,), {name: property(lambda self: None)})
-        with pytest.raises(
-            InvalidField, match=re.escape(f"Former writes `{name}`, which its contract does not ask for")
-        ):
-            former()
-        assert instead
-    field_of_that_name: Any = dataclass(frozen=True)(
-        type("Mine", (Telling,), {"__annotations__": {"law": Any}, "law": None, "__module__": __name__})
-    )
-    assert field_of_that_name().law is None
 
 
 def test_a_wrapper_tells_the_facts_of_what_it_wraps():

@@ -57,5 +57,4 @@ VERB = Verb(
 The controllers run with other seeds where there is noise, in other ways of computing, and with start and parameters
 changed by rounding errors; the band of each metric comes from its spread. Commit baselines/NAME.json with the change.
 """,
-    former=("bless",),
 )
