@@ -101,9 +101,7 @@ class HoldPlan(OnFailure):
 class Feedforward(OnFailure):
     """Apply the input that the model needs along the reference, without feedback from the plan."""
 
-    @property
-    def uses_feedforward(self) -> bool:
-        return True
+    uses_feedforward = True
 
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
@@ -115,9 +113,7 @@ class Feedforward(OnFailure):
 class StopRun(OnFailure):
     """Stop: the planned input becomes NaN, which holds the last command and ends the run with this status."""
 
-    @property
-    def stops(self) -> bool:
-        return True
+    stops = True
 
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression

@@ -70,13 +70,9 @@ class FromMeasurement(Replanning):
 
     consistent: bool | None = field(default=None, kw_only=True, metadata={"setting": False})
 
-    @property
-    def restarts(self) -> bool:
-        return True
+    restarts = True
 
-    @property
-    def law(self) -> None:
-        return
+    law = None
 
     def parts(self, problem: Problem) -> Parts:
         plant = problem.plant
@@ -102,9 +98,7 @@ class FromMeasurementTracked(Replanning):
 
     tracking: Tracking
 
-    @property
-    def restarts(self) -> bool:
-        return True
+    restarts = True
 
     @property
     def law(self) -> Tracking:
@@ -134,9 +128,7 @@ class FromPlan(Replanning):
         default=None, kw_only=True, hash=False, metadata={"setting": "where given"}
     )
 
-    @property
-    def restarts(self) -> bool:
-        return False
+    restarts = False
 
     @property
     def law(self) -> Tracking:

@@ -412,9 +412,7 @@ class Identity(Deformation):
     It is the only map that does not iterate: its gains are zero, and it corrects no response error.
     """
 
-    @property
-    def adapts(self) -> bool:
-        return False
+    adapts = False
 
     @property
     def iteration(self) -> Iteration:

@@ -367,10 +367,7 @@ class ExactHessian(HessianModel):
     It sees the curvature that the dynamics give to a cost that has none of its own, such as a production rate.
     """
 
-    @property
-    def needs_convex_cost(self) -> bool:
-        """Whether the model needs a convex cost: it does not, because it is the curvature of the whole problem."""
-        return False
+    needs_convex_cost = False
 
     def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:
         """Return l + lambda' F."""

@@ -61,9 +61,7 @@ class FixedPoint(Optimiser):
     most_iterations: Count = 100
     second_start: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
-    @property
-    def in_data(self) -> tuple[str, ...]:
-        return "tolerance", "damping", "map"
+    in_data = "tolerance", "damping", "map"
 
     @property
     def near_plan(self) -> Optimiser:

@@ -56,9 +56,7 @@ class MultipleShooting(Optimiser):
     def options(self, ocp: OptimalControl) -> Options:
         """CasADi's options of the solver."""
 
-    @property
-    def exportable(self) -> bool:
-        return False
+    exportable = False
 
     def memory(self, ocp: OptimalControl) -> Layout:
         variables, constraints = sizes(ocp)
@@ -241,9 +239,7 @@ class Ipopt(MultipleShooting):
     def unbounded(self) -> str:
         return "" if self.time_limit else "IPOPT has no time limit here: give Ipopt(time_limit=...), in s"
 
-    @property
-    def plugin(self) -> str:
-        return "ipopt"
+    plugin = "ipopt"
 
     def options(self, ocp: OptimalControl) -> Options:  # noqa: ARG002
         return {
@@ -273,16 +269,12 @@ class Fatrop(MultipleShooting):
     accuracy: Accuracy = 1e-8
     iterations: Count = 200
 
-    @property
-    def unbounded(self) -> str:
-        return (
-            "fatrop has no time limit, and after an outlier its call may never return: use FixedPoint(), "
-            "or Ipopt(time_limit=...)"
-        )
+    unbounded = (
+        "fatrop has no time limit, and after an outlier its call may never return: use FixedPoint(), "
+        "or Ipopt(time_limit=...)"
+    )
 
-    @property
-    def plugin(self) -> str:
-        return "fatrop"
+    plugin = "fatrop"
 
     def options(self, ocp: OptimalControl) -> Options:
         return {
@@ -322,9 +314,7 @@ class Qrqp(QuadraticSolver):
 
     iterations: Count = 200
 
-    @property
-    def plugin(self) -> str:
-        return "qrqp"
+    plugin = "qrqp"
 
     def options(self) -> Options:
         quiet = {"print_iter": False, "print_header": False, "print_info": False, "print_lincomb": False}
@@ -343,9 +333,7 @@ class Osqp(QuadraticSolver):
     accuracy: Accuracy = 1e-8
     iterations: Count = 20000
 
-    @property
-    def plugin(self) -> str:
-        return "osqp"
+    plugin = "osqp"
 
     def options(self) -> Options:
         inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": self.iterations}
@@ -379,9 +367,7 @@ class SequentialQuadratic(MultipleShooting):
     def unbounded(self) -> str:
         return self.quadratic.unbounded
 
-    @property
-    def plugin(self) -> str:
-        return "sqpmethod"
+    plugin = "sqpmethod"
 
     def options(self, ocp: OptimalControl) -> Options:
         return {

@@ -139,9 +139,7 @@ class Cvodes(Integrator):
 
     tolerance: Accuracy = 1e-10
 
-    @property
-    def opaque(self) -> bool:
-        return True
+    opaque = True
 
     def finer(self, times: int) -> Cvodes:  # noqa: ARG002
         return Cvodes(self.tolerance / 10)
@@ -167,9 +165,7 @@ class MapSteps(Integrator):
     `Problem` and `Horizon` have it for a map by themselves.
     """
 
-    @property
-    def steps_maps(self) -> bool:
-        return True
+    steps_maps = True
 
     def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:
         """Function (state, input, parameters, length) -> state after a whole number of steps, up to the longest."""

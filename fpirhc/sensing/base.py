@@ -167,9 +167,7 @@ class OfPositions(DerivativeEstimator, ABC):
 class Measured(AtOnce):
     """State and response as the sensors show them, without delay."""
 
-    @property
-    def measures_all(self) -> bool:
-        return True
+    measures_all = True
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         return tuple(dict.fromkeys(plant.output.elements + response_names(plant)))
@@ -188,9 +186,7 @@ class Measured(AtOnce):
 
         return Block("estimate", Layout((seen,)), Layout((plant.output, realised)), step)
 
-    @property
-    def shows_response(self) -> bool:
-        return True
+    shows_response = True
 
 
 EXAMPLES = (Measured(),)

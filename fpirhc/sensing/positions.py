@@ -145,9 +145,7 @@ class StepDifference(PositionDifference):
     those of s cycles ago; `fpirhc.controllers.sensing_chain` brings them to this cycle by the model.
     """
 
-    @property
-    def of_steps(self) -> bool:
-        return True
+    of_steps = True
 
     def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
         """State elements that are measured: the differences are those of earlier cycles."""

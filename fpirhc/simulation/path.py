@@ -206,13 +206,9 @@ class Equations(Mover):
     def states(self) -> tuple[str, ...]:
         return self.problem.truth.shown(self.problem.plant.state.elements)
 
-    @property
-    def shows_truth(self) -> bool:
-        return True
+    shows_truth = True
 
-    @property
-    def reads(self) -> tuple[Signal, ...]:
-        return ()
+    reads = ()
 
     @property
     def delays(self) -> list[Delay]:

@@ -134,10 +134,7 @@ class Operation(Node):
         """Itself."""
         return [self]
 
-    @property
-    def regions(self) -> tuple[Region, ...]:
-        """None."""
-        return ()
+    regions = ()
 
     @property
     def reads(self) -> Iterator[Value]:

@@ -239,10 +239,7 @@ class Samples(Checked):
         if not (np.isfinite(times).all() and np.isfinite(values).all()) or np.any(np.diff(times) <= 0):
             raise InvalidValue("Samples: times and values must be finite, and the times must increase")
 
-    @property
-    def opaque(self) -> bool:
-        """Whether the values are looked up, which scalar expressions cannot: they are."""
-        return True
+    opaque = True
 
     @property
     def held(self) -> bool:

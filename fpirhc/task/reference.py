@@ -233,9 +233,7 @@ class Table(Reference):
             if not np.all(np.isfinite(column)):
                 raise InvalidValue(f"table '{name}' holds values that are not finite")
 
-    @property
-    def opaque(self) -> bool:
-        return True
+    opaque = True
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
         return {name: self._spline(name, np.asarray(v, dtype=float), t) for name, v in self.values.items()}

@@ -64,9 +64,7 @@ class AdaptiveInverseDynamics(Controller):
     combinations: Mapping[str, Combination] = field(default_factory=dict)
     deformation: Deformation = field(default_factory=Identity)
 
-    @property
-    def learns(self) -> bool:
-        return True
+    learns = True
 
     def check(self, problem: Problem) -> None:
         """Raise if plant, bounds or rule do not fit, as `Learning.check` does."""

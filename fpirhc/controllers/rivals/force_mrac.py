@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, law_blocks, like
-from fpirhc.controllers.contract import Deforms, PlantModel
+from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.reference_states import request_of_commands
 from fpirhc.deformation.base import Deformation, automatic
 from fpirhc.errors import Mistakes
@@ -48,9 +48,7 @@ class ForceMRAC(Controller):
     def plant_model(self, problem: Problem) -> PlantModel:
         return PlantModel(problem.plant, problem.signals, given=self.model)
 
-    @property
-    def deforms(self) -> Deforms:
-        return "command"
+    deforms = "command"
 
     def check(self, problem: Problem) -> None:
         """Raise if the reference model has parameters that the plant does not have, or values that are no numbers.

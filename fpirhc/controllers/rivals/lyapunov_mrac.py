@@ -41,9 +41,7 @@ class LyapunovMRAC(Undeformed):
     adaptation: Positive
     leakage: NotNegative = 0.0
 
-    @property
-    def learns(self) -> bool:
-        return True
+    learns = True
 
     def weights(self, order: int) -> np.ndarray:
         """Return P of the scaled error z for one coordinate, shape (order, order)."""

@@ -58,9 +58,7 @@ class SlotineLi(Controller):
     combinations: Mapping[str, Combination] = field(default_factory=dict)
     deformation: Deformation = field(default_factory=Identity)
 
-    @property
-    def learns(self) -> bool:
-        return True
+    learns = True
 
     def check(self, problem: Problem) -> None:
         self._learning.check(problem, inverts=self._deforms)

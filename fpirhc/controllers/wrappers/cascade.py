@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, like, reference_block
-from fpirhc.controllers.contract import Deforms, without_deformation
+from fpirhc.controllers.contract import without_deformation
 from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import Deformation, RequestChange, automatic
 from fpirhc.errors import InvalidValue, Mistakes, NotContractive, NotSupported
@@ -311,13 +311,9 @@ class Cascade(Controller):
     def inner_problem(self, problem: Problem) -> Problem:
         return replace(problem, reference=Shifted(problem.reference))
 
-    @property
-    def deforms(self) -> Deforms:
-        return "target"
+    deforms = "target"
 
-    @property
-    def planner(self) -> None:
-        """None: plans of the inner controller follow the target, and not the reference of the problem."""
+    planner = None  # plans of the inner controller follow the target, and not the reference of the problem
 
     def with_deformation(self, deformation: Deformation) -> Controller:  # type: ignore[override]
         return replace(self, deformation=deformation) if deformation.adapts else without_deformation(self.controller)

@@ -63,9 +63,7 @@ class Estimating(ControllerWrapper):
     def feeds(self) -> Mapping[str, str]:
         return {"parameters": _BELIEVED, **self.controller.feeds}
 
-    @property
-    def learns(self) -> bool:
-        return True
+    learns = True
 
     @property
     def planner(self) -> Planner | None:

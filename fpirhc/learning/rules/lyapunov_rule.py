@@ -26,9 +26,7 @@ class LyapunovRule(Rule):
 
     gains: Mapping[str, Positive]
 
-    @property
-    def reads_response(self) -> bool:
-        return False
+    reads_response = False
 
     def check(self, bounds: Bounds) -> None:
         """Raise if the names differ.

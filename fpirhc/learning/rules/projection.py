@@ -40,9 +40,7 @@ class Projection(Rule):
     gain: Annotated[float, _CONVERGENT]
     dead_zone: NotNegative = 0.0
 
-    @property
-    def reads_response(self) -> bool:
-        return True
+    reads_response = True
 
     def check(self, bounds: Bounds) -> None:
         """Raise if a bound is infinite.

@@ -118,10 +118,7 @@ class KalmanFilter(StateObserver):
         del known
         return unobservable(slopes, shown)
 
-    @property
-    def needs_detectability(self) -> bool:
-        """True: the covariance of an error that neither decays nor is observed would stay or grow for ever."""
-        return True
+    needs_detectability = True
 
     @property
     def _deviations(self) -> list[float]:

@@ -299,9 +299,7 @@ class MovingHorizonStates(StateObserver):
         del measured
         return tuple(self.measured)
 
-    @property
-    def opaque(self) -> bool:
-        return True
+    opaque = True
 
     def memory(self, model: Model) -> Layout:
         """States, noises and samples of the window, oldest first, and the arrival cost.
@@ -370,10 +368,7 @@ class MovingHorizonStates(StateObserver):
         del known
         return unobservable(slopes, shown)
 
-    @property
-    def needs_detectability(self) -> bool:
-        """True: the arrival cost of an error that neither decays nor is observed would stay or grow for ever."""
-        return True
+    needs_detectability = True
 
     def _smoother(self, model: Model) -> Smoother:
         interior = Interior(model.plant.state.elements, self.bounds, self.barrier)
