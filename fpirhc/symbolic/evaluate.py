@@ -7,6 +7,7 @@ array of shape (columns, rows), a column as (rows,). A Function must not run in 
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -155,8 +156,8 @@ def _dense(function: ca.Function) -> ca.Function:
 T = TypeVar("T")
 
 
-class Latest(Generic[T]):
-    """The latest results of a function of values.
+class Latest(threading.local, Generic[T]):
+    """The latest results of a function of values, of every thread its own: an evaluator among them has numbers of its last call.
 
     `most`: number of results that are kept, with their arguments; what is built of one problem follows each other, so a few do.
     """

@@ -23,7 +23,7 @@ from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression, graph, kind
 from fpirhc.symbolic.layout import Expression
 
-_LATEST: Latest[ca.Function | None] = Latest(8)
+_FILLED: Latest[ca.Function] = Latest(16)  # every run asks for those of the plant and of the model
 _REAL: Latest[Mapping[str, Exogenous]] = Latest(8)
 _HOLDS = ("zero", "linear")
 
@@ -110,8 +110,7 @@ def model_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function 
 
 def previewed_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with what the model is told of a later time; None where it is told nothing."""
-    ahead = {n: one for n, one in signals.items() if one.preview}
-    return _LATEST.of((plant, *ahead.values()), tuple(ahead), lambda: model_values(plant, ahead))
+    return model_values(plant, {n: one for n, one in signals.items() if one.preview})
 
 
 def known_places(plant: Plant, signals: Mapping[str, Exogenous]) -> tuple[int, ...]:
@@ -198,12 +197,16 @@ def _check_course(what: str, course: Course, times: np.ndarray, mistakes: Mistak
 
 
 def _filled(plant: Plant, courses: Mapping[str, Course]) -> ca.Function | None:
-    if not courses:
-        return None
+    elements = plant.parameter.elements
+    key = tuple(courses), elements
+    return _FILLED.of(tuple(courses.values()), key, lambda: _filling(elements, courses)) if courses else None
+
+
+def _filling(elements: Sequence[str], courses: Mapping[str, Course]) -> ca.Function:
     matrix = kind(any(map(_is_opaque, courses.values())))
-    t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    t, p = matrix.sym("t"), matrix.sym("p", len(elements))
     values = dict(zip(courses, ca.vertsplit(_course_function(list(courses.values()))(t)), strict=True))
-    entries = [values.get(name, p[k]) for k, name in enumerate(plant.parameter.elements)]
+    entries = [values.get(name, p[k]) for k, name in enumerate(elements)]
     return ca.Function("fpirhc_signals", [t, p], [ca.densify(ca.vertcat(*entries))], ["t", "p"], ["parameters"])
 
 

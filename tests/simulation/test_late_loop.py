@@ -70,6 +70,13 @@ def test_what_stays_as_it_is_and_no_judged_error_shows_is_left_out(slower):
     assert replace(loop, errors=np.array([[0.0, 1.0]])).radius == pytest.approx(max(slower, 1.0), abs=2e-6)
 
 
+def test_a_double_mode_that_stays_and_no_judged_error_shows_is_left_out_as_a_single_one():
+    """The time that is spent in a queue that stays: its null vector is one, its poles are two."""
+    loop = waiting(np.array([[0.9, 0.0, 0.0], [0.2, 1.0, 1.0], [0.3, 0.0, 1.0]]), 500)
+    assert replace(loop, errors=np.eye(3)[:1]).radius == pytest.approx(0.9, abs=2e-8)
+    assert replace(loop, errors=np.eye(3)[1:2]).radius == pytest.approx(1.0, abs=2e-5)
+
+
 @pytest.mark.parametrize("count", range(1, 9))
 @pytest.mark.parametrize("angle", [0.0, 0.3])
 def test_poles_that_lie_together_near_the_unit_circle_are_all_counted(count, angle):

@@ -20,6 +20,7 @@ from fpirhc.controllers.plausible import plausible_range
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidProblem, InvalidShape, InvalidValue, NotSupported
 from fpirhc.status import Status
+from fpirhc.symbolic.evaluate import Latest
 
 TRACK = fp.Exponential(rate=6.0)
 SHAPE = fp.Sigmoid(gain=-0.5, scale=50.0)
@@ -130,6 +131,21 @@ def test_memory_of_the_same_size_of_another_controller_is_refused():
 
 
 # Threads
+
+
+def test_what_is_built_once_is_built_for_every_thread():
+    """An evaluator keeps the numbers of its last call, so that two threads may not share one."""
+    latest, built = Latest[object](2), list[object]()
+
+    def ask() -> None:
+        built.append(latest.of((latest,), (), object))
+
+    ask()
+    ask()
+    other = threading.Thread(target=ask)
+    other.start()
+    other.join()
+    assert built[0] is built[1] is not built[2]
 
 
 def test_second_thread_is_refused():

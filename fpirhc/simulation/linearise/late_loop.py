@@ -82,11 +82,18 @@ class LateLoop(LinearLoop):
 
     @property
     def _neutral(self) -> int:
-        """Number of modes that stay as they are, M(1) V = 0, and that no judged error shows, E V = 0."""
+        """Number of modes that stay as they are, M(1) V = 0, and that no judged error shows, E V = 0.
+
+        Where no error shows any of them, multiple ones count as often as det M turns along a circle around z = 1.
+        """
         [matrix] = self._matrices(np.ones(1)).real
         _, sizes, rows = np.linalg.svd(matrix)
         still = rows[sizes <= NEUTRAL * max(float(sizes[0]), 1.0)]
-        return len(still) - int(np.linalg.matrix_rank(still @ self.errors.T, tol=_SHOWN)) if len(self.errors) else 0
+        shown = int(np.linalg.matrix_rank(still @ self.errors.T, tol=_SHOWN)) if len(self.errors) else len(still)
+        if shown or not len(still):
+            return len(still) - shown
+        signs, _ = self._determinants(1 + 10 * NEUTRAL * np.exp(2j * math.pi * np.linspace(0.0, 1.0, _LEAST + 1)))
+        return round(float(np.angle(signs[1:] / signs[:-1]).sum()) / (2 * math.pi))
 
     def opened(self, place: int) -> Callable[[np.ndarray], np.ndarray]:
         [one] = self.cycles
