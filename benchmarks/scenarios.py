@@ -8,10 +8,10 @@ A record is one run of one controller in one scenario, with its metrics: process
 runs side by side; bytes of memory are those of a thousand more records that are read from a file. The memory of a study is the
 largest one that a command holds, in a process of its own.
 
-Libraries are compiled before anything is timed. In every round the four ways take turns, so that whatever else the machine does
-falls on all: one process, two processes, two workers of a local Dask cluster, and, for what the machine can give, the same work
-cut in halves by hand and run as two independent commands at once. Ratios are those of the medians. CPU seconds show what sharing
-itself costs, also on a machine with other work.
+Libraries are compiled before anything is timed. In every round the five ways take turns, so that whatever else the machine does
+falls on all: one process on one core; on both cores one process, two processes, two workers of a local Dask cluster, and, for what
+the machine can give, the same work cut in halves by hand and run as two commands at once. Ratios are those of the medians.
+CPU seconds show what sharing itself costs, also on a machine with other work.
 """
 
 from __future__ import annotations
@@ -69,10 +69,13 @@ def command(
     ]
 
 
-def measured(*commands: list[str]) -> tuple[float, float]:
-    """Wall and CPU seconds of commands that run at once."""
+def measured(*commands: list[str], cores: int | None = None) -> tuple[float, float]:
+    """Wall and CPU seconds of commands that run at once, on so many cores."""
     used, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    own = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(own)[:cores])
     running = [subprocess.Popen(c, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for c in commands]
+    os.sched_setaffinity(0, own)
     assert [process.wait() for process in running] == [0] * len(commands)
     wall, now = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
     return wall, now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
@@ -80,31 +83,30 @@ def measured(*commands: list[str]) -> tuple[float, float]:
 
 def study(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ...]:
     """One row: medians over the rounds."""
-    taken: dict[str, list[tuple[float, float]]] = {"one": [], "two": [], "dask": [], "halves": []}
+    taken: dict[str, list[tuple[float, float]]] = {way: [] for way in ("core", "one", "two", "dask", "halves")}
     for _ in range(ROUNDS):
         with tempfile.TemporaryDirectory() as base:
-            folders = [Path(base) / f"{k}" for k in range(5)]
+            folders = [Path(base) / f"{k}" for k in range(6)]
+            taken["core"].append(measured(command(name, controllers, count, 1, folders[5]), cores=1))
             taken["one"].append(measured(command(name, controllers, count, 1, folders[0])))
             taken["two"].append(measured(command(name, controllers, count, 2, folders[1])))
             dask = command(name, controllers, count, 2, folders[4], "--cluster", "local")
             taken["dask"].append(measured(dask))
             halves = [command(name, controllers, count // 2, 1, folders[k + 2], seed=k) for k in (0, 1)]
             taken["halves"].append(measured(*halves))
-            ledgers = [sorted((f / "scenarios.jsonl").read_text().splitlines()) for f in (*folders[:2], folders[4])]
-            assert ledgers[0] == ledgers[1] == ledgers[2], "results depend on who computes them"
+            written = (*folders[:2], *folders[4:])
+            ledgers = [sorted((f / "scenarios.jsonl").read_text().splitlines()) for f in written]
+            assert all(one == ledgers[0] for one in ledgers), "results depend on who computes them"
     wall = {way: float(np.median([w for w, _ in times])) for way, times in taken.items()}
     cpu = {way: float(np.median([c for _, c in times])) for way, times in taken.items()}
+    others = ("one", "two", "dask", "halves")
     return (
         f"{name}: {', '.join(controllers)}",
         f"{count * len(controllers)}",
-        f"{wall['one']:.1f}",
-        f"{wall['two']:.1f}",
-        f"{wall['one'] / wall['two']:.2f}",
-        f"{wall['one'] / wall['dask']:.2f}",
-        f"{wall['one'] / wall['halves']:.2f}",
-        f"{cpu['one']:.1f}",
-        f"{cpu['two']:.1f}",
-        f"{cpu['dask']:.1f}",
+        f"{wall['core']:.1f}",
+        *(f"{wall['core'] / wall[way]:.2f}" for way in others),
+        f"{wall['halves'] / wall['dask']:.2f}",
+        *(f"{cpu[way]:.1f}" for way in ("core", *others)),
     )
 
 
@@ -191,9 +193,11 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             measured(command(name, controllers, 1, 1, Path(folder)))  # compiles
         rows.append(study(name, controllers, count))
+    ways = ("one process on both", "two processes", "two Dask workers", "halves by hand")
     heads_of_commands = (
-        *("problem", "runs", "s, one process", "s, two processes", "times faster", "two Dask workers: times faster"),
-        *("halves by hand: times faster", "CPU s, one process", "CPU s, two processes", "CPU s, two Dask workers"),
+        *("problem", "runs", "s, one process on one core", *(f"{way}: times faster" for way in ways)),
+        "Dask's share of halves",
+        *(f"CPU s, {way}" for way in ("one process on one core", *ways)),
     )
     write_table("scenarios", heads_of_commands, rows)
 

@@ -7,6 +7,7 @@ the rows.
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
 import time
@@ -49,6 +50,7 @@ _MOST_STEPS = 6  # of the set-points of one coordinate in a text
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
 _EVERY = 1.0  # s from one line of progress to the next
+_DRAWN = 0.1  # s from one picture of a bar to the next
 _EDGES = 2  # columns left and right of a table
 
 
@@ -164,8 +166,13 @@ def progress_bars(*, as_json: bool = False) -> Iterator[Report]:
         TimeRemainingColumn(),
     )
     bars, known = Progress(*columns, console=Console(stderr=True), transient=True), dict[str, TaskID]()
+    told: dict[str, float] = {}
 
     def report(name: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done < total and now - told.get(name, -math.inf) < _DRAWN:
+            return  # the rate is computed anew from all that was told, which takes longer than a short run
+        told[name] = now
         bars.start()  # here, because it leaves a line behind, which is none of an error that comes before
         if name not in known:
             known[name] = bars.add_task(printable(name), total=total, rate="")

@@ -308,7 +308,12 @@ def _built(ready: Simulator, sums: Sums, device: str | None) -> _Library:
     library, lanes = lanes_library((text + _around(ready, sums, *callees), *drivers))
     run = library.run_lanes
     run.argtypes, run.restype = [ctypes.c_long] * 4 + [np.ctypeslib.ndpointer(float)] * 5, ctypes.c_int
-    return _Library(run, lanes, _GROUPS, os.cpu_count() or 1)
+    return _Library(run, lanes, _GROUPS, _cores())
+
+
+def _cores() -> int:
+    """Cores that this process may use, which are fewer than there are in a container or a job of a cluster."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _around(ready: Simulator, sums: Sums, step: Callee, summing: Callee) -> str:

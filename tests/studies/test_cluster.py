@@ -110,14 +110,14 @@ def test_a_worker_without_the_file_has_its_content(tmp_path: Path) -> None:
     elsewhere, greeting = opening_of(tmp_path / "two_mass.py")
     here, _ = opening_of(path)
     content, facts = path.read_bytes(), {**greeting, **machine_facts()}
-    records = [run_jobs(json.dumps(o), content, facts, [([0], "CTC")])[0] for o in (elsewhere, here)]
+    records = [run_jobs(json.dumps(o), content, facts, [[([0], "CTC")]])[0] for o in (elsewhere, here)]
     assert records[0] == records[1]
     assert records[0][0][0]["outcome"] == "finished"
 
 
 def test_a_file_that_a_worker_cannot_load_is_named(tmp_path: Path) -> None:
     opening, greeting = opening_of(tmp_path / "none.py")
-    [[answer]], _ = run_jobs(json.dumps(opening), b"import nowhere_at_all\n", greeting, [([0], "CTC")])
+    [[answer]], _ = run_jobs(json.dumps(opening), b"import nowhere_at_all\n", greeting, [[([0], "CTC")]])
     assert answer["error"].startswith("a worker cannot load the problem: ")
     assert "nowhere_at_all" in answer["error"]
 

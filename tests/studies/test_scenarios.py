@@ -366,10 +366,16 @@ def test_records_of_a_file_are_what_they_were(seed, tmp_path):
     with pytest.raises(OutputError, match="holds the results of another study by now"):
         records[0]
     assert other.records == wanted[::-1]
+    (tmp_path / "l.jsonl").unlink()
+    with Ledger(tmp_path / "l.jsonl", {}) as anew:  # with the same first line
+        for one in reversed(wanted):
+            anew.append(one)
+    with pytest.raises(OutputError, match="holds the results of another study by now"):
+        records[0]
 
 
-def test_a_record_takes_eight_bytes(tmp_path):
-    """Those of its place in the file, with the growth of an array; nothing else of it stays."""
+def test_a_record_takes_twelve_bytes(tmp_path):
+    """Those of its place in the file and of its checksum, with the growth of arrays; nothing else of it stays."""
     with Ledger(tmp_path / "l.jsonl", {}) as ledger:
         for k in range(2000):
             ledger.append({"scenario": k, "name": f"{k}", "metrics": {"rms": {"q1": k / 7}, "status": {"OK": k}}})
@@ -380,7 +386,7 @@ def test_a_record_takes_eight_bytes(tmp_path):
             taken, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert taken < 12 * 2000 + 10_000
+    assert taken < 16 * 2000 + 10_000
 
 
 def test_other_results_damage_and_other_users_are_refused(tmp_path):

@@ -15,6 +15,7 @@ import fpirhc as fp
 from fpirhc.errors import NoCode
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.simulate import Simulator, built
+from fpirhc.studies.scenarios import scenario_study
 from fpirhc.studies.scenarios.bench import Bench, Conditions, ranges, relative_error
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
@@ -274,3 +275,22 @@ def test_a_population_is_judged_as_its_members_and_goes_on_where_it_stopped(tmp_
     again = tune(task, folder=tmp_path / "cut", **settings)
     assert again.entries[0].cost == whole.entries[0].cost
     assert (tmp_path / "cut" / "trials.jsonl").read_text() == "".join(lines)
+
+
+def test_a_worker_has_the_scenarios_of_a_register_for_all_controllers() -> None:
+    """So it draws each once; runs that are one after the other are jobs of their own, which spread better."""
+    seen: list[Any] = []
+
+    class _Listening:
+        def __enter__(self) -> None: ...
+        def __exit__(self, *_: object) -> None: ...
+        def answers(self, groups: Iterator[Any], own: object) -> Iterator[Any]:
+            del own
+            seen.extend(groups)
+            return iter(())
+
+    numbers = list(range(64))
+    jobs = [(numbers, "CTC"), (numbers, "RHC"), ([64], "CTC"), ([64], "RHC")]
+    bench = Bench(TWO_MASS, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
+    assert not list(scenario_study._answers(bench, _Listening(), jobs))  # type: ignore[arg-type]
+    assert seen == [jobs[:2], jobs[2:3], jobs[3:]]

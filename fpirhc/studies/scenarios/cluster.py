@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from fpirhc.errors import FpirhcError, InvalidValue, WorkerDied, package
-from fpirhc.studies.scenarios.worker import Study, answered, study
+from fpirhc.studies.scenarios.worker import Job, Study, answered, study
 from fpirhc.symbolic.native import machine_facts
 
 _NONE = object()  # no job is left
@@ -220,12 +220,14 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 LOCAL = "local"  # in place of an address: a cluster of this machine's cores
 _CHUNK = 0.2  # s of work in a task, beside which the milliseconds of its transport do not count
-_MOST = 200  # jobs in a task
+_MOST = 200  # groups of jobs in a task
 _WAIT = 10  # s for an answer of the scheduler
-_THREADS = {f"{name}_NUM_THREADS": 1 for name in ("OMP", "MKL", "OPENBLAS")}  # of the libraries of a worker
+_LOCAL = {
+    # Dask's own settings give every log back to the system and fetch it anew: half as much time again for a scenario.
+    "distributed.nanny.pre-spawn-environ": {f"{name}_NUM_THREADS": 1 for name in ("OMP", "MKL", "OPENBLAS")},
+    "distributed.worker.profile.enabled": False,  # it looks at every thread a hundred times a second
+}
 _ONE_AT_A_TIME = threading.Lock()  # a worker may have several threads, and a loop serves one
-
-Job = tuple[Sequence[int], str]
 
 
 class Cluster:
@@ -253,8 +255,7 @@ class Cluster:
     def _connected(self, address: str, count: int) -> Any:
         where: Any = address
         if address == LOCAL:
-            # Dask's own settings give every log back to the system and fetch it anew: half as much time again for a scenario.
-            with package("dask.config", "cluster", "--cluster").set({"distributed.nanny.pre-spawn-environ": _THREADS}):
+            with package("dask.config", "cluster", "--cluster").set(_LOCAL):
                 local = self._dask.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0")
             where = self._stack.enter_context(local)
         try:
@@ -273,8 +274,10 @@ class Cluster:
         with contextlib.suppress(Exception):  # a scheduler that is gone cannot be left in good order
             self._stack.close()
 
-    def answers(self, jobs: Iterable[Job], own: Callable[[Job], Any] | None = None) -> Iterator[Any]:
-        """Yield the answer of every job as it comes, in no particular order."""
+    def answers(
+        self, jobs: Iterable[Sequence[Job]], own: Callable[[Sequence[Job]], Any] | None = None
+    ) -> Iterator[Any]:
+        """Yield the answer of every group of jobs as it comes, in no particular order."""
         del own  # this process has the ledger to write
         try:
             for answers in self._chunks(iter(jobs)):
@@ -282,7 +285,7 @@ class Cluster:
         except (OSError, TimeoutError, CancelledError) as error:
             raise _lost("the cluster does not answer any more", error) from None
 
-    def _chunks(self, jobs: Iterator[Job]) -> Iterator[list[Any]]:
+    def _chunks(self, jobs: Iterator[Sequence[Job]]) -> Iterator[list[Any]]:
         """Answers of one task after the other; tasks get longer until their transport does not count."""
         size, running = 1, 0
         pool = self._dask.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
@@ -315,11 +318,11 @@ def _lost(what: str, why: Any) -> WorkerDied:
 
 
 def run_jobs(
-    opening: str, content: bytes, greeting: Mapping[str, Any], jobs: Sequence[Job]
+    opening: str, content: bytes, greeting: Mapping[str, Any], groups: Sequence[Sequence[Job]]
 ) -> tuple[list[list[dict[str, Any]]], float]:
-    """Answer jobs on a worker; return the records of each and the seconds that they took.
+    """Answer groups of jobs on a worker; return the records of each and the seconds that they took.
 
-    `greeting`: facts on which the client's numbers depend. `jobs`: (numbers of scenarios, name of the controller).
+    `greeting`: facts on which the client's numbers depend.
     """
     with _ONE_AT_A_TIME:
         try:
@@ -330,7 +333,7 @@ def run_jobs(
         if other:
             return [[{"error": f"a worker would compute other numbers: {other}"}]], 0.0
         begin = time.perf_counter()
-        return [answered(ready.bench, numbers, name) for numbers, name in jobs], time.perf_counter() - begin
+        return [answered(ready.bench, jobs) for jobs in groups], time.perf_counter() - begin
 
 
 def _differences(wanted: Mapping[str, Any], there: Mapping[str, Any]) -> str:

@@ -20,29 +20,37 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Self, overload
 
+import numpy as np
+
 from fpirhc.errors import InvalidField, OutputError
 from fpirhc.fields.checked import Checked, field_names
 
 
 class Records(Sequence[Mapping[str, Any]]):
-    """Records of a file in their order; each is read where it is asked for: what stays in memory is its place, eight bytes.
+    """Records of a file in their order; each is read where it is asked for.
+
+    What stays in memory is the place of a line and its checksum, twelve bytes: a file that was begun anew has other lines there.
 
     Args:
         path: of the file.
-        head: its first line; records of a file that begins with another one are not read.
         places: of the records' lines, in bytes from the start.
+        sums: CRC-32 of the lines.
     """
 
-    def __init__(self, path: Path, head: bytes, places: Iterable[int] = ()) -> None:
-        self._path, self._head, self._places = path, head, array("Q", places)
+    def __init__(self, path: Path, places: Iterable[int] = (), sums: Iterable[int] = ()) -> None:
+        self._path, self._places, self._sums = path, array("Q", places), array("I", sums)
 
-    def append(self, place: int) -> None:
+    def append(self, place: int, line: bytes) -> None:
         """Add the record of the line that starts there."""
         self._places.append(place)
+        self._sums.append(zlib.crc32(line))
 
     def at(self, numbers: Iterable[int]) -> Records:
         """Return some of the records."""
-        return Records(self._path, self._head, (self._places[k] for k in numbers))
+        chosen = np.fromiter(numbers, dtype=np.intp)
+        return Records(
+            self._path, *(np.frombuffer(one, one.typecode)[chosen].tolist() for one in (self._places, self._sums))
+        )
 
     def __iter__(self) -> Iterator[Mapping[str, Any]]:
         try:
@@ -53,14 +61,18 @@ class Records(Sequence[Mapping[str, Any]]):
                 "they are read"
             ) from None
         with file:
-            if file.readline() != self._head:
-                raise OutputError(
-                    f"'{self._path}' holds the results of another study by now, and these records are gone; give every study a "
-                    "folder of its own with --out"
-                )
-            for place in self._places:
-                file.seek(place)
-                record = _parsed(self._path, file.readline())
+            at = 0
+            for place, known in zip(self._places, self._sums, strict=True):
+                if place != at:
+                    file.seek(place)
+                line = file.readline()
+                at = place + len(line)
+                if zlib.crc32(line) != known:
+                    raise OutputError(
+                        f"'{self._path}' holds the results of another study by now, and these records are gone; give every study a "
+                        "folder of its own with --out"
+                    )
+                record = _parsed(self._path, line)
                 record.pop(_SUM, None)
                 yield record
 
@@ -122,7 +134,8 @@ class Ledger:
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write one record; every so often, wait until all are on the disk."""
-        self.records.append(self._write(record))
+        place = self._end
+        self.records.append(place, self._write(record))
 
     def close(self) -> None:
         """Force all to the disk and close the file; another process may open it then."""
@@ -137,9 +150,9 @@ class Ledger:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _write(self, value: Mapping[str, Any]) -> int:
-        """The place where the line begins."""
-        line, place = _line(value), self._end
+    def _write(self, value: Mapping[str, Any]) -> bytes:
+        """The line of it."""
+        line = _line(value)
         try:
             written = self._file.write(line)
             while written < len(line):
@@ -150,7 +163,7 @@ class Ledger:
         self._waiting += 1
         if self._waiting >= _GROUP or time.monotonic() - self._forced >= _WAIT:
             self._force()
-        return place
+        return line
 
     def _force(self) -> None:
         """Wait until everything that was written is on the disk."""
@@ -168,26 +181,25 @@ class Ledger:
 
     def _read(self, header: dict[str, Any]) -> Records:
         """The records, one line after the other; a torn last line is cut off."""
-        records, summed = Records(self._path, _line(header)), True
+        records, summed = Records(self._path), True
         for number, text in enumerate(self._whole_lines(), 1):
-            line = _parsed(self._path, text, f", line {number}")
-            if number == 1:
-                summed = _SUM in line
-            else:
-                self._check(number, line)
-            if summed and line.pop(_SUM, "") != _sum(line):
-                what = (
-                    "remove the line, and its result is computed again"
-                    if number > 1
-                    else "remove the file to begin again"
-                )
-                raise OutputError(f"'{self._path}', line {number} is damaged: its checksum does not fit; {what}")
-            if number == 1 and line != header:
-                raise OutputError(_refusal(self._path, line, header))
-            if number == 1:
-                records = Records(self._path, text)  # older files have no checksum in it
-            else:
-                records.append(self._end)
+            if number == 1 or not summed or not _is_as_written(text):
+                line = _parsed(self._path, text, f", line {number}")
+                if number == 1:
+                    summed = _SUM in line
+                else:
+                    self._check(number, line)
+                if summed and line.pop(_SUM, "") != _sum(line):
+                    what = (
+                        "remove the line, and its result is computed again"
+                        if number > 1
+                        else "remove the file to begin again"
+                    )
+                    raise OutputError(f"'{self._path}', line {number} is damaged: its checksum does not fit; {what}")
+                if number == 1 and line != header:
+                    raise OutputError(_refusal(self._path, line, header))
+            if number > 1:
+                records.append(self._end, text)
             self._end += len(text)
         if self._end != self._file.seek(0, os.SEEK_END):
             self._file.truncate(self._end)
@@ -256,7 +268,14 @@ def _parsed(path: Path, text: bytes, where: str = "") -> dict[str, Any]:
 
 def _line(value: Mapping[str, Any]) -> bytes:
     """With its checksum."""
-    return _text({**value, _SUM: _sum(value)}).encode() + b"\n"
+    text = _text(value)
+    return f'{text[:-1]}{"," if value else ""}"{_SUM}":"{_checksum(text.encode())}"}}\n'.encode()
+
+
+def _is_as_written(line: bytes) -> bool:
+    """Whether not one byte differs from what `_line` wrote; such a line need not be understood."""
+    rest, _, end = line.rpartition(f',"{_SUM}":"'.encode())
+    return end == f'{_checksum(rest + b"}")}"}}\n'.encode()
 
 
 def _text(value: Mapping[str, Any]) -> str:
@@ -264,8 +283,13 @@ def _text(value: Mapping[str, Any]) -> str:
 
 
 def _sum(value: Mapping[str, Any]) -> str:
-    """Checksum of an object, eight hexadecimal digits; numbers are read and written alike to the last bit."""
-    return f"{zlib.crc32(json.dumps(value, separators=(',', ':')).encode()):08x}"
+    """Checksum of an object; numbers are read and written alike to the last bit."""
+    return _checksum(_text(value).encode())
+
+
+def _checksum(text: bytes) -> str:
+    """Eight hexadecimal digits."""
+    return f"{zlib.crc32(text):08x}"
 
 
 def _refusal(path: Path, header: dict[str, Any], wanted: dict[str, Any]) -> str:

@@ -31,12 +31,13 @@ from fpirhc.studies.scenarios.bench import (
     scenario_numbers,
     scenarios,
 )
-from fpirhc.studies.scenarios.cluster import Cluster, Job, Workers
+from fpirhc.studies.scenarios.cluster import Cluster, Workers
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger, Records, begun_with, header_of
 from fpirhc.studies.scenarios.paired import Summary, noun, verdict
 from fpirhc.studies.scenarios.running import summarise
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
+from fpirhc.studies.scenarios.worker import Job, answered
 from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import with_tuned
 from fpirhc.studies.view import Progress, circumstances
@@ -219,11 +220,18 @@ def _answers(bench: Bench, workers: Workers | Cluster | None, jobs: Iterable[Job
         for numbers, name in jobs:
             yield from bench.records(numbers, name)
         return
+    groups = (list(group) for _, group in itertools.groupby(jobs, key=_together))
     with workers:
-        for record in itertools.chain.from_iterable(workers.answers(jobs, lambda job: list(bench.records(*job)))):
+        for record in itertools.chain.from_iterable(workers.answers(groups, lambda some: answered(bench, some))):
             if "error" in record and "scenario" not in record:
                 raise FpirhcError(record["error"])
             yield record
+
+
+def _together(job: Job) -> object:
+    """What jobs have in common that one worker does: scenarios side by side, which it draws once for all controllers."""
+    numbers, name = job
+    return numbers if len(numbers) > 1 else (numbers, name)
 
 
 def _groups(

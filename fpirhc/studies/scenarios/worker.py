@@ -1,7 +1,7 @@
 """A process that runs scenarios for another one: `python -m fpirhc.studies.scenarios.worker`, see `processes`.
 
-Its first line of input has the problem file and the conditions, and it answers with the fingerprint. Every other line is a job
-[scenarios, controller], and it answers with their records.
+Its first line of input has the problem file and the conditions, and it answers with the fingerprint. Every other line has jobs
+[[scenarios, controller], ...], and it answers with their records.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
 from fpirhc.studies.tuning.tuned_file import with_tuned
+
+Job = tuple[Sequence[int], str]  # numbers of scenarios, name of the controller
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +38,15 @@ def study(opening: Mapping[str, Any]) -> Study:
     return Study(bench, fingerprint(task, conditions))
 
 
-def answered(bench: Bench, numbers: Sequence[int], name: str) -> list[dict[str, Any]]:
-    """Return the records of a job, or {"error": why} where nobody expected an error."""
-    try:
-        return list(bench.records(numbers, name))
-    except Exception as error:  # noqa: BLE001 -- a process that dies of it would be started again and again
-        return [{"error": f"scenario {numbers[0]}, controller '{name}': {error}"}]
+def answered(bench: Bench, jobs: Sequence[Job]) -> list[dict[str, Any]]:
+    """Return the records of jobs, or {"error": why} behind those of the jobs before one where nobody expected an error."""
+    records: list[dict[str, Any]] = []
+    for numbers, name in jobs:
+        try:
+            records += bench.records(numbers, name)
+        except Exception as error:  # noqa: BLE001 -- a process that dies of it would be started again and again
+            return [*records, {"error": f"scenario {numbers[0]}, controller '{name}': {error}"}]
+    return records
 
 
 def main() -> None:
@@ -56,8 +61,7 @@ def main() -> None:
         _answer(answers, {"error": str(error)})
         return
     for line in sys.stdin:
-        numbers, name = json.loads(line)
-        _answer(answers, answered(ready.bench, numbers, name))
+        _answer(answers, answered(ready.bench, json.loads(line)))
 
 
 def _private_output() -> TextIO:

@@ -70,9 +70,12 @@ def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every me
     if "solve" not in run.layout or not run.cycles:
         return None
     solves = run["solve"]
-    # A plan that is held for several cycles counts once; the remaining rows are few enough to sort.
-    first = np.concatenate([[True], (np.diff(solves, axis=0) != 0).any(axis=1)])
-    return int(np.unique(solves[first], axis=0).shape[0])
+    # A plan that is held for several cycles counts once.
+    first = np.concatenate([[True], (solves[1:] != solves[:-1]).any(axis=1)])
+    different = solves[first]
+    # Plans with different residuals are different; whole rows are slow to sort.
+    alone = np.unique(run["solve.stationarity"][first]).size == len(different)
+    return len(different) if alone else int(np.unique(different, axis=0).shape[0])
 
 
 def second_plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every metric is given the problem
