@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -12,11 +13,13 @@ from fpirhc.errors import OutputError
 from fpirhc.simulation.drawing import (
     PALETTE,
     by_unit,
+    caption_axes,
     draw_bands,
     draw_changes,
     draw_legend,
     draw_line,
     draw_responses,
+    draw_signal,
     literal,
     new_figure,
     quantity_label,
@@ -49,6 +52,7 @@ _GROUPS = 6  # of scenarios with similar mismatch, whose medians are joined by a
 _WIDE = 16.5  # inches, of a picture as wide as the page
 _CYCLES = 150  # of the decay of a response error
 _BEYOND = 1.2  # of the linear limit, up to which the factor is drawn
+_ERROR = "rms error [% of the reference's range]"
 _REFERENCES = ("#111111", "#777777", "#aaaaaa")  # colours of references, which lie on what follows them
 
 
@@ -114,8 +118,8 @@ def _pictures(run: Run) -> list[tuple[str, Draw, str, list[str]]]:
     return [
         ("Trajectory tracking", _draw_trajectory, "error", judged),
         *phases,
-        ("Tracking error", _draw_error, "error", judged),
-        ("Command", _draw_command, "command", inputs),
+        ("Tracking error", partial(draw_signal, signal="error"), "error", judged),
+        ("Command", partial(draw_signal, signal="command"), "command", inputs),
         (highest, _draw_responses, "desired", list(run.layout["desired"].elements)),
     ]
 
@@ -154,9 +158,7 @@ def lyapunov_figure(comparison: Comparison) -> Drawing | None:
         times = entry.run.period * np.arange(values.size)
         axis.semilogy(thinned(times), thinned(values), color=color, lw=1, label=literal(entry.name))
         axis.axhline(max(0.5 * view.ultimate**2, 1e-20), color=color, lw=0.8, ls="--")
-    axis.set_xlabel(time_label(views[0][0].run))
-    axis.set_ylabel("V")
-    axis.grid(visible=True, alpha=0.25)
+    caption_axes(axis, time_label(views[0][0].run), "V")
     draw_legend(axis)
     return figure
 
@@ -168,7 +170,7 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
     for column, entry in enumerate((plain, adaptive)):
         names = entry.run.layout["error"].elements
         _draw_trajectory(axes[0, column], entry.run, names)
-        _draw_error(axes[1, column], entry.run, names)
+        draw_signal(axes[1, column], entry.run, names, "error")
         for row in (0, 1):
             draw_bands(axes[row, column], entry.run)
             draw_changes(axes[row, column], entry.run)
@@ -205,19 +207,8 @@ def _draw_phase(axis: Axes, run: Run, names: Sequence[str]) -> None:
         for signal, style, color in ((motion, "-", PALETTE[k % len(PALETTE)]), ("reference", "--", nominal)):
             x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
             axis.plot(thinned(x), thinned(y), style, color=color, lw=1, label=literal(f"{name} {signal}"))
-    axis.set_xlabel(quantity_label(run, motion, names))
-    axis.set_ylabel(quantity_label(run, motion, [f"{name}'" for name in names]))
-    axis.grid(visible=True, alpha=0.25)
-
-
-def _draw_error(axis: Axes, run: Run, names: Sequence[str]) -> None:
-    for k, name in enumerate(names):
-        draw_line(axis, run, f"error.{name}", name, PALETTE[k % len(PALETTE)])
-
-
-def _draw_command(axis: Axes, run: Run, names: Sequence[str]) -> None:
-    for k, name in enumerate(names):
-        draw_line(axis, run, f"command.{name}", name, PALETTE[k % len(PALETTE)])
+    across, up = (quantity_label(run, motion, [name + prime for name in names]) for prime in ("", "'"))
+    caption_axes(axis, across, up)
 
 
 def _draw_responses(axis: Axes, run: Run, names: Sequence[str]) -> None:
@@ -298,10 +289,8 @@ def _draw_factor(axis: Axes, name: str, scale: float, entries: Sequence[Entry], 
     axis.set_ylim(0, 1.6)
     axis.locator_params(axis="x", nbins=7)
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))
-    axis.set_xlabel(literal(name))
-    axis.set_ylabel("contraction factor max|1 - a lambda|")
+    caption_axes(axis, literal(name), "contraction factor max|1 - a lambda|")
     axis.set_title("Predicted factor; o predicted, x measured", fontsize=10, y=1.0)
-    axis.grid(visible=True, alpha=0.25)
     draw_legend(axis)
 
 
@@ -321,9 +310,7 @@ def mismatch_figure(comparison: ScenarioComparison) -> Drawing:
         axis.semilogy(x[~ended], y[~ended], "o", color=colour, ms=3, alpha=0.5)
         axis.semilogy(x[ended], np.full(ended.sum(), edge), "x", color=colour, ms=6)
         axis.semilogy(*_medians(x[~ended], y[~ended]), "-", color=colour, lw=1.5, label=literal(one.name))
-    axis.set_xlabel("mismatch between model and plant [%]")
-    axis.set_ylabel("rms error [% of the reference's range]")
-    axis.grid(visible=True, alpha=0.25)
+    caption_axes(axis, "mismatch between model and plant [%]", _ERROR)
     axis.legend(fontsize=8, framealpha=0.8)
     return figure
 
@@ -347,9 +334,7 @@ def limits_figure(result: OperatingLimits) -> Drawing:
         axis.set_xscale("log")
         axis.set_yscale("log")
         axis.set_ylim(top=150 * edge)
-        axis.set_xlabel(literal(f"{quantity.name} [{quantity.unit}]"))
-        axis.set_ylabel("rms error [% of the reference's range]")
-        axis.grid(visible=True, alpha=0.25)
+        caption_axes(axis, literal(f"{quantity.name} [{quantity.unit}]"), _ERROR)
     draw_legend(axes[0])
     for axis in axes[len(shown) :]:
         axis.remove()
@@ -389,9 +374,7 @@ def _sweep_lines(result: Sweep) -> Drawing:
         if over.path in one.now:
             axis.axvline(one.now[over.path], color=colour, ls=":", lw=1)
     _scale_of(axis, result)
-    axis.set_xlabel(literal(over.path))
-    axis.set_ylabel(literal(_figure_label(result)))
-    axis.grid(visible=True, alpha=0.25)
+    caption_axes(axis, literal(over.path), literal(_figure_label(result)))
     draw_legend(axis)
     return figure
 

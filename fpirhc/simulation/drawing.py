@@ -136,19 +136,37 @@ def draw_responses(axis: Axes, run: Log, name: str) -> None:
         axis.set_ylim(-3 * usual, 3 * usual)
 
 
+def draw_signal(axis: Axes, run: Log, names: Sequence[str], signal: str) -> None:
+    """Draw entries of a signal of a run over time, each in its colour."""
+    for k, name in enumerate(names):
+        draw_line(axis, run, f"{signal}.{name}", name, PALETTE[k % len(PALETTE)])
+
+
+def caption_axes(axis: Axes, across: str, up: str) -> None:
+    """Label the two directions of an axis with texts that are `literal` already, and draw a pale grid."""
+    axis.set_xlabel(across)
+    axis.set_ylabel(up)
+    axis.grid(visible=True, alpha=0.25)
+
+
 def run_figure(run: Log) -> Figure:
     """Return a figure with errors, coordinates, commands and responses of one run over time, one chart per unit."""
-    judged, inputs = run.layout["error"].elements, run.layout["command"].elements
+    judged, inputs, first = (
+        run.layout["error"].elements,
+        run.layout["command"].elements,
+        run.layout["desired"].elements[:1],
+    )
     panels = [
-        *((_draw_errors, names) for names in by_unit(run, "error", judged).values()),
-        *((_draw_motion, names) for names in by_unit(run, "error", judged).values()),
-        *((_draw_commands, names) for names in by_unit(run, "command", inputs).values()),
-        (_draw_first_response, run.layout["desired"].elements[:1]),
+        *(("error", "error of ", draw_signal, names) for names in by_unit(run, "error", judged).values()),
+        *((shown_motion(run.layout), "", _draw_motion, names) for names in by_unit(run, "error", judged).values()),
+        *(("command", "", draw_signal, names) for names in by_unit(run, "command", inputs).values()),
+        ("desired", "responses of ", _draw_first_response, first),
     ]
     figure = new_figure(10, 2.25 * len(panels), f"{run.controller}" + (f" ({run.stop})" if run.stop else ""))
     axes = figure.subplots(len(panels), 1, sharex=True)
-    for axis, (draw, names) in zip(axes, panels, strict=True):
-        axis.set_ylabel(draw(axis, run, names))
+    for axis, (signal, what, draw, names) in zip(axes, panels, strict=True):
+        draw(axis, run, names, signal)
+        axis.set_ylabel(what + quantity_label(run, signal, names))
         draw_bands(axis, run)
         draw_changes(axis, run)
         draw_legend(axis)
@@ -156,28 +174,14 @@ def run_figure(run: Log) -> Figure:
     return figure
 
 
-def _draw_errors(axis: Axes, run: Log, names: Sequence[str]) -> str:
-    for k, name in enumerate(names):
-        draw_line(axis, run, f"error.{name}", name, PALETTE[k % len(PALETTE)])
-    return f"error of {quantity_label(run, 'error', names)}"
-
-
-def _draw_motion(axis: Axes, run: Log, names: Sequence[str]) -> str:
+def _draw_motion(axis: Axes, run: Log, names: Sequence[str], signal: str) -> None:
     for k, name in enumerate(names):
         color = PALETTE[k % len(PALETTE)]
-        draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", name, color)
+        draw_line(axis, run, f"{signal}.{name}", name, color)
         draw_line(axis, run, f"reference.{name}", f"{name} reference", color, "--")
         if "setpoint" in run.layout:
             draw_line(axis, run, f"setpoint.{name}", f"{name} set-point", color, ":")
-    return quantity_label(run, shown_motion(run.layout), names)
 
 
-def _draw_commands(axis: Axes, run: Log, names: Sequence[str]) -> str:
-    for k, name in enumerate(names):
-        draw_line(axis, run, f"command.{name}", name, PALETTE[k % len(PALETTE)])
-    return quantity_label(run, "command", names)
-
-
-def _draw_first_response(axis: Axes, run: Log, names: Sequence[str]) -> str:
+def _draw_first_response(axis: Axes, run: Log, names: Sequence[str], _: str) -> None:
     draw_responses(axis, run, names[0])
-    return f"responses of {quantity_label(run, 'desired', names)}"

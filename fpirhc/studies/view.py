@@ -128,7 +128,7 @@ def versions() -> dict[str, str]:
 
 def to_json(facts: Mapping[str, Any]) -> str:
     """Return facts as JSON text; numbers that are not finite become null."""
-    return json.dumps(_finite(facts), indent=2, allow_nan=False)
+    return json.dumps(finite_alone(facts), indent=2, allow_nan=False)
 
 
 def status_shares(statuses: Mapping[str, int]) -> str:
@@ -138,9 +138,10 @@ def status_shares(statuses: Mapping[str, int]) -> str:
     return ", ".join(f"{k.lower().replace('_', ' ')} {in_percent(v / cycles)}" for k, v in other.items()) or "ok"
 
 
-def _finite(value: Any) -> Any:
+def finite_alone(value: Any) -> Any:
+    """Return plain data with None in place of numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: finite_alone(v) for k, v in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_finite(v) for v in value]
+        return [finite_alone(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

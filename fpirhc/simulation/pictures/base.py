@@ -20,7 +20,6 @@ from fpirhc.simulation import drawing
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Kept: TypeAlias = Mapping[str, float | str | list[float]]
@@ -117,10 +116,3 @@ def extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     parts = [(a, values[a:b]) for a, b in pairwise(edges)]
     places = np.array([sorted((a + int(np.argmin(v)), a + int(np.argmax(v)))) for a, v in parts]).ravel()
     return times[places], values[places]
-
-
-def caption_axes(axis: Axes, across: str, up: str) -> None:
-    """Label the two directions of an axis and draw a pale grid."""
-    axis.set_xlabel(drawing.literal(across))
-    axis.set_ylabel(drawing.literal(up))
-    axis.grid(visible=True, alpha=0.25)

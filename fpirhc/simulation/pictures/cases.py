@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.simulation import drawing
-from fpirhc.simulation.pictures.base import Kept, Picture, Quantity, averaged, caption_axes, label, numbers
+from fpirhc.simulation.pictures.base import Kept, Picture, Quantity, averaged, label, numbers
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class Band(Picture):
             for extreme in (np.nanmin(values, axis=0), np.nanmax(values, axis=0)):
                 axis.plot(times, extreme, color=colour, lw=0.7, ls=":")
             axis.plot(times, np.nanmedian(values, axis=0), color=colour, lw=1.5)
-            caption_axes(axis, "", str(cases[0]["up"]))
+            drawing.caption_axes(axis, "", str(cases[0]["up"]))
             cohort = f" ({len(cases)} cases)" if len(cases) > 1 else ""
             axis.set_title(drawing.literal(f"{name}{cohort}"), fontsize=10)
         panels[-1].set_xlabel(str(next(iter(kept.values()))[0]["across"]))

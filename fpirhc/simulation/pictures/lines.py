@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fpirhc.simulation import drawing
-from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, extremes, label, numbers
+from fpirhc.simulation.pictures.base import Picture, Quantity, extremes, label, numbers
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class OverTime(Picture):
                 up = label(run, what)
             for level in self.levels.get(what if isinstance(what, str) else what.name, ()):
                 axis.axhline(level, color="#777777", lw=0.8, ls="--")
-            caption_axes(axis, "", up)
+            drawing.caption_axes(axis, "", up)
         axes[-1].set_xlabel(drawing.time_label(next(iter(runs.values()))))
         axes[0].legend(fontsize=7, loc="best", framealpha=0.8)
 
@@ -94,7 +94,7 @@ class Portrait(Picture):
             late = run.time >= self.since
             axis.plot(numbers(run, self.x)[late], numbers(run, self.y)[late], lw=0.8)
             axis.set_title(name, fontsize=10)
-            caption_axes(axis, label(run, self.x), label(run, self.y))
+            drawing.caption_axes(axis, label(run, self.x), label(run, self.y))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ class Raster(Picture):
         axis.set_yticks(np.arange(len(runs)), counts, fontsize=8)
         axis.set_ylim(len(runs) - 0.5, -0.5)
         axis.set_xlim(0, max(float(run.time[-1]) for run in runs.values()))
-        caption_axes(axis, drawing.time_label(next(iter(runs.values()))), "")
+        drawing.caption_axes(axis, drawing.time_label(next(iter(runs.values()))), "")
 
 
 def passages(times: np.ndarray, values: np.ndarray, threshold: float) -> np.ndarray:

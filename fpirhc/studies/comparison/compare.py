@@ -21,7 +21,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.questions.gain import recommended_for
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
-from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
+from fpirhc.simulation.lyapunov_view import lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.run import Run
@@ -190,10 +190,6 @@ def _entries(
     return entries, skipped
 
 
-def _told_of_run(view: LyapunovView | None, run: Run) -> tuple[str, ...]:
-    return (*([view.text] if view else []), *run.remarks)
-
-
 def _entry(
     task: Task,
     controllers: Mapping[str, Controller],
@@ -222,7 +218,7 @@ def _entry(
     metrics = measure(problem, run, task.metrics)
     view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
     stepper, cycle = part("the time of a cycle", _timed, problem, ready, run, compiled=compiled) or (None, None)
-    built[name] = Built(loop, stepper)
+    built[name], told = Built(loop, stepper), [view.text] if view else []
     contraction = part("the contraction", _contraction, problem, ready, run, metrics)
     optimality = part("the excess cost of the plans", measure_optimality, problem, ready, run, compiled=compiled)
     predicts = adaptive and name in (task.headline or ())
@@ -237,13 +233,13 @@ def _entry(
         pair=_pair(controllers, name) if adaptive else None,
         contraction=contraction,
         optimality=optimality,
-        notes=(*_notes(controller, ready), *ready.notes(problem), *_told_of_run(view, run), *broken, *metrics.broken),
+        notes=(*_notes(controller, ready), *ready.notes(problem), *told, *run.remarks, *broken, *metrics.broken),
         lyapunov=view,
         prediction=prediction,
         weighed=weighed(problem, ready),
         exact=has_exact_model(problem, ready),
         learns=ready.learns,
-        fixed=_fixed(controllers, controller) if ready.learns else None,
+        fixed=_same(controller.inner, controllers) if ready.learns and controller.inner is not None else None,
         plan_every=every,
         information=informed,
         automatic=automatic(controller.deformation),
@@ -271,11 +267,6 @@ def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:
     except NotSupported:
         return None
     return _same(wanted, {n: c for n, c in controllers.items() if not c.deformation.adapts})
-
-
-def _fixed(controllers: Mapping[str, Controller], learner: Controller) -> str | None:
-    """The controller around which a learner is, with its fixed model."""
-    return None if learner.inner is None else _same(learner.inner, controllers)
 
 
 def _same(wanted: Controller, controllers: Mapping[str, Controller]) -> str | None:

@@ -6,7 +6,7 @@ where the command or the memory depends on one, structurally.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +53,8 @@ def lines_of(problem: Problem, known: Mapping[str, Information]) -> tuple[str, .
     """Return the lines of a comparison: what all are given, what each uses, and when each acts."""
     if not known:
         return ()
-    return _given(problem), *_grouped("use", _by_use(known)), *_grouped("act", _by_rate(known))
+    uses = {name: ", ".join(one.uses) or "nothing measured" for name, one in known.items()}
+    return _given(problem), *_grouped("use", uses), *_grouped("act", {name: one.rate for name, one in known.items()})
 
 
 def _given(problem: Problem) -> str:
@@ -72,22 +73,11 @@ def _given(problem: Problem) -> str:
     return text + (f"; {', '.join(believed)} are believed ({type(sensing.observer).__name__})" if believed else "")
 
 
-def _by_use(known: Mapping[str, Information]) -> dict[str, list[str]]:
+def _grouped(verb: str, texts: Mapping[str, str]) -> list[str]:
+    """One line for all controllers of the same text; one line for all where there is one text."""
     groups: dict[str, list[str]] = {}
-    for name, one in known.items():
-        groups.setdefault(", ".join(one.uses) or "nothing measured", []).append(name)
-    return groups
-
-
-def _by_rate(known: Mapping[str, Information]) -> dict[str, list[str]]:
-    groups: dict[str, list[str]] = {}
-    for name, one in known.items():
-        groups.setdefault(one.rate, []).append(name)
-    return groups
-
-
-def _grouped(verb: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
-    """One line per group; one line for all where there is one group."""
+    for name, text in texts.items():
+        groups.setdefault(text, []).append(name)
     if len(groups) == 1:
         [what] = groups
         return [f"every controller {verb}s {what}"]

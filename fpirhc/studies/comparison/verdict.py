@@ -134,14 +134,16 @@ def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
     weighed = {n: c for n, c in changes.items() if adaptive.weighed is None or n in adaptive.weighed} or changes
     counted = major(weighed)
     outcome = outcome_of(counted)
-    beside = _minor(adaptive, [c for n, c in weighed.items() if n not in counted])
-    beside += _not_weighed(adaptive, [c for n, c in changes.items() if n not in weighed])
+    beside = ""
+    for said, every, some in ((_MINOR, weighed, counted), (_NOT_WEIGHED, changes, weighed)):
+        rest = [c for n, c in every.items() if n not in some]
+        beside += f" {said}: {_listed(adaptive, rest, factors=False)}." if rest else ""
     ratios = {n: c.ratio for n, c in counted.items()}
     lost_both = not_followed(plain, adaptive, list(counted), yardstick)
     if lost_both:
         why = _of(adaptive, causes(plain, adaptive))
         return Finding(f"{lost_both}{why}", Outcome.NOT_COMPARABLE, pair, ratios)
-    text = _SENTENCES[outcome](plain, adaptive, list(counted.values())) + beside
+    text = _effect(plain, adaptive, list(counted.values()), outcome) + beside
     if outcome is not Outcome.BETTER:
         worse = left_alone_is_better(plain, adaptive, list(counted), yardstick)
         why = causes(plain, adaptive)
@@ -150,6 +152,9 @@ def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
     text += "".join(f" {s}" for s in (movement(plain, adaptive), effort_cause(adaptive)) if s)
     against = _of(adaptive, against)
     return Finding(f"{against} {text}" if against else text, Outcome.DOUBTFUL if against else outcome, pair, ratios)
+
+
+_MINOR, _NOT_WEIGHED = "Too small beside them to count", "The cost does not weigh, so the verdict leaves out"
 
 
 def _of(entry: Entry, sentences: str) -> str:
@@ -162,41 +167,21 @@ def _changes(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> dict
     return {c: Change(c, before[c], after[c], scales.get(c, 1.0)) for c in before}
 
 
-def _better(plain: Entry, adaptive: Entry, changes: list[Change]) -> str:
-    stays = [c for c in changes if c.outcome is Outcome.NO_DIFFERENCE]
-    lower = _listed(adaptive, [c for c in changes if c not in stays])
-    rest = f"; no clear change: {_listed(adaptive, stays, factors=False)}" if stays else ""
-    return f"{adaptive.name} lowers the rms error of {lower}{rest}{_price(plain, adaptive)}."
-
-
-def _worse(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
-    stays = [c for c in changes if c.outcome is Outcome.NO_DIFFERENCE]
-    higher = _listed(adaptive, [c for c in changes if c not in stays])
-    rest = f"; no clear change: {_listed(adaptive, stays, factors=False)}" if stays else ""
-    return f"{adaptive.name} does not help: it raises the rms error of {higher}{rest}."
-
-
-def _mixed(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
+def _effect(plain: Entry, adaptive: Entry, changes: list[Change], outcome: Outcome) -> str:
+    """What adaptation does to the errors that count, in a sentence."""
+    name = adaptive.name
     higher, lower, stays = (
-        [c for c in changes if c.outcome is one] for one in (Outcome.WORSE, Outcome.BETTER, Outcome.NO_DIFFERENCE)
+        _listed(adaptive, [c for c in changes if c.outcome is one], factors=one is not Outcome.NO_DIFFERENCE)
+        for one in (Outcome.WORSE, Outcome.BETTER, Outcome.NO_DIFFERENCE)
     )
-    rest = f"; no clear change: {_listed(adaptive, stays, factors=False)}" if stays else ""
-    return (
-        f"{adaptive.name} has mixed results: it raises the rms error of {_listed(adaptive, higher)} and lowers that of "
-        f"{_listed(adaptive, lower)}{rest}."
-    )
-
-
-def _no_difference(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
-    return f"{adaptive.name} makes no clear difference: it changes the rms error of {_listed(adaptive, changes, factors=False)}."
-
-
-_SENTENCES = {
-    Outcome.BETTER: _better,
-    Outcome.WORSE: _worse,
-    Outcome.MIXED: _mixed,
-    Outcome.NO_DIFFERENCE: _no_difference,
-}
+    rest = f"; no clear change: {stays}" if stays else ""
+    if outcome is Outcome.BETTER:
+        return f"{name} lowers the rms error of {lower}{rest}{_price(plain, adaptive)}."
+    if outcome is Outcome.WORSE:
+        return f"{name} does not help: it raises the rms error of {higher}{rest}."
+    if outcome is Outcome.MIXED:
+        return f"{name} has mixed results: it raises the rms error of {higher} and lowers that of {lower}{rest}."
+    return f"{name} makes no clear difference: it changes the rms error of {stays}."
 
 
 def _listed(entry: Entry, changes: Sequence[Change], *, factors: bool = True) -> str:
@@ -214,18 +199,6 @@ def _factor(change: Change) -> str:
         return ""
     more = change.ratio > 1
     return f" ({times(change.ratio if more else 1 / change.ratio)} {'more' if more else 'less'})"
-
-
-def _minor(entry: Entry, changes: Sequence[Change]) -> str:
-    if not changes:
-        return ""
-    return f" Too small beside them to count: {_listed(entry, changes, factors=False)}."
-
-
-def _not_weighed(entry: Entry, changes: Sequence[Change]) -> str:
-    if not changes:
-        return ""
-    return f" The cost does not weigh, so the verdict leaves out: {_listed(entry, changes, factors=False)}."
 
 
 def _no_pair(entries: Sequence[Entry]) -> Finding:

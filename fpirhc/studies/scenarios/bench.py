@@ -32,6 +32,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import JUDGING, Compiled, Simulator, built, with_judgements
 from fpirhc.studies.comparison.causes import error_left_alone
 from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
+from fpirhc.studies.view import finite_alone
 from fpirhc.task.problem import Problem
 
 FORMAT = 6  # of records
@@ -227,9 +228,9 @@ class Bench:
             "controller": name,
             "mismatch": scenario.mismatch,
             "outcome": outcome(stop, self._judged(scenario, metrics, size)),
-            "error": _finite(size),
-            "metrics": _finite(metrics.values),
-            "pictures": {} if run is None else _finite(self._kept(name, run)),
+            "error": finite_alone(size),
+            "metrics": finite_alone(metrics.values),
+            "pictures": {} if run is None else finite_alone(self._kept(name, run)),
             "lasted": 1.0 if run is None else run.cycles / scenario.problem.cycles,
             "stop": stop,
         }
@@ -407,16 +408,6 @@ def _kept_of(picture: Picture, run: Run) -> Kept:
         return picture.kept(run)
     except FpirhcError as error:  # a mistake in a picture costs no run
         return {NOT_DRAWN: str(error)}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
-    if isinstance(value, str):
-        return value
-    return value if abs(value) < float("inf") else None
 
 
 DIVERGED = 1.0  # relative error above which a run that lasted to its end has diverged: as large as the motion itself
