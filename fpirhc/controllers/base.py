@@ -141,11 +141,11 @@ def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[
     `judged` are solver statuses.
     """
     delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(command_before(problem), "command")]
-    return [_limit_block(problem), _judge_block(judged), _warm_up_block(problem.longest_warm_up)], delays
+    return [_limit_block(problem), _judge_block(judged), warm_up_block(problem.longest_warm_up)], delays
 
 
-def _warm_up_block(warm_up_cycles: float) -> Block:
-    """Block that counts the cycles of a run up to `warm_up_cycles`, after which the response may be used."""
+def warm_up_block(warm_up_cycles: float) -> Block:
+    """Return the block that counts the cycles of a run up to `warm_up_cycles`, after which the response may be used."""
 
     def step(s: Signals) -> dict[str, Expression]:
         return {"_warm_up_now": ca.fmin(s.warm_up + 1, warm_up_cycles)}

@@ -44,9 +44,12 @@ class Replanning(Checked, ABC):
         return True
 
     @property
-    @abstractmethod
     def law(self) -> Tracking | None:
-        """The law that keeps the plant on the planned motion between plans; None: the plan's response is the desired one."""
+        """The law that keeps the plant on the planned motion between plans, by default `tracking`; None: nothing does.
+
+        Then the plan's response is the desired one.
+        """
+        return getattr(self, "tracking", None)
 
     @property
     def room(self) -> Mapping[str, float] | None:
@@ -71,8 +74,6 @@ class FromMeasurement(Replanning):
     consistent: bool | None = field(default=None, kw_only=True, metadata={"setting": False})
 
     restarts = True
-
-    law = None
 
     def parts(self, problem: Problem) -> Parts:
         plant = problem.plant
@@ -100,10 +101,6 @@ class FromMeasurementTracked(Replanning):
 
     restarts = True
 
-    @property
-    def law(self) -> Tracking:
-        return self.tracking
-
     def parts(self, problem: Problem) -> Parts:
         def start(s: Signals) -> dict[str, Expression]:
             fresh = ca.logic_or(s.warm_up < 0.5, s._due > 0.5)
@@ -129,10 +126,6 @@ class FromPlan(Replanning):
     )
 
     restarts = False
-
-    @property
-    def law(self) -> Tracking:
-        return self.tracking
 
     def parts(self, problem: Problem) -> Parts:
         def start(s: Signals) -> dict[str, Expression]:

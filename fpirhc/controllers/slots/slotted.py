@@ -17,15 +17,16 @@ from fpirhc.controllers.base import (
     clip,
     command_before,
     deform_block,
-    error_signal,
     like,
+    reference_block,
     under_names,
+    warm_up_block,
 )
 from fpirhc.controllers.check import limit_behind
 from fpirhc.controllers.contract import late_deformation
 from fpirhc.controllers.mirror import Answers, believed_path, instant_mirror
 from fpirhc.controllers.model_inputs import measured_output
-from fpirhc.controllers.reference_states import motion_of, own_signals, own_values, stages_of
+from fpirhc.controllers.reference_states import own_signals, own_values, stages_of
 from fpirhc.controllers.slots.schedules import Schedule, linear_modes
 from fpirhc.controllers.slots.slot import (
     Channel,
@@ -280,12 +281,7 @@ def _usable_from(problem: Problem, one: Channel, measurement: float) -> float:
 def _count_block(problem: Problem, channels: Sequence[Channel]) -> Block:
     """Block that counts the cycles until every y^(r) may be used."""
     late = problem.dead_time.at_longest.measurement
-    most = max(live.nominal(_usable_from(problem, c, late)) for c in channels)
-
-    def step(s: Signals) -> dict[str, Value]:
-        return {"_warm_up_now": ca.fmin(s.warm_up + 1, most)}
-
-    return Block("running", Layout((scalar("warm_up"),)), Layout((scalar("_warm_up_now"),)), step)
+    return warm_up_block(max(live.nominal(_usable_from(problem, c, late)) for c in channels))
 
 
 def _mirror(problem: Problem, one: Channel, name: str) -> Block:
@@ -401,20 +397,6 @@ def radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule,
 def by_slot(channels: Sequence[Channel], name: str) -> Signal:
     """A signal that holds a y^(r) of every slot."""
     return Signal(name, tuple(c.slot.coordinate for c in channels), tuple(c.chain.response_unit for c in channels))
-
-
-def reference_block(problem: Problem) -> Block:
-    """Block (time, outputs) -> (reference of the outputs, error of the judged ones)."""
-    plant, seen, function = problem.plant, problem.plant.output, motion_of(problem)
-    places = [seen.elements.index(c) for c in problem.judged_names]
-
-    def step(s: Signals) -> dict[str, Expression]:
-        reference = function(s.time, *own_values(problem, s))[0]
-        return {"reference": reference, "error": reference[places] - getattr(s, seen.name)[places]}
-
-    writes = Layout((like(seen, "reference"), error_signal(problem, "error")))
-    reads = Layout((time_signal(plant), seen, *own_signals(problem)))
-    return Block("reference", reads, writes, step, opaque=problem.reference.opaque)
 
 
 def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
