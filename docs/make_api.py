@@ -72,6 +72,7 @@ WITH_MEMBERS = {
     "Review",
     "figures",
 }
+INHERITED = {"Stepper": ["   :inherited-members:"]}  # its numbers in force
 
 
 def by_section() -> dict[str, list[str]]:
@@ -107,7 +108,7 @@ def _entry(name: str, member: object) -> list[str]:
     if isinstance(member, ModuleType):
         return [f".. automodule:: {member.__name__}", *(["   :members:"] if name in WITH_MEMBERS else [])]
     kind = "autoclass" if isinstance(member, type) else "autofunction"
-    return [f".. {kind}:: fpirhc.{name}", *(["   :members:"] if name in WITH_MEMBERS else [])]
+    return [f".. {kind}:: fpirhc.{name}", *(["   :members:"] if name in WITH_MEMBERS else []), *INHERITED.get(name, [])]
 
 
 if __name__ == "__main__":

@@ -224,36 +224,32 @@ class NumbersNow:
     """Live settings and set-points in force, written into the arguments of a step.
 
     What is refused changes nothing: the old numbers stay, `refused` counts, and `why_refused` states the last reason.
-
-    Attributes:
-        numbers: live settings in force, by path.
-        refused: number of changes that were refused.
-        why_refused: reason of the last one.
     """
 
-    def __init__(
-        self, live: LiveSettings, composite: Composite, settings: Mapping[str, np.ndarray], setpoints: np.ndarray
-    ) -> None:
-        """Put the numbers of the build in force.
+    refused: int  # number of changes that were refused
+    why_refused: str  # reason of the last change that was refused
 
-        `setpoints`: argument of the step, with the set-points at the start; no entries without any.
-        """
-        self._live, self._composite = live, composite
-        self._settings, self._setpoints = settings, setpoints
+    def _begin(self, live: LiveSettings, composite: Composite, arguments: StepArguments) -> None:
+        """Put the numbers of the build in force."""
+        self._live, self._composite, self._arguments = live, composite, arguments
         self.refused, self.why_refused = 0, ""
-        self.numbers: dict[str, float] = live.start
-        self._write(self.numbers)
+        self._numbers: dict[str, float] = live.start
+        self._write(self._numbers)
 
-    def memory(self) -> np.ndarray:
+    def start(self) -> np.ndarray:
         """Return the memory of the controller before its first cycle, with the settings in force."""
-        remembered = self._composite.derived(self.numbers).memory() if self.numbers else {}
+        remembered = self._composite.derived(self._numbers).memory() if self._numbers else {}
         return self._composite.memory.pack(remembered)
 
     def change(self, settings: Numbers) -> bool:
-        """Put numbers of live settings in force, by path, and return whether they were accepted."""
+        """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
+
+        Raises:
+            InvalidName: a setting that is not live.
+        """
         if not named_entries("settings", settings):
             return True
-        before = {path: value for path, value in self.numbers.items() if path in self._live.paths}
+        before = {path: value for path, value in self._numbers.items() if path in self._live.paths}
         try:
             _, _, numbers = self._live.changed({**before, **self._live.flat(settings)})
             self._write(numbers)
@@ -261,37 +257,64 @@ class NumbersNow:
             raise
         except FpirhcError as error:
             return self._refuse(error)
-        self.numbers = numbers
+        self._numbers = numbers
         return True
 
-    def bounds(self) -> dict[str, Interval]:
-        """Return for each live setting the interval in which it is accepted while the others stay as in the build, by path."""
-        return {path: self._live.bounds(path) for path in self._live.paths}
-
     def set_reference(self, setpoints: SetpointsNow) -> bool:
-        """Put set-points in force, by coordinate or output, and return whether they were accepted."""
+        """Put set-points in force from the next step on, by coordinate or output, and return whether they were accepted.
+
+        A set-point that is not finite, or outside the range or the limits of its state, is refused with all others of the call: the
+        old ones stay, `refused` counts, and `why_refused` states the reason.
+
+        Raises:
+            InvalidName: a coordinate without set-point.
+            InvalidShape: neither one number nor one per node.
+        """
         if not named_entries("setpoints", setpoints):
             return True
         try:
-            row = set_points_now(self._live.problem, setpoints, self._setpoints)
+            row = set_points_now(self._live.problem, setpoints, self._arguments.setpoints)
         except InvalidValue as error:
             return self._refuse(error)
-        self._setpoints[:] = row
+        self._arguments.setpoints[:] = row
         return True
+
+    @property
+    def settings(self) -> Layout:
+        """The live settings among `reads`, 'setting.PATH', and what follows from them, 'setting.derived.NAME'."""
+        return self._composite.settings
+
+    def bounds(self) -> dict[str, Interval]:
+        """Return for each live setting the interval of the numbers that a device without Python may accept, by path.
+
+        It is the interval around the number of the build in which the setting is accepted while the others stay, found by trials of
+        Python's own check, to a millionth of the number. A limit of an input ends at that of the build; infinite ends refuse
+        nothing.
+        """
+        return ByName({path: self._live.bounds(path) for path in self._live.paths}, "Stepper.bounds()")
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The live settings in force, by path."""
+        return ByName(self._numbers, "Stepper.numbers")
 
     @property
     def setpoints(self) -> dict[str, float | list[float]]:
         """The set-points in force, by coordinate or output; where they are announced, one per node of the horizon."""
         names = self._live.problem.plant.chains
-        rows = self._setpoints.reshape(-1, len(names)).T
+        rows = self._arguments.setpoints.reshape(-1, len(names)).T
         values = {
             n: row.tolist() if row.size > 1 else float(row[0]) for n, row in zip(names, rows, strict=True) if row.size
         }
         return ByName(values, "Stepper.setpoints")
 
     def outdated(self) -> dict[str, str]:
-        """Return what follows from live settings by way of Python, and what becomes of a device that keeps the old number."""
-        return ByName(self._composite.derived(self.numbers).stale if self.numbers else {}, "Stepper.outdated()")
+        """Return what follows from live settings by way of Python, and the effect of a deployed build with the outdated value.
+
+        Gains, scales, limits, weights and dead times themselves are data, and may be written at any time. An empty text
+        says that the number must not stay as it was: change the settings that it follows from only where Python computes it.
+        """
+        return ByName(self._composite.derived(self._numbers).stale if self._numbers else {}, "Stepper.outdated()")
 
     def _write(self, numbers: Mapping[str, float]) -> None:
         """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""
@@ -299,7 +322,7 @@ class NumbersNow:
             return
         values = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
         values |= self._composite.derived(numbers).signals
-        for name, argument in self._settings.items():
+        for name, argument in self._arguments.settings.items():
             argument[:] = values[name]
 
     def _refuse(self, error: FpirhcError) -> bool:

@@ -42,7 +42,7 @@ _TRUTHS = (bool, np.bool_)
 _NOT_SOLVED = "the compiled solver failed"
 
 
-class Stepper(Checked):
+class Stepper(NumbersNow, Checked):
     """One controller, ready to be called once per control cycle.
 
         stepper = Stepper(problem, controller)
@@ -125,26 +125,26 @@ class Stepper(Checked):
         if bounded:
             refuse_unbounded(ready)
         ranges = plausible_range(problem, plausible)
-        self._composite, self.memory = composed_step(settings, ready, ranges, max_age, monitor or RunMonitor(), bridged)
-        self.function: ca.Function = self._composite.function
+        composite, self.memory = composed_step(settings, ready, ranges, max_age, monitor or RunMonitor(), bridged)
+        self.function: ca.Function = composite.function
         backend = native(self.function, required=bool(live)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
-        self.signals: Layout = self._composite.trace
+        self.signals: Layout = composite.trace
         self.measures = measures(problem, ready)  # names of the raw measurements
         self.why_failed = ""
         self._title = f"{problem.name}, {name_in_task(controller)}"
-        self._may_fail = self._composite.opaque  # scalar code cannot fail
+        self._may_fail = composite.opaque  # scalar code cannot fail
         function = backend.function if backend else self.function
         model = ready.plant_model(problem)
         parameters = model.parameters(model.plant)
-        arguments = StepArguments(function, self._composite, problem, parameters, ages=max_age is not None)
-        self._now = NumbersNow(settings, self._composite, arguments.settings, arguments.setpoints)
-        self.reads: Layout = self._composite.reads.starting_at(np.concatenate(arguments.evaluator.arguments[1:]))
+        arguments = StepArguments(function, composite, problem, parameters, ages=max_age is not None)
+        self._begin(settings, composite, arguments)
+        self.reads: Layout = composite.reads.starting_at(np.concatenate(arguments.evaluator.arguments[1:]))
         self.estimates, self.beside = arguments.estimates, arguments.beside
         self._tokens = [True]
         self._fingerprint = float(self.memory[FINGERPRINT].start[0])
         # Attributes of the stepper itself are found faster in every step.
-        self._arguments, self._evaluate = arguments, arguments.evaluator.evaluate
+        self._evaluate = arguments.evaluator.evaluate
         self._time, self._state, self._realised = arguments.time, arguments.state, arguments.realised
         self._memory, self._command = arguments.memory, arguments.command
         self._new_command, self._new_memory = arguments.command_next.copy, arguments.memory_next.copy
@@ -165,10 +165,6 @@ class Stepper(Checked):
         backend = "compiled C" if self.compiled else "virtual machine"
         facts = [self._title, backend, *([] if self.deadline is None else [str(self.deadline)])]
         return f"Stepper({', '.join(facts)})"
-
-    def start(self) -> np.ndarray:
-        """Return the memory of the controller before its first cycle, with the settings in force."""
-        return self._now.memory()
 
     def step(
         self,
@@ -264,68 +260,6 @@ class Stepper(Checked):
         return self.step(
             time, state, realised, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
         )
-
-    def change(self, settings: Numbers) -> bool:
-        """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
-
-        Raises:
-            InvalidName: a setting that is not live.
-        """
-        return self._now.change(settings)
-
-    def set_reference(self, setpoints: SetpointsNow) -> bool:
-        """Put set-points in force from the next step on, by coordinate or output, and return whether they were accepted.
-
-        A set-point that is not finite, or outside the range or the limits of its state, is refused with all others of the call: the
-        old ones stay, `refused` counts, and `why_refused` states the reason.
-
-        Raises:
-            InvalidName: a coordinate without set-point.
-            InvalidShape: neither one number nor one per node.
-        """
-        return self._now.set_reference(setpoints)
-
-    @property
-    def settings(self) -> Layout:
-        """The live settings among `reads`, 'setting.PATH', and what follows from them, 'setting.derived.NAME'."""
-        return self._composite.settings
-
-    def bounds(self) -> dict[str, Interval]:
-        """Return for each live setting the interval of the numbers that a device without Python may accept, by path.
-
-        It is the interval around the number of the build in which the setting is accepted while the others stay, found by trials of
-        Python's own check, to a millionth of the number. A limit of an input ends at that of the build; infinite ends refuse
-        nothing.
-        """
-        return ByName(self._now.bounds(), "Stepper.bounds()")
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """The live settings in force, by path."""
-        return ByName(self._now.numbers, "Stepper.numbers")
-
-    @property
-    def setpoints(self) -> dict[str, float | list[float]]:
-        """The set-points in force, by coordinate or output; where they are announced, one per node of the horizon."""
-        return self._now.setpoints
-
-    @property
-    def refused(self) -> int:
-        """Number of changes that were refused."""
-        return self._now.refused
-
-    @property
-    def why_refused(self) -> str:
-        """Reason of the last change that was refused."""
-        return self._now.why_refused
-
-    def outdated(self) -> dict[str, str]:
-        """Return what follows from live settings by way of Python, and the effect of a deployed build with the outdated value.
-
-        Gains, scales, limits, weights and dead times themselves are data, and may be written at any time. An empty text
-        says that the number must not stay as it was: change the settings that it follows from only where Python computes it.
-        """
-        return self._now.outdated()
 
     @property
     def skipped(self) -> int:
