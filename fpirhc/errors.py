@@ -163,8 +163,9 @@ def _near(name: str, names: Sequence[str]) -> list[str]:
     """Valid names that may be meant, the likeliest first."""
     derivative = name.removesuffix("_ddot") + "''" if name.endswith("_ddot") else name.removesuffix("_dot") + "'"
     elsewhere = [one for one in (derivative, *OF_OTHER_TOOLS.get(name, ())) if one in names]
+    same = [one for one in names if one.casefold() == name.casefold()]
     inside = [one for one in names if len(name) > _LETTER and name.casefold() in one.casefold()]
-    return [*elsewhere, *get_close_matches(name, names, n=1, cutoff=0.5), *inside]
+    return [*elsewhere, *same, *get_close_matches(name, names, n=1, cutoff=0.5), *inside]
 
 
 _MANY, _SHOWN = 40, 8  # names beyond which a list is cut, and to how many

@@ -7,6 +7,7 @@ state, and any other one a field of the problem or a number inside it, 'limits.i
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -353,15 +354,13 @@ def _read(
     make: Callable[..., Cases], path: Path, needed: Sequence[str], words: Mapping[str, Mapping[str, float]]
 ) -> Cases:
     """The cases of a file; places of mistakes are its rows and columns, counted from 1."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = [(k, row) for k, row in enumerate(csv.reader(file), 1) if any(row) and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InvalidProblem(f"cases: cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
+    lines = _lines(path)
     mistakes = Mistakes(path.name)
     first, cells_of_head = lines[0] if lines else (1, [])
     head = [cell.strip() for cell in cells_of_head]
     _check_head(f"row {first}", head, needed, mistakes)
+    if not lines[1:]:
+        mistakes.add(f"row {first}: no row follows; expected one for every case")
     changes: dict[str, dict[str, object]] = {}
     places: dict[str, str] = {}
     for number, row in lines[1:]:
@@ -385,10 +384,28 @@ def _read(
     return make(changes, places=places)
 
 
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """The cells of a file by row, without remarks and empty rows."""
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+        rows = list(csv.reader(io.StringIO(text, newline="")))
+    except UnicodeDecodeError as error:
+        row, byte = error.object[: error.start].count(b"\n") + 1, error.object[error.start]
+        raise InvalidProblem(f"{path.name}: row {row}: expected text in UTF-8, got the byte 0x{byte:02x}") from None
+    except (OSError, csv.Error) as error:
+        raise InvalidProblem(f"cases: cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
+    return [(k, row) for k, row in enumerate(rows, 1) if any(row) and not row[0].startswith("#")]
+
+
 def _check_head(row: str, head: Sequence[str], needed: Sequence[str], mistakes: Mistakes) -> None:
+    other = next((mark for mark in ";\t| " if head and _CASE in map(str.strip, head[0].split(mark))), "")
+    if not head:
+        mistakes.add(f"{row}: it is empty; expected '{_CASE}' and the heads of the other columns")
+    elif other and _CASE not in head:
+        mistakes.add(f"{row}: expected columns that are separated by commas, got {other!r}")
+    mistakes.raise_if_any()
     if _CASE not in head:
-        apart = "; columns are separated by commas" if head and ";" in head[0] else ""
-        mistakes.add(f"{row}: there is no column '{_CASE}' with the names of the cases{apart}.{nearest(_CASE, head)}")
+        mistakes.add(f"{row}: there is no column '{_CASE}' with the names of the cases.{nearest(_CASE, head)}")
     for column in (c for c in needed if c not in head):
         mistakes.add(f"{row}: there is no column '{column}', which every case needs.{nearest(column, head)}")
     for column in dict.fromkeys(head):

@@ -381,7 +381,12 @@ WRONG_PATHS: dict[str, tuple[Any, str]] = {
 }
 WRONG_TABLES = {
     "no column of names": ("name,exact.b\nweak,1\n", r"cases\.csv: row 1: there is no column 'case'"),
-    "semicolons": ("case;exact.b\nweak;1\n", "columns are separated by commas"),
+    "semicolons": ("case;exact.b\nweak;1,5\n", "^cases.csv: row 1: expected columns .* separated by commas, got ';'$"),
+    "tabs": ("exact.b\tcase\n1\tweak\n", r"separated by commas, got '\\t'$"),
+    "nothing": ("", "^cases.csv: row 1: it is empty; expected 'case' and the heads of the other columns$"),
+    "remarks alone": ("# a remark\n", "^cases.csv: row 1: it is empty"),
+    "a head alone": ("# a remark\ncase,exact.b\n", "^cases.csv: row 2: no row follows; expected one for every case$"),
+    "a head in capitals": ("case,exact.B\nweak,1\n", r"there is no 'B'\. Did you mean 'b'\?"),
     "a name twice": ("case,exact.b\nweak,1\nweak,2\n", "row 3, column 'case': 'weak' stands in row 2 too"),
     "a column twice": ("case,exact.b,exact.b\nweak,1,2\n", "row 1: column 'exact.b' stands 2 times"),
     "too few cells": ("case,exact.b\nweak\n", "row 2: it has 1 cells, expected 2"),
@@ -418,6 +423,19 @@ def test_wrong_tables(wrong, task):
     text, message = WRONG_TABLES[wrong]
     with pytest.raises(InvalidProblem, match=message):
         fp.Cases.from_csv(written(text).resolve()).check(task.problem)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "found"), [("latin-1", "row 2: .* got the byte 0xe4"), ("utf-16", "row 1: .* 0xf[ef]")]
+)
+def test_a_table_is_text_in_utf_8(encoding, found, task):
+    """Any other encoding is told with the row of its first byte; a mark of byte order in front is passed over."""
+    text = "case,exact.b\nträge,1\n"
+    Path("cases.csv").write_bytes(text.encode(encoding))
+    with pytest.raises(InvalidProblem, match=f"cases.csv: {found}"):
+        fp.Cases.from_csv(Path("cases.csv").resolve())
+    Path("cases.csv").write_bytes(text.encode("utf-8-sig"))
+    assert fp.Cases.from_csv(Path("cases.csv").resolve()).names == ("träge",)
 
 
 def test_a_right_case_is_refused_beside_wrong_ones(task):
