@@ -33,8 +33,8 @@ runs = {
 figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
 for name, run in runs.items():
     axis.semilogy(run.time, abs(run["error.q1"]) + 1e-7, lw=1, label=name)
-axis.set(xlabel="time [s]", ylabel="|error of q1| [m]")
-axis.legend()
+axis.set(xlabel="time [s]", ylabel="|error of q1| [m]", ylim=(1e-7, 3))
+axis.legend(ncols=3, loc="upper center")
 
 # %%
 # Why it works: the *deformed* request is far from what is wanted, by as much as the
@@ -52,7 +52,5 @@ axis.legend()
 # The numbers.
 
 for name, run in runs.items():
-    print(
-        name,
-        {q: f"{e:.2e} m" for q, e in fp.measure(task.problem, run).rms_error.items()},
-    )
+    errors = fp.measure(task.problem, run).rms_error
+    print(f"{name:15s}", *(f"{q} {1e3 * e:.2g} mm" for q, e in errors.items()))

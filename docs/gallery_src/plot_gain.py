@@ -10,6 +10,8 @@ Between the two lies a range in which a loop that is already quiet stays quiet, 
 that is not may oscillate for ever.
 """
 
+import textwrap
+
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -42,7 +44,7 @@ spectrum = spectrum_over_run(
     task.problem.plant, run["state"][::50], run["deformed"][::50]
 )
 report = assess_gain(fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), spectrum)
-print(report.text)
+print(textwrap.fill(report.text, 85))
 
 figure, axis = plt.subplots(figsize=(8, 3.4), layout="constrained")
 axis.loglog(-gains, errors, "o-", ms=4)
@@ -50,3 +52,5 @@ for limit, name in ((2.82, "sector limit"), (3.36, "linear limit")):
     axis.axvline(limit, ls="--", lw=0.8, color="grey")
     axis.text(limit, max(errors), name, rotation=90, va="top", ha="right", fontsize=8)
 axis.set(xlabel="-gain", ylabel="rms response error [m/s²]")
+axis.set_xticks([0.2, 0.5, 1, 2, 3], ["0.2", "0.5", "1", "2", "3"])
+axis.minorticks_off()

@@ -30,10 +30,8 @@ for name, optimiser in {
     "IPOPT": fp.Ipopt(),
 }.items():
     plans[name] = fp.solve(ocp, optimiser, problem.start_state, data)
-    print(
-        name,
-        f"cost {plans[name].cost:.6f}, stationarity {plans[name].stationarity:.1e} N, {plans[name].status.name}",
-    )
+    found = plans[name]
+    print(name, f"cost {found.cost:.6f}, stationarity {found.stationarity:.1e} N")
 
 # %%
 # The same plan from both; at the start the force is at its limit.

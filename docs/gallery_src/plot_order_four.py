@@ -7,6 +7,7 @@ and twice too fast. Whatever the model is asked for, the plant answers three tim
 strongly, so an iteration of gain a multiplies its error by 1 - 3 a in every cycle.
 """
 
+import textwrap
 from dataclasses import replace
 
 import matplotlib.pyplot as plt
@@ -69,7 +70,7 @@ noisy = replace(
 try:
     rms(noisy, controllers["CTC+FPI"])
 except fp.FpirhcError as reason:
-    print(reason)
+    print(textwrap.fill(str(reason), 85))
 leaky = fp.ComputedTorque(
     fp.Exponential(rate=3.0),
     fp.Increment(

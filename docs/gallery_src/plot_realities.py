@@ -8,6 +8,7 @@ and what did the review say before? Every number on this page is computed when i
 reality is written, also one with other states than the model, is in `docs/extending/reality.md`.
 """
 
+import textwrap
 from dataclasses import replace
 
 import casadi as ca
@@ -192,7 +193,7 @@ for name, answers in reviews.items():
     for answer in answers["CTC, increment"]:
         if "lag of the reality" in answer.question or "resonance" in answer.question:
             print(f"{name}: {answer.verdict!s}. {answer.question}")
-            print(f"    {answer.evidence}")
+            print(textwrap.indent(textwrap.fill(answer.evidence, 80), "    "))
 
 # %%
 # The picture: how many times smaller the error becomes by adaptation.
@@ -204,4 +205,4 @@ for k, (name, column) in enumerate(list(zip(controllers, errors.T, strict=True))
 axis.axhline(1, color="k", lw=0.8)
 axis.set(yscale="log", ylabel="error without / with adaptation", xticks=places)
 axis.set_xticklabels(list(realities), rotation=30, ha="right")
-axis.legend()
+axis.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1))

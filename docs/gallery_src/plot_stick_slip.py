@@ -6,6 +6,7 @@ A sledge on bristles (LuGre friction) follows a sine, reversing twice in three s
 The model takes its slide for well oiled: it has a hundredth of the friction.
 """
 
+import textwrap
 from dataclasses import replace
 
 import matplotlib.pyplot as plt
@@ -14,9 +15,10 @@ import fpirhc as fp
 
 task = fp.load_problem("stick_slip")
 problem, controllers = task.problem, task.controllers
+shown = ("RHC", "RHC+FPI, model-referenced", "RHC exact model")
 runs = {
     name: fp.simulate(problem, controllers[name], seed=0)
-    for name in ("RHC", "RHC+FPI, model-referenced", "RHC exact model")
+    for name in (*shown, "RHC offset-free", "CTC+FPI")
 }
 for name, run in runs.items():
     error = fp.measure(problem, run).rms_error["x"]
@@ -31,6 +33,7 @@ for name, run in runs.items():
 # knows nothing of it, so RHC alone learns of it from the error only.
 
 [portrait] = task.pictures
+runs = {name: runs[name] for name in shown}
 portrait.draw(plt.figure(figsize=(8, 3), layout="constrained"), runs)
 figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
 for name, run in runs.items():
@@ -49,10 +52,11 @@ for substeps in (1, 8):
     other = replace(problem, horizon=horizon)
     answers = fp.review(other, exact, mismatch=0.0, seed=0).controllers["exact"]
     worst = max(answers, key=lambda a: a.verdict.value == "no")
-    print(f"{substeps} sub-steps: {worst.question} {worst.evidence}")
+    print(f"{substeps} sub-steps:", worst.verdict)
+    print(textwrap.fill(f"{worst.question} {worst.evidence}", 85))
     try:
         run = fp.simulate(other, exact["exact"], seed=0)
     except fp.FpirhcError as reason:
-        print(reason)
+        print("refused:", str(reason).split(";")[0])
     else:
         print(f"rms error {1e3 * fp.measure(other, run).rms_error['x']:.3g} mm")

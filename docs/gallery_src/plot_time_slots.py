@@ -29,8 +29,8 @@ print(f"Floquet radius {floquet.radius:.4f} per period of {floquet.period:g} s")
 run = fp.simulate(task.problem, controller, seed=0)
 figure, axes = plt.subplots(2, 1, figsize=(8, 4), sharex=True, layout="constrained")
 active = run["slot"].ravel()
-for axis, name in zip(axes, ("cart", "angle"), strict=True):
-    axis.plot(run.time, run[f"error.{name}"], lw=1)
+for axis, name in zip(axes, ("cart [m]", "angle [rad]"), strict=True):
+    axis.plot(run.time, run[f"error.{name.split()[0]}"], lw=1)
     axis.set(ylabel=f"error of {name}")
     axis.fill_between(
         run.time,

@@ -75,5 +75,5 @@ for name, run in runs.items():
     size.plot(run.time, run["true_error.size"], lw=1, label=name)
     dose.step(run.time, run["command.dose"], lw=1, where="post")
 size.set(ylabel="error of ln(volume)", ylim=(-0.2, 0.2))
-size.legend()
+size.legend(ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1))
 dose.set(ylabel="dose asked for [mg/kg/day]", xlabel="time [day]")
