@@ -136,14 +136,22 @@ class Points:
         return {pair: one for pair, one in drawn.items() if (_fed_back(one) >= _SMALL * strongest).all()}
 
     def feasible(self, places: Sequence[int]) -> list[int]:
-        """Return those of some points whose plan keeps its limits of states; all of them where none does."""
-        return [place for place, _ in self._feasible([(place, 0) for place in places])]
+        """Return those of some points whose plan keeps its limits of states; where none does, those whose plan is solved.
+
+        Raises:
+            NoAnswer: every cycle is skipped, or no plan is solved.
+        """
+        feasible = [place for place, _ in self._feasible([(place, 0) for place in places])]
+        if places and not feasible:
+            raise NoAnswer("no plan along the reference keeps its limits of states")
+        return feasible
 
     def _feasible(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
         moved = [pair for pair in pairs if not self.asked.skips(self.quiet(*pair))]
         if pairs and not moved:
             raise NoAnswer("every cycle is skipped along the reference, because a signal is not finite there")
-        return [pair for pair in moved if self.asked.feasible(self.quiet(*pair))] or moved
+        kept = [pair for pair in moved if self.asked.feasible(self.quiet(*pair))]
+        return kept or [pair for pair in moved if self.asked.solves(self.quiet(*pair))]
 
     def between(self, place: int, draw: int, gains: tuple[float, float], *, held: bool) -> tuple[LinearLoop, ...]:
         """Return the linear loops of two gains of the map at a point, in the same coordinates; held: plans are held for ever."""

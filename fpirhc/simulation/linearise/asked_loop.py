@@ -276,6 +276,10 @@ class AskedLoop:
         """Return whether the next cycle has a plan that keeps its limits of states; a loop without such a plan breaks none."""
         return bool((self._step(memory)[1][self._violations] <= FEASIBLE).all())
 
+    def solves(self, memory: np.ndarray) -> bool:
+        """Return whether the next cycle has a plan that is solved, as soft limits may be beyond theirs."""
+        return all(Status(int(one)) == Status.OK for one in self._step(memory)[1][self._statuses])
+
     def skips(self, memory: np.ndarray) -> bool:
         """Return whether the next cycle is skipped, with the last command and every memory as it was."""
         return any(Status(int(one)).skips for one in self._step(memory)[1][self._statuses])
