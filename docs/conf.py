@@ -16,6 +16,7 @@ make_command_line.PAGE.write_text(make_command_line.page(), encoding="utf-8")
 
 project = "fpirhc"
 author = "The fpirhc authors"
+copyright = author
 release = importlib.metadata.version("fpirhc")
 extensions = [
     "myst_parser",
@@ -32,6 +33,7 @@ html_title = f"fpirhc {release}"
 # version 0.16.22 of KaTeX; the style sheet names the fonts in the one format that every browser reads.
 html_static_path = ["_static"]
 katex_css_path = "katex/katex.min.css"
+html_css_files = ["gallery.css"]
 katex_options = "throwOnError: true"
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3

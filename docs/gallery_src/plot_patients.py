@@ -17,7 +17,9 @@ task = fp.load_problem("anaesthesia_people")
 # %%
 # The worst patient's share of the time in the range in %, the lowest depth of anybody, and
 # the mean share, in four groups. Settings were chosen on the first, by a rule that was
-# changed once after all had been run, so the others are no blind test. The table takes a
+# changed once after all had been run, so the others are no blind test. At least 90, 37 and
+# 97 are wanted: of those whom no setting was chosen on, the cascade in mg/l and the PID law
+# have it in every group. The table takes a
 # minute, so it is kept in the problem file, where a test compares it with its command,
 # ``fpirhc compare anaesthesia_people --cases all``.
 
@@ -57,9 +59,18 @@ for axis, case in zip(axes, cases, strict=True):
             task.cases.problem(case, task.problem), task.controllers[name], seed=0
         )
         axis.plot(run.time, run["plant_state.bis"], label=name, linewidth=1)
-    axis.set(ylabel=f"bis of {case}", ylim=(10, 100))
-axes[-1].set_xlabel("min")
+    axis.set(ylabel=f"bis of {case} [1]", ylim=(10, 100))
+axes[-1].set_xlabel("time [min]")
 axes[0].legend(ncols=2, fontsize=8)
+
+# %%
+# What the pump gives to the sensitive one: the sooner the bis is at 50, the larger the first
+# infusion, and the deeper the induction.
+
+patient = task.cases.problem("C06", task.problem)
+shown = {n: fp.simulate(patient, task.controllers[n], seed=0) for n in rows}
+_, infusion = task.pictures
+infusion.draw(plt.figure(figsize=(8, 5), layout="constrained"), shown)
 
 # %%
 # The model-referenced cascade begins with its model's whole target, as the pump alone does,
@@ -84,7 +95,7 @@ shown.plot(
 shown.plot(
     run.time, run["plant_state.bis"], color="black", linewidth=1, label="patient"
 )
-shown.set(ylabel="bis")
-moved.set(ylabel="target [mg/l]", xlabel="min")
+shown.set(ylabel="bis [1]")
+moved.set(ylabel="target [mg/l]", xlabel="time [min]")
 shown.legend(fontsize=8)
 moved.legend(fontsize=8)

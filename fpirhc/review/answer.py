@@ -13,9 +13,13 @@ from fpirhc.task.problem import Problem
 
 
 class Verdict(StrEnum):
-    """The verdict of an answer; yes is good in every question."""
+    """The verdict of an answer; yes is good in every question.
+
+    Caution is known as well as yes and no: less than is wished for, and no reason to stop.
+    """
 
     YES = "yes"
+    CAUTION = "caution"
     NO = "no"
     UNKNOWN = "unknown"
 
@@ -26,7 +30,7 @@ class Answer(FoundByName):
 
     Args:
         question: in the words of a reader.
-        verdict: yes, no, unknown.
+        verdict: yes, caution, no, unknown.
         evidence: the facts in a sentence, with the deciding number and its unit.
         change: what to change; empty after a yes.
         numbers: the same facts by name.
@@ -91,7 +95,7 @@ class Review(FoundByName):
 
     @property
     def ready(self) -> bool:
-        """Whether every answer is yes or unknown."""
+        """Whether no answer is no."""
         return not self.to_do
 
 

@@ -25,7 +25,7 @@ def judged(good: bool, pairs: Iterable[ErrorPair], *, spared: bool) -> Verdict:
     """
     if good:
         return Verdict.YES
-    return Verdict.NO if not spared and any(pair.fails for pair in pairs) else Verdict.UNKNOWN
+    return Verdict.NO if not spared and any(pair.fails for pair in pairs) else Verdict.CAUTION
 
 
 def by_run(case: Case, question: str, reason: str) -> Answer:
@@ -51,5 +51,5 @@ def by_run(case: Case, question: str, reason: str) -> Answer:
         return Answer(question, verdict, text, SEE_CONVERGENCE if case.diverges else _LEAVE, numbers)
     if not all(map(math.isfinite, pair.adapted.values())):
         return Answer(question, Verdict.UNKNOWN, text, _ENDS, numbers)
-    longer = "Compare it over several scenarios." if whole else "Run it for longer and compare."
-    return Answer(question, Verdict.UNKNOWN, text, longer, numbers)
+    change = "Compare it over several scenarios." if whole else "Run it for longer and compare."
+    return Answer(question, verdict if whole else Verdict.UNKNOWN, text, change, numbers)

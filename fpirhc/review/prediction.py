@@ -301,9 +301,22 @@ class NominalRuns:
         return self.model.run(self._loop(bare), self.model.of(bare))
 
     def null(self, controller: Controller) -> ErrorPair:
-        """Return the errors of the controller on its own model, with and without adaptation, over at most `CYCLES` cycles."""
+        """Return the errors of the controller on its own model, with and without adaptation, over at most `CYCLES` cycles.
+
+        Where commands stand at a limit in them, the run goes on for as many cycles in which errors count.
+        """
         ready = resolved(self.problem, controller)
-        return errors_of(*self.model.pair((self._loop(without_deformation(ready)), self._loop(ready))))
+        loops = self._loop(without_deformation(ready)), self._loop(ready)
+        pair = errors_of(*self.model.pair(loops))
+        return errors_of(*self._later.pair(loops)) if pair.stuck and self._later is not None else pair
+
+    @cached_property
+    def _later(self) -> ModelAsPlant | None:
+        """The models as plants for as long as it takes until errors have counted for `CYCLES` cycles; None: they do before."""
+        end = min(self.problem.duration, self.problem.measure_from + CYCLES * self.problem.period)
+        if end <= CYCLES * self.problem.period:
+            return None
+        return ModelAsPlant(_quiet(replace(self.problem, duration=end)), seed=0)
 
     def _loop(self, controller: Controller) -> Simulator:
         name = "loop", identity(controller)

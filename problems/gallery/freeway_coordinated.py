@@ -111,3 +111,4 @@ problem = replace(
 )
 controllers, headline = economic.controllers, economic.headline
 metrics, headline_metric = economic.metrics, economic.headline_metric
+pictures = (*economic.pictures, fp.OverTime("Signs", panels=tuple(f"command.{name}" for name in SIGNS)))

@@ -107,3 +107,7 @@ metrics = (
     fp.figures.Largest("plant_state.w2", name="queue"),
 )
 headline_metric = "time_spent"
+pictures = (
+    *metering.pictures,
+    fp.OverTime("Light and queue", panels=("command.r", "plant_state.w2"), levels={"plant_state.w2": (100.0,)}),
+)

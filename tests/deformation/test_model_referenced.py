@@ -360,7 +360,7 @@ def test_review_says_which_form():
     assert advice.change == f"Try ModelReferenced(map={affine(0.5)!r})."
     for own, other, verdict in (
         (1, 1, "yes"),
-        (1.2, 1, "unknown"),
+        (1.2, 1, "caution"),
         (math.nan, 1, "unknown"),
         (math.inf, math.inf, "unknown"),
     ):

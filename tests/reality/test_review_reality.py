@@ -87,7 +87,7 @@ def test_lag_rule_at_its_edge(order):
     below, above = (answer(problem, adapted(share * edge, 1.0), LAG) for share in (0.99, 1.01))
     assert below.numbers["lag"] == pytest.approx(TAU, rel=1e-9)
     assert below.numbers["room"] == pytest.approx(0.99, rel=1e-9)
-    assert (below.verdict, above.verdict) == ("unknown", "no")
+    assert (below.verdict, above.verdict) == ("caution", "no")
 
 
 @pytest.mark.parametrize("damping", [0.2, 0.3])

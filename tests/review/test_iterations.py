@@ -67,7 +67,7 @@ def test_one_iteration_is_enough_for_a_tolerance_that_matters():
     """The intended setting: one step per cycle follows the moving optimum. What the start alone needs is unknown."""
     assert asked(pendulum(), fp.FixedPoint(iterations=1, tolerance=1.0)).verdict == "yes"
     start = asked(pendulum(), fp.FixedPoint(iterations=1, tolerance=5.0))
-    assert (start.verdict, start.numbers["unsolved_later"]) == ("unknown", 0.0)
+    assert (start.verdict, start.numbers["unsolved_later"]) == ("caution", 0.0)
 
 
 def test_a_controller_without_plans_is_not_asked():
@@ -96,7 +96,7 @@ LIMITED = replace(NOISY, limits=fp.Limits(inputs={"u": (-20.0, 20.0)}))
 def test_the_pair_keeps_its_budget_in_a_run():
     """1 % of 40 N: the pair's rms step is 0.4 N, and the review is content with it. The tracking law damps a tenth."""
     advice = answer(LIMITED, fp.Affine(gain=-1.5), WORDS)
-    assert advice.verdict == "unknown"
+    assert advice.verdict == "caution"
     assert "Filtered(map, pole=" in advice.change
     gain, pole = advice.numbers["recommended"], advice.numbers["recommended_pole"]
     pair = fp.Filtered(fp.Affine(gain=-2 * gain), pole=pole)

@@ -89,7 +89,7 @@ def test_errors_of_a_body_outside_are_those_of_now():
 def test_review_names_a_prediction_that_knows_it():
     late = 0.08
     [answer] = about(KNOWS, mass(late), law(late, FORM))
-    assert answer.verdict == "unknown"
+    assert answer.verdict == "caution"
     assert answer.change == "Predict with what acts: Predicted(..., by=ByModel(residual_time=0.08))."
     assert answer.numbers["error with ByModel(residual_time=0.08)"] < 0.01 * answer.numbers["error"]
 

@@ -201,7 +201,7 @@ def test_the_middle_of_a_box_is_in_it(grid, monkeypatch):
     inside, outside = (box_converges(one) for one in cases)
     assert inside.verdict == "yes"
     assert inside.numbers["radius"] == pytest.approx(0.9)
-    assert outside.verdict == "unknown"
+    assert outside.verdict == "caution"
     assert outside.change == "It does not converge at some points of the reference: see there."
 
 
@@ -246,8 +246,8 @@ def test_doubts_and_steep_maps_speak_against_convergence(grid):
     ("drawn", "verdict", "text"),
     [
         ((0.5, 0.9), "yes", "in 100 % of 2 draws; the worst mode is multiplied by 0.9 per cycle"),
-        ((0.5, 1.0), "unknown", "in 50 % of 2 draws; the worst mode is multiplied by 1 per cycle"),
-        ((0.5, 0.9, 1.25), "unknown", "in 66.7 % of 3 draws; the worst mode is multiplied by 1.25 per cycle"),
+        ((0.5, 1.0), "caution", "in 50 % of 2 draws; the worst mode is multiplied by 1 per cycle"),
+        ((0.5, 0.9, 1.25), "caution", "in 66.7 % of 3 draws; the worst mode is multiplied by 1.25 per cycle"),
         ((), "yes", "in 100 % of 1 draw; the worst mode is multiplied by 0.25 per cycle"),
     ],
 )
@@ -257,7 +257,7 @@ def test_share_of_the_box_that_converges(grid, drawn, verdict, text, monkeypatch
     monkeypatch.setattr("fpirhc.review.questions.convergence.loops_over_box", lambda *_: tuple(map(loop, drawn)))
     one = box_converges(case)
     radii = drawn or (0.25,)
-    assert (one.verdict, one.evidence, bool(one.change)) == (verdict, text, verdict == "unknown")
+    assert (one.verdict, one.evidence, bool(one.change)) == (verdict, text, verdict == "caution")
     assert one.numbers == {"share": pytest.approx(np.mean(np.array(radii) < 1)), "radius": max(radii)}
     without: Any = SimpleNamespace(grid=grid, loops=Loops((), (), None, reason="none"))
     assert box_converges(without).evidence == "no linear loop: none"
@@ -292,12 +292,12 @@ def test_numbers_of_the_gain():
     ("gain", "limit", "verdict"),
     [
         (-1.99, 2.0, "yes"),
-        (-2.01, 2.0, "unknown"),
-        (-3.99, 2.0, "unknown"),
+        (-2.01, 2.0, "caution"),
+        (-3.99, 2.0, "caution"),
         (-4.01, 2.0, "no"),
         (0.5, 2.0, "no"),
         (-0.99, 1.0, "yes"),
-        (-1.99, 1.0, "unknown"),
+        (-1.99, 1.0, "caution"),
         (-2.01, 1.0, "no"),
     ],
 )
@@ -340,7 +340,7 @@ def test_both_signs_have_no_gain():
     assert (own.verdict, own.change) == ("no", "See the question about the eigenvalues' sign.")
 
 
-@pytest.mark.parametrize(("limit", "verdict"), [(-0.51, "yes"), (-0.49, "unknown")])
+@pytest.mark.parametrize(("limit", "verdict"), [(-0.51, "yes"), (-0.49, "caution")])
 def test_a_limit_that_is_not_the_maps_counts_too(limit, verdict):
     """J = 1 bears |A_c| < 4; what else limits the loop, such as its poles, is in the advice."""
     spectrum = Spectrum(np.array([[1.0 + 0j]]))
@@ -358,8 +358,8 @@ def test_both_signs_of_an_inverse_are_inside():
     ("limit", "radius", "verdict", "said", "change"),
     [
         (1.0, 1.5, "yes", "the smallest limit is -2, set by a pole", ""),
-        (0.25, 0.9, "unknown", "the smallest limit is -0.5, set by a pole", "Use gain = -0.25, half of it."),
-        (0.2, 0.9, "unknown", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
+        (0.25, 0.9, "caution", "the smallest limit is -0.5, set by a pole", "Use gain = -0.25, half of it."),
+        (0.2, 0.9, "caution", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
         (0.2, 1.0, "no", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
         (0.2, 1.5, "no", "the smallest limit is -0.4, set by a pole", "Use gain = -0.2, half of it."),
         (math.inf, 0.9, "yes", f"no gain up to {FAR:g} times as large is a limit of the whole loop", ""),
@@ -453,10 +453,10 @@ def test_of_a_map_on_targets_the_loop_decides_and_without_eigenvalues_nobody(mon
 def test_the_sign_of_eigenvalues_is_that_of_the_box():
     """J = 1 at the plant; one of the other sign in the box leaves it open, one at the plant is a no; none is no answer."""
     plant, box, both = (Spectrum(np.array(e, complex)[:, None]) for e in ([1.0], [1.0, -0.5], [2.0, -1.0]))
-    asked: dict[str, Any] = {"yes": (plant, plant), "unknown": (plant, box), "no": (both, both), "nothing": None}
+    asked: dict[str, Any] = {"yes": (plant, plant), "caution": (plant, box), "no": (both, both), "nothing": None}
     said = {name: _sign(SimpleNamespace(spectra=spectra)) for name, spectra in asked.items()}  # type: ignore[arg-type]
     assert {name: one.verdict for name, one in said.items()} == {n: n for n in asked} | {"nothing": "unknown"}
-    assert said["unknown"].evidence == "real parts 1 to 1, over the box -0.5 to 1"
+    assert said["caution"].evidence == "real parts 1 to 1, over the box -0.5 to 1"
     assert said["no"].numbers == {"smallest": -1.0, "largest": 2.0, "smallest_over_box": -1.0, "largest_over_box": 2.0}
     assert said["nothing"].evidence.startswith("no finite eigenvalue of the response Jacobian")
     assert [bool(one.change) for one in said.values()] == [False, True, True, True]
@@ -478,14 +478,14 @@ NAN = float("nan")
     [
         ((1.0, 0.5), (0.5, 0.02), "yes", "condition at most 50, the smallest gain is 0.02 of its largest"),
         ((1.0, 1.0), (1.0, 0.0101), "yes", "condition at most 99, the smallest gain is 0.0101 of its largest"),
-        ((1.0, 1.0), (1.0, 0.0099), "unknown", "condition at most 101, the smallest gain is 0.0099 of its largest"),
+        ((1.0, 1.0), (1.0, 0.0099), "caution", "condition at most 101, the smallest gain is 0.0099 of its largest"),
         ((1.01e-4,) * 2, (1.01e-4,) * 2, "yes", "condition at most 9 900, the smallest gain is 1 of its largest"),
-        ((0.99e-4,) * 2, (0.99e-4,) * 2, "unknown", "condition at most 10 100, the smallest gain is 1 of its largest"),
+        ((0.99e-4,) * 2, (0.99e-4,) * 2, "caution", "condition at most 10 100, the smallest gain is 1 of its largest"),
         ((0.99e-8,) * 2, (0.99e-8,) * 2, "no", "of its largest; it vanishes along the reference"),
         ((0.0, 0.0), (0.0, 0.0), "no", "the smallest gain is 0 of its largest; it vanishes along the reference"),
         ((1.0, -1.0), (1.0, 1.0), "no", "of its largest; it vanishes along the reference"),
-        ((1.0, 1.0), (1.0, -1.0), "unknown", "of its largest; it changes sign within the box of the parameters"),
-        ((1.0, 1.0), (1.0, NAN), "unknown", "of its largest; it changes sign within the box of the parameters"),
+        ((1.0, 1.0), (1.0, -1.0), "caution", "of its largest; it changes sign within the box of the parameters"),
+        ((1.0, 1.0), (1.0, NAN), "caution", "of its largest; it changes sign within the box of the parameters"),
         ((1.0, NAN), (1.0, 1.0), "no", "the gain of the inputs is not finite along the reference"),
     ],
 )
@@ -513,7 +513,7 @@ def slew(problem: fp.Problem, step: float, ideal: LinearLoop | None = None) -> f
     return slew_enough(own, unit.with_scale(step / unit.largest_step()), problem.plant.approximate, ideal)
 
 
-@pytest.mark.parametrize(("ratio", "verdict"), [(2.01, "yes"), (1.99, "unknown"), (1.01, "unknown"), (0.99, "no")])
+@pytest.mark.parametrize(("ratio", "verdict"), [(2.01, "yes"), (1.99, "caution"), (1.01, "caution"), (0.99, "no")])
 def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
     """The request is 4.667 sin 3t: 14 per second."""
     one = slew(mass(), ratio * 14.0 * PERIOD)
@@ -576,7 +576,7 @@ def test_a_start_off_the_reference_of_outputs_is_the_state_that_explains_them():
     assert _start_deviation(off, np.full((2, 2), np.nan)) == pytest.approx([0.2, -0.5])
 
 
-@pytest.mark.parametrize(("ratio", "verdict"), [(10.1, "yes"), (9.9, "unknown"), (1.01, "unknown"), (0.99, "no")])
+@pytest.mark.parametrize(("ratio", "verdict"), [(10.1, "yes"), (9.9, "caution"), (1.01, "caution"), (0.99, "no")])
 def test_a_constant_of_a_map_is_ten_times_the_largest_request(grid, ratio, verdict):
     """Requests of 4.667 and responses of 4.5 at the same time are 6.48; a map without such a constant is not asked."""
     largest = math.hypot(14 / 3, 4.5)
@@ -643,7 +643,7 @@ def commands(rows: Any, limits: tuple[float, float] | None) -> fp.Answer:
     [
         ([[-2.0, 4.0]], (-4.0, 8.0), "yes", 2 / 3, 2 / 3),
         ([[-2.0, 7.0], [-3.9, 8.0]], (-4.0, 8.0), "yes", 5 / 6, 1.0),
-        ([[-2.0, 7.0], [-4.6, 0.0]], (-4.0, 8.0), "unknown", 5 / 6, 1.1),
+        ([[-2.0, 7.0], [-4.6, 0.0]], (-4.0, 8.0), "caution", 5 / 6, 1.1),
         ([[-2.0, 8.6], [0.0, 9.2]], (-4.0, 8.0), "no", 1.1, 1.2),
         ([[-4.6, 2.0]], (-4.0, 8.0), "no", 1.1, 1.1),
         ([[math.nan, 5.0]], (-4.0, 8.0), "yes", 0.5, 0.5),
@@ -658,7 +658,9 @@ def test_share_of_the_limits(rows, limits, verdict, own, widest):
     one = commands(rows, limits)
     assert one.verdict == verdict
     assert one.numbers == pytest.approx({"share_of_limits": own, "share_over_box": widest})
-    assert one.evidence.endswith(f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box")
+    assert one.evidence.endswith(
+        f"; {100 * own:.3g} % of the way from the middle of the limits to one of them, {100 * widest:.3g} % over the box"
+    )
     held = f"u {np.nanmin(rows):.3g} to {np.nanmax(rows):.3g} N"
     change = f"Slow the reference down or ask for less; limits that are a choice must hold {held}."
     assert one.change == ("" if verdict == "yes" else change)
@@ -716,7 +718,7 @@ def test_at_rest_no_parameter_is_reached():
     """Nothing moves along a reference of zeros, so a response error shows none of them there."""
     task = fp.load_problem("crane_slots")
     one = asked(task.problem, task.controllers["RHC+FPI"], "reach the wrong parameters")
-    assert one.verdict == "unknown"
+    assert one.verdict == "caution"
     assert one.evidence == "along the reference the response is the same for all values of M, m, l, b"
     assert one.change == "It corrects them off the reference: after a start or a disturbance."
 

@@ -128,7 +128,7 @@ def test_a_gain_that_is_too_large_for_the_lightest_plant_of_the_box_is_unknown()
     problem, controller = mass(), torque(gain=-2.2)
     one = answer(problem, controller, "gain admissible", mismatch=40.0)
     advised = float(one.change.removeprefix("Use gain = ").removesuffix("."))
-    assert one.verdict == "unknown"
+    assert one.verdict == "caution"
     assert advised == pytest.approx(one.numbers["recommended"], rel=1e-3)
     within = controller.with_deformation(replace(controller.deformation, gain=advised))  # type: ignore[type-var]
     assert answer(problem, within, "gain admissible", mismatch=40.0).verdict == "yes"

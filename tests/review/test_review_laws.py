@@ -40,7 +40,7 @@ def answer(problem: fp.Problem, deformation: Deformation, words: str) -> Any:
     return reviewed.answer(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), deformation), words)
 
 
-@pytest.mark.parametrize(("ratio", "verdict"), [(0.9, "no"), (2.0, "unknown"), (4.0, "yes")])
+@pytest.mark.parametrize(("ratio", "verdict"), [(0.9, "no"), (2.0, "caution"), (4.0, "yes")])
 def test_slow_iterations_are_told(ratio, verdict):
     """Below what the plain form needs: no; less than three times: unknown. The increment form is not asked."""
     slow = fp.Affine(gain=-2 * ratio * least_product(3, RATE, PERIOD) / 1.5)
@@ -73,7 +73,7 @@ def test_lag_that_is_said_to_be_borne_is_borne():
     for tau, stable in ((one_answer.numbers["lag"], True), (2 * one_answer.numbers["limit"], False)):
         radius = np.abs(poles(lag(tau), 2, RATE, PERIOD, 0.1, plain=False)).max()
         assert (radius < 1) == stable
-    assert answer(moving(1.0), fp.Affine(gain=-2.0), "small lag").verdict == "unknown"
+    assert answer(moving(1.0), fp.Affine(gain=-2.0), "small lag").verdict == "caution"
 
 
 def test_two_cycle_that_is_said_to_exist_is_there():
@@ -105,7 +105,7 @@ def test_the_basin_grows_with_the_step_of_the_map_and_four_times_the_error_is_wa
 
     first = asked(1.0)
     error, basin = first.numbers["error"], first.numbers["basin"]
-    for ratio, verdict in ((4.01, "yes"), (3.99, "unknown"), (2.49, "no")):
+    for ratio, verdict in ((4.01, "yes"), (3.99, "caution"), (2.49, "no")):
         one = asked(ratio * error / basin)
         assert one.verdict == verdict
         assert one.numbers["basin"] == pytest.approx(ratio * error, rel=1e-6)
@@ -170,14 +170,14 @@ def test_half_of_the_limit_of_two_cycles_is_proposed_after_a_run(period, harmful
 
 def test_benefit_is_told_from_harm():
     """A wrong inertia: yes. A right one, which the plain form disturbs: no. A slightly wrong one: not sure."""
-    verdicts = {1.5: "yes", 1.0: "no", 1.005: "unknown"}
+    verdicts = {1.5: "yes", 1.0: "no", 1.005: "caution"}
     for eigenvalue, verdict in verdicts.items():
         one_answer = answer(moving(eigenvalue), fp.Affine(gain=-1.0), "lower the response error")
         assert one_answer.verdict == verdict
         assert one_answer.numbers["with"] == pytest.approx(one_answer.numbers["null"], rel=1.0)
 
 
-@pytest.mark.parametrize(("eigenvalue", "verdict"), [(1.5, "yes"), (1.0, "unknown")])
+@pytest.mark.parametrize(("eigenvalue", "verdict"), [(1.5, "yes"), (1.0, "caution")])
 def test_runs_decide_on_the_benefit_under_dead_time(eigenvalue, verdict):
     """The recursion pairs a response with the last request, so nothing predicts it; the errors are those of two runs."""
     late = moving(eigenvalue, dead_time=fp.DeadTime(inputs={"u": PERIOD}))
@@ -208,7 +208,7 @@ def test_chatter_is_told_and_what_to_do():
     """A noisy accelerometer: the step of the command is that of `suggest` but for the tracking law; without limits it is small."""
     noisy = moving(sensing=fp.Sensing({"y''": fp.Sensor(noise=fp.Noise(1.0))}))
     loud = answer(replace(noisy, limits=fp.Limits(inputs={"u": (-20.0, 20.0)})), fp.Affine(gain=-1.0), "chatter")
-    assert loud.verdict == "unknown"
+    assert loud.verdict == "caution"
     assert "suggest" in loud.change
     controller = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Affine(gain=-0.1))
     same = fp.suggest(noisy, controller, chatter=loud.numbers["step_u"], ringing=0.0)

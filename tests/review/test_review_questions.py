@@ -45,7 +45,7 @@ def test_parameters_in_reach_have_their_effect():
     plant = replace(problem.plant, parameters={**problem.plant.parameters, "k": stiffness})
     problem = replace(problem, plant=plant, reference=fp.Trajectory(lambda t: {"load": 0.1 * t, "motor": 2 * t + 1.0}))
     one = answer(replace(problem, judged=("motor", "load")), ADAPTIVE, "reach the wrong parameters")
-    assert one.verdict == "unknown"
+    assert one.verdict == "caution"
     assert one.numbers["effect_k"] == pytest.approx(128.02 / 20 * (1.0 / 20) / 0.5)
     assert one.evidence.endswith("the response does not depend on J_L, b_L")
 
@@ -114,7 +114,7 @@ def test_no_limit_is_left_where_nobody_is_drawn_to_the_reference():
 def test_limits_that_are_touched_are_not_covered():
     """At rest on the limit: the linear loop leaves it out, which is no yes."""
     one = answer(mass(0.0, states={"q": (0.0, 1.0)}), None, KEEPS)
-    assert (one.verdict, one.numbers["room_q"]) == ("unknown", 0.0)
+    assert (one.verdict, one.numbers["room_q"]) == ("caution", 0.0)
 
 
 def test_limits_inside_leave_the_linear_loop_known():
@@ -153,7 +153,7 @@ def test_advice_for_a_controller_without_a_map_names_no_gain():
     """A plan with small margins has no gain of a map that could be lowered."""
     task = fp.load_problem("delayed_tanks")
     one = answer(task.problem, task.controllers["RHC"], "margin")
-    assert (one.verdict, one.change) == ("unknown", "Weigh the inputs more.")
+    assert (one.verdict, one.change) == ("caution", "Weigh the inputs more.")
 
 
 @pytest.mark.parametrize("name", ["delayed_mass", "two_link_arm"])

@@ -115,7 +115,7 @@ def test_what_survives_is_ready_and_what_grows_is_not():
 
 def test_the_box_contains_the_dead_time():
     """With 10 % of twenty cycles two cycles are in the box: a pairing without a leak is stable at the true dead time alone."""
-    for uncertainty, verdict in ((0, "unknown"), (5, "yes")):
+    for uncertainty, verdict in ((0, "caution"), (5, "yes")):
         controller = told(fp.Increment(MAP, cycles=20, uncertainty=uncertainty))
         narrow, wide = (case(mass(20), controller, mismatch) for mismatch in (0.0, 10.0))
         assert box_converges(narrow).verdict == "yes"
@@ -225,7 +225,7 @@ def test_the_latency_that_a_loop_bears_and_the_gain_that_bears_three_cycles(gain
     answer = bears_latency(case(problem, adaptive))
     assert answer is not None
     borne, share = int(answer.numbers["borne"]), answer.numbers["share"]
-    assert answer.verdict == "unknown"
+    assert answer.verdict == "caution"
     assert f"{share:.2g} times the gain bears them" in answer.change
 
     def most(controller: Controller) -> int:
@@ -276,7 +276,7 @@ def test_a_loop_that_grows_too_slowly_for_a_short_run_is_no_yes():
     task = fp.load_problem("delayed_mass")
     problem = replace(task.problem, cost=fp.Quadratic(states={"q": 1e3, "q'": 1.0}, deviation={"Q": 9e-4}))
     one = answer(problem, task.controllers["RHC+FPI"], "wrong by a tenth")
-    assert one.verdict == "unknown"
+    assert one.verdict == "caution"
     assert one.evidence.startswith("longer: the rms error of q is 0.0402 m without adaptation, 0.043 m with it; ")
     assert "; but 6 cycles off, the slowest mode is multiplied by 1.000" in one.evidence
     assert one.numbers["radius"] == pytest.approx(1.00017, abs=4e-5)

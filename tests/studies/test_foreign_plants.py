@@ -136,7 +136,7 @@ def test_a_plan_is_not_refused_for_growth_that_the_run_does_not_show(plant, ques
     )
     plan = fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3))
     one_answer = answer(problem, plan, question)
-    assert one_answer.verdict is Verdict.UNKNOWN
+    assert one_answer.verdict is Verdict.CAUTION
     assert said in one_answer.evidence
     assert one_answer.change.startswith(change)
 
@@ -147,8 +147,9 @@ def test_growth_that_no_gain_changes_is_not_blamed_on_the_gain(plant):
     one = plant()
     adaptive = one.controllers["CTC+FPI"]
     boxed = case(one.problem, adaptive, mismatch=10.0)
-    for said in (predict(one.problem, adaptive), box_converges(boxed)):
-        assert said.verdict is Verdict.UNKNOWN
+    verdicts = Verdict.UNKNOWN, Verdict.CAUTION  # the box has its shares
+    for said, verdict in zip((predict(one.problem, adaptive), box_converges(boxed)), verdicts, strict=True):
+        assert said.verdict is verdict
         assert said.change.startswith("The slowest mode is that of the zero dynamics, which no gain changes")
 
 

@@ -74,10 +74,10 @@ def test_a_weight_of_the_effort_is_named_whether_adaptation_helps_or_not():
 def test_a_review_names_the_weight_of_the_effort_in_the_same_words():
     """two_mass has a pair with such a cost on purpose."""
     task = fp.load_problem("two_mass")
-    for name, verdict in (("RHC+FPI, absolute effort", "unknown"), ("RHC+FPI", "yes")):
+    for name, verdict in (("RHC+FPI, absolute effort", "caution"), ("RHC+FPI", "yes")):
         one = answer(task.problem, task.controllers[name], "effort free")
         assert one.verdict == verdict
-        if verdict == "unknown":
+        if verdict == "caution":
             assert f" I{one.evidence[1:]}. {one.change}" == EFFORT
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from fpirhc.review.answer import Answer, Review
     from fpirhc.task.problem import Problem
 
-_COLOURS = {"yes": "green", "no": "red", "unknown": "yellow"}
+_COLOURS = {"yes": "green", "caution": "yellow", "no": "red", "unknown": "magenta"}
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -110,7 +110,7 @@ VERB = Verb(
     group="start",
     add=_add,
     run=_run,
-    codes={ExitCode.FINISHED: "every answer is yes or unknown", ExitCode.ANSWERED_NO: "at least one answer is no"},
+    codes={ExitCode.FINISHED: "no answer is no", ExitCode.ANSWERED_NO: "at least one answer is no"},
     examples=(
         ("fpirhc review two_mass --mismatch 20", "before a run, exact parameters within 20 %"),
         ("fpirhc review my_arm.py --controllers RHC+FPI", "one controller"),

@@ -95,7 +95,7 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
             held = text.replace("unstable: ", "unstable by themselves and held by the plan: ", 1)
             return Answer(ZERO_DYNAMICS, Verdict.YES, held, "", numbers)
         little = radius < 1 + NEUTRAL or min(rate * problem.duration, radius**problem.cycles - 1) < LITTLE
-        verdict = Verdict.UNKNOWN if loops.learns or neutral or little else Verdict.NO
+        verdict = Verdict.CAUTION if neutral or little else Verdict.UNKNOWN if loops.learns else Verdict.NO
         return Answer(
             ZERO_DYNAMICS, verdict, text, "Weigh the other states in the cost, or lengthen the horizon.", numbers
         )
@@ -145,7 +145,7 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
         return Answer(RATES, Verdict.YES, text, "", numbers)
     if of_zero_dynamics(grid, radius):
         change = "It is the mode of the zero dynamics, which no rate and no period changes: see there."
-        return Answer(RATES, Verdict.UNKNOWN, text, change, numbers)
+        return Answer(RATES, Verdict.CAUTION, text, change, numbers)
     believed = controller.plant_model(grid.problem).parameters(grid.problem.plant)
     change = stiff_advice(grid, believed, planned=is_planned(controller)) or (
         "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
@@ -154,7 +154,7 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
     )
     if radius < 1 + NEUTRAL:
         change = "A mode neither grows nor decays: weigh the state or the input in which it is."
-        return Answer(RATES, Verdict.UNKNOWN, text, change, numbers)
+        return Answer(RATES, Verdict.CAUTION, text, change, numbers)
     return Answer(RATES, Verdict.NO, text, change, numbers)
 
 
@@ -231,7 +231,7 @@ def _changing(deformation: Deformation) -> str:
 
 
 def box_converges(case: Case) -> Answer:
-    """Return in how many draws of the parameters the linear loop converges; unknown where it is not all of them."""
+    """Return in how many draws of the parameters the linear loop converges; caution where it is not all of them."""
     grid, own = case.grid, case.loops
     if not own.loops:
         return Answer(BOX, Verdict.UNKNOWN, f"no linear loop: {own.reason}")
@@ -251,7 +251,7 @@ def box_converges(case: Case) -> Answer:
         change = "It does not converge along the reference either: see there."
     elif share == 1:
         change = "It does not converge at some points of the reference: see there."
-    return Answer(BOX, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(BOX, Verdict.CAUTION, text, change, numbers)
 
 
 def _slow(grid: ReviewGrid, controller: Controller, loops: Loops, worst: float) -> str:

@@ -42,7 +42,7 @@ def bears_wrong_dead_time(case: Case) -> Answer | None:
     radius = float(case.loops.radii.max())
     if radius >= 1:
         text = f"with the dead time as it is the slowest mode is multiplied by {radius:.6g} per cycle"
-        return Answer(WRONG_DEAD_TIME, Verdict.UNKNOWN, text, "See the convergence.", {"radius": radius})
+        return Answer(WRONG_DEAD_TIME, Verdict.CAUTION, text, "See the convergence.", {"radius": radius})
     borne, beyond = _borne(case)
     if borne:
         more = (
@@ -121,9 +121,9 @@ def bears_latency(case: Case) -> Answer | None:
     measure = "measure the latency and state it, Problem(dead_time=...)"
     if share is None:
         lower = "Lower the gain" if case.by_gain is None else "No lower gain bears them"
-        return Answer(UNSTATED, Verdict.UNKNOWN, text, f"{lower}; {measure}.", numbers)
+        return Answer(UNSTATED, Verdict.CAUTION, text, f"{lower}; {measure}.", numbers)
     change = f"{share:.2g} times the gain bears them, in this loop of the model; or {measure}."
-    return Answer(UNSTATED, Verdict.UNKNOWN, text, change, {**numbers, "share": share})
+    return Answer(UNSTATED, Verdict.CAUTION, text, change, {**numbers, "share": share})
 
 
 def _share_that_bears(case: Case) -> float | None:
@@ -163,7 +163,7 @@ def pays_when_late(case: Case) -> Answer | None:
             return Answer(PAYS_LATE, Verdict.YES, text, "", numbers)
         text += f"; but {cycles} cycles off, the slowest mode is multiplied by {radius:.6g} per cycle, which short runs hardly show"
         change = "Weigh the inputs more, lower the rate or the gain, or measure the dead time better than to a tenth."
-        return Answer(PAYS_LATE, Verdict.UNKNOWN, text, change, {**numbers, "radius": radius})
+        return Answer(PAYS_LATE, Verdict.CAUTION, text, change, {**numbers, "radius": radius})
     change = "Lower the gain or the rate of the loop, or measure the dead time better than to a tenth."
     change = SEE_CONVERGENCE if case.diverges else change
     return Answer(PAYS_LATE, verdict, text, change, numbers)
@@ -221,7 +221,7 @@ def prediction_knows(case: Case) -> Answer | None:
     numbers = {"error": size, **{f"error with {name}": value for name, value in sizes.items() if math.isfinite(value)}}
     if sizes[best] > _LESS * size:
         return Answer(KNOWS, Verdict.YES, text, "", numbers)
-    return Answer(KNOWS, Verdict.UNKNOWN, text, f"Predict with what acts: Predicted(..., by={best}).", numbers)
+    return Answer(KNOWS, Verdict.CAUTION, text, f"Predict with what acts: Predicted(..., by={best}).", numbers)
 
 
 QUESTIONS = (

@@ -278,7 +278,8 @@ def gain_admissible(
     if inside and advice.why_not:
         change = f"It is inside its limits, which does not say that it helps: see whether a comparison does. {change}"
     good = inside and not advice.why_not
-    return Answer(GAIN, Verdict.YES if good else Verdict.UNKNOWN, text, "" if good else change, numbers)
+    verdict = Verdict.UNKNOWN if advice.why_not else Verdict.CAUTION
+    return Answer(GAIN, Verdict.YES if good else verdict, text, "" if good else change, numbers)
 
 
 def gain_of_target(case: Case) -> Answer | None:
@@ -300,7 +301,7 @@ def gain_of_target(case: Case) -> Answer | None:
     if value / limit < 1:
         return Answer(GAIN, Verdict.YES, text, "", numbers)
     along = case.loops.radii.max() < 1  # in the box it is another matter
-    verdict = Verdict.UNKNOWN if along else Verdict.NO
+    verdict = Verdict.CAUTION if along else Verdict.NO
     return Answer(GAIN, verdict, text, f"Use {name} = {limit * scale / 2:.3g}, half of it.", numbers)
 
 
@@ -329,7 +330,7 @@ def one_sign(own: Spectrum, boxed: Spectrum) -> Answer:
     change = "Give the approximate parameters the sign of every input's effect, and let each input act on its own coordinate."
     if not own.one_sign:
         return Answer(ONE_SIGN, Verdict.NO, text, change, numbers)
-    verdict = Verdict.YES if boxed.one_sign else Verdict.UNKNOWN
+    verdict = Verdict.YES if boxed.one_sign else Verdict.CAUTION
     return Answer(ONE_SIGN, verdict, text, "" if boxed.one_sign else change, numbers)
 
 

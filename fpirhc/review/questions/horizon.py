@@ -50,6 +50,10 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
         first, second = (plan_gain(problem, one, grid.states_at) for one in (problem.horizon, _longer(problem.horizon)))
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return Answer(LONG_ENOUGH, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
+    if not any(gain[:, : -len(plant.inputs)].any() for gain in (first, second)):
+        text = f"{reach:g} {unit}; near the reference the plan feeds no state back, whatever its length"
+        change = "Run it with a longer horizon and compare."
+        return Answer(LONG_ENOUGH, Verdict.UNKNOWN, text, change, {"reach": reach})
     change = float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
     grows = _growth(grid, first)
     slowest = _slowest(grid)
@@ -61,11 +65,11 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     if grows > 0:
         text += f"; the model under the plan's feedback diverges at {grows:.3g} {problem.rate_unit}"
         stiff = stiff_advice(grid, plant.approximate, planned=True)
-        verdict = Verdict.UNKNOWN if grows * problem.duration <= _LITTLE else Verdict.NO
+        verdict = Verdict.CAUTION if grows * problem.duration <= _LITTLE else Verdict.NO
         return Answer(LONG_ENOUGH, verdict, text, stiff or _advice(plant, change), numbers)
     if change > _SAME:
         return Answer(
-            LONG_ENOUGH, Verdict.UNKNOWN, text, "A longer horizon, or a weight of its end, plans differently.", numbers
+            LONG_ENOUGH, Verdict.CAUTION, text, "A longer horizon, or a weight of its end, plans differently.", numbers
         )
     return Answer(LONG_ENOUGH, Verdict.YES, text, "", numbers)
 
@@ -219,7 +223,7 @@ def iterations_suffice(case: Case) -> Answer | None:
     text += f", of the second half of them {in_percent(later)}"
     if later < MANY:
         return Answer(
-            ITERATIONS, Verdict.UNKNOWN, text, "Give the optimiser more iterations where the start matters.", numbers
+            ITERATIONS, Verdict.CAUTION, text, "Give the optimiser more iterations where the start matters.", numbers
         )
     return Answer(ITERATIONS, Verdict.NO, text, _remedy(model, bare, planner.optimiser), numbers)
 
@@ -262,7 +266,7 @@ def leaves_effort_free(case: Case) -> Answer | None:
     if cost is None or right:
         return None
     if cost.weighs_effort:
-        return Answer(EFFORT, Verdict.UNKNOWN, EFFORT_FACT, EFFORT_CHANGE)
+        return Answer(EFFORT, Verdict.CAUTION, EFFORT_FACT, EFFORT_CHANGE)
     return Answer(EFFORT, Verdict.YES, "its cost weighs no absolute effort")
 
 

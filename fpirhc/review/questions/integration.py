@@ -141,7 +141,7 @@ def stage_follows(grid: ReviewGrid, believed: np.ndarray, question: str) -> Answ
     if poles.unstable:
         text += f"; the plant's modes decay, but the discretisation grows by {poles.largest:.3g} per stage"
         return Answer(question, Verdict.NO, text, change, numbers)
-    return Answer(question, Verdict.YES if poles.follows else Verdict.UNKNOWN, text, change, numbers)
+    return Answer(question, Verdict.YES if poles.follows else Verdict.CAUTION, text, change, numbers)
 
 
 OWN_MODEL = "Does the discretisation of the horizon follow the controller's own model?"
@@ -181,7 +181,7 @@ def integrator_follows(grid: ReviewGrid) -> Answer | None:
     if one.follows:
         return Answer(PLANT, Verdict.YES, text, "", numbers)
     change = advice(CYCLE, plant, problem.integrator, problem.period, places[worst])
-    return Answer(PLANT, Verdict.NO if one.unstable else Verdict.UNKNOWN, text, change, numbers)
+    return Answer(PLANT, Verdict.NO if one.unstable else Verdict.CAUTION, text, change, numbers)
 
 
 REALITY = "Does the integrator follow the reality along the reference?"

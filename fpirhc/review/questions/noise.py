@@ -344,7 +344,7 @@ def chatter_small(case: Case) -> Answer | None:
         change = "Lower the rate, weigh the change of the inputs, or estimate more slowly."
     elif problem.response_delay > 0:
         change = "Lower the gain, filter its error (Filtered), or estimate more slowly."
-    return Answer(CHATTER, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(CHATTER, Verdict.CAUTION, text, change, numbers)
 
 
 def _noisy_loops(case: Case) -> list[tuple[LinearLoop, np.ndarray]] | None:
@@ -397,11 +397,11 @@ def suits_noise(case: Case) -> Answer | None:
     against = case.harm(pair.deformation)
     if against:
         change = "Less noise at the response is needed: a better sensor, an estimator, or a longer period."
-        return Answer(NOISE_PAIR, Verdict.UNKNOWN, f"{text}, but {against}", change, numbers)
+        return Answer(NOISE_PAIR, Verdict.CAUTION, f"{text}, but {against}", change, numbers)
     change = f"Use {pair.gain_name} = {pair.gain:.3g}" + (
         f" in Filtered(map, pole={pair.pole:.3g})." if pair.pole else " without a filter."
     )
-    return Answer(NOISE_PAIR, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(NOISE_PAIR, Verdict.CAUTION, text, change, numbers)
 
 
 def _budget(case: Case) -> dict[str, float]:

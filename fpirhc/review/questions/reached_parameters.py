@@ -44,12 +44,12 @@ def reaches_parameters(case: Case) -> Answer:
     text = "; ".join([*_reached(sizes), *_missed(missed, idle)])
     if reached and not max(sizes.values()):
         change = "It corrects them off the reference: after a start or a disturbance."
-        return Answer(REACHED, Verdict.UNKNOWN, text, change, numbers)
+        return Answer(REACHED, Verdict.CAUTION, text, change, numbers)
     if reached and not set(missed) - set(idle):
         return Answer(REACHED, Verdict.YES, text, "", numbers)
     change = f"Control a coordinate in whose response {missed[0]} is, or correct {', '.join(missed)} in the model."
     if reached:
-        return Answer(REACHED, Verdict.UNKNOWN, text, change, numbers)
+        return Answer(REACHED, Verdict.CAUTION, text, change, numbers)
     return Answer(REACHED, Verdict.NO, text, f"{change} A deformation has nothing to correct.", numbers)
 
 

@@ -258,7 +258,7 @@ def real_pair_converges(case: Case) -> Answer | None:
     change = f"Lower the gain, or pair through {lag}"
     if bare >= 1:
         change = "Lower the rate of the tracking law: the loop does not converge without adaptation either."
-    return Answer(LOOP, Verdict.UNKNOWN if adapted < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
+    return Answer(LOOP, Verdict.CAUTION if adapted < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
 
 
 def plain_pair_converges(case: Case) -> Answer | None:
@@ -273,7 +273,7 @@ def plain_pair_converges(case: Case) -> Answer | None:
     if radius < 1:
         return Answer(LOOP, Verdict.YES, text, "", numbers)
     change = "Lower the rate of the tracking law, or the weights of the plan."
-    return Answer(LOOP, Verdict.UNKNOWN if radius < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
+    return Answer(LOOP, Verdict.CAUTION if radius < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
 
 
 LAG = "Does the tracking law leave room for the lag of the reality?"
@@ -314,7 +314,7 @@ def leaves_room(case: Case) -> Answer | None:
     if product <= most:
         return Answer(LAG, Verdict.YES, text, "", numbers)
     change = f"Multiply the gain by {most / product:.2g}, or pair through the lag: lag={lag:.2g}."
-    return Answer(LAG, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(LAG, Verdict.CAUTION, text, change, numbers)
 
 
 def _is_lag(poles: np.ndarray) -> np.ndarray:

@@ -187,7 +187,7 @@ def reference_keeps_limits(grid: ReviewGrid) -> Answer | None:
     soft = {*limits.soft, *limits.prices}
     softened = soft | {f"{i} rate" for i in soft - {*problem.plant.state.elements}}
     hard = [name for name in outside if name not in softened]
-    return Answer(LIMITS, Verdict.NO if hard else Verdict.UNKNOWN, text, change, numbers)
+    return Answer(LIMITS, Verdict.NO if hard else Verdict.CAUTION, text, change, numbers)
 
 
 def _drawn_to_reference(ocp: OptimalControl) -> bool:
@@ -262,10 +262,10 @@ def inverse_exists(grid: ReviewGrid) -> Answer:
         return Answer(INVERSE, Verdict.NO, f"{text}; it vanishes along the reference", _CHANGE, numbers)
     if np.unique(signs[1]).size > 1 or bad.any():
         return Answer(
-            INVERSE, Verdict.UNKNOWN, f"{text}; it changes sign within the box of the parameters", _CHANGE, numbers
+            INVERSE, Verdict.CAUTION, f"{text}; it changes sign within the box of the parameters", _CHANGE, numbers
         )
     if condition > _DOUBTFUL or share < _VANISHING:
-        return Answer(INVERSE, Verdict.UNKNOWN, text, _CHANGE, numbers)
+        return Answer(INVERSE, Verdict.CAUTION, text, _CHANGE, numbers)
     return Answer(INVERSE, Verdict.YES, text, "", numbers)
 
 
@@ -303,12 +303,12 @@ def commands_inside(grid: ReviewGrid) -> Answer:
     numbers = {"share_of_limits": own, "share_over_box": widest}
     if not np.isfinite(np.concatenate([lower, upper])).any():
         return Answer(COMMANDS, Verdict.YES, f"{text}; no input has limits", "", numbers)
-    text += f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box"
+    text += f"; {100 * own:.3g} % of the way from the middle of the limits to one of them, {100 * widest:.3g} % over the box"
     held = _named_ranges(plant, commands, np.nan_to_num(used).max(axis=(0, 1)) > 1)
     change = f"Slow the reference down or ask for less; limits that are a choice must hold {held}."
     if own > 1:
         return Answer(COMMANDS, Verdict.NO, text, change, numbers)
-    return Answer(COMMANDS, Verdict.UNKNOWN if widest > 1 else Verdict.YES, text, change if widest > 1 else "", numbers)
+    return Answer(COMMANDS, Verdict.CAUTION if widest > 1 else Verdict.YES, text, change if widest > 1 else "", numbers)
 
 
 def _named_ranges(plant: Plant, commands: np.ndarray, chosen: np.ndarray | None = None) -> str:

@@ -82,7 +82,7 @@ def right_form(
         return Answer(FORM, Verdict.YES, f"{text}; but here {against}, and the form in use does no harm")
     if against:
         change = "Keep the form that a comparison shows to be better."
-        return Answer(FORM, Verdict.UNKNOWN, f"{text}; but here {against}", change)
+        return Answer(FORM, Verdict.CAUTION, f"{text}; but here {against}", change)
     if proposed is None or error is None:
         change = "Try another form." if proposed is None else f"Try {as_written(proposed)}."
         return Answer(FORM, Verdict.UNKNOWN, text, change)
@@ -92,7 +92,8 @@ def right_form(
     text += _beside(*both, when, form)
     if _as_good(*both):
         return Answer(FORM, Verdict.YES, text)
-    return Answer(FORM, Verdict.UNKNOWN, text, f"Try {as_written(proposed)}.")
+    verdict = Verdict.CAUTION if math.isfinite(sum(_sizes(*both))) else Verdict.UNKNOWN
+    return Answer(FORM, verdict, text, f"Try {as_written(proposed)}.")
 
 
 def _sizes(own: Mapping[str, Tried], other: Mapping[str, Tried]) -> tuple[float, float]:
@@ -186,13 +187,13 @@ def pays(case: Case) -> Answer:
         change = "The prediction leaves the outer loop out, and this one does not converge: see the convergence."
         return Answer(PAYS, Verdict.NO, f"{text}, but errors grow in every cycle", change, numbers)
     if max(without, adapted) <= ROUNDING * nominal_size(nominal) and not case.grid.elsewhere:
-        return Answer(PAYS, Verdict.UNKNOWN, f"{text}: there is no error to lower", "", numbers)
+        return Answer(PAYS, Verdict.CAUTION, f"{text}: there is no error to lower", "", numbers)
     if not adapted < without:
         why = "for the exact values of the model's own parameters, which move nothing beside a reality"
         return by_run(case, PAYS, f"{text}, {why}") if case.grid.elsewhere else _no_gain(text, numbers)
     if null > _HARM * without:
         change = "Adaptation would do harm with a slightly better model: use a form that leaves a right model alone."
-        return Answer(PAYS, Verdict.UNKNOWN, text, change, numbers)
+        return Answer(PAYS, Verdict.CAUTION, text, change, numbers)
     return Answer(PAYS, Verdict.YES, text, "", numbers)
 
 

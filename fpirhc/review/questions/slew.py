@@ -60,7 +60,7 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
     change = f"Raise the map's scale at least {SPARE / ratio:.2g} times, or leave it out to have it chosen."
     if ratio >= SPARE:
         return Answer(SLEW, Verdict.YES, text, "", numbers)
-    return Answer(SLEW, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, change, numbers)
+    return Answer(SLEW, Verdict.NO if ratio < 1 else Verdict.CAUTION, text, change, numbers)
 
 
 def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
@@ -138,7 +138,7 @@ def range_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarra
     if ratio < 1:
         return Answer(RANGE, Verdict.NO, text, change, {"ratio": ratio})
     good = ratio >= _ROOM
-    return Answer(RANGE, Verdict.YES if good else Verdict.UNKNOWN, text, "" if good else change, {"ratio": ratio})
+    return Answer(RANGE, Verdict.YES if good else Verdict.CAUTION, text, "" if good else change, {"ratio": ratio})
 
 
 BASIN = "Does it come back from the largest response error?"
@@ -166,7 +166,7 @@ def comes_back(case: Case) -> Answer | None:
     numbers = {"error": error, "basin": basin}
     if ratio >= _WANTED:
         return Answer(BASIN, Verdict.YES, text, "", numbers)
-    verdict = Verdict.UNKNOWN if ratio > _LASTING or not deformation.iteration.constant else Verdict.NO
+    verdict = Verdict.CAUTION if ratio > _LASTING or not deformation.iteration.constant else Verdict.NO
     change = f"Raise the map's scale at least {_WANTED / ratio:.2g} times, or leave it out to have it chosen."
     return Answer(BASIN, verdict, text, change, numbers)
 

@@ -39,7 +39,7 @@ def fast_enough(case: Case) -> Answer | None:
         return Answer(FAST, Verdict.YES, text, "", numbers)
     return Answer(
         FAST,
-        Verdict.NO if ratio < 1 else Verdict.UNKNOWN,
+        Verdict.NO if ratio < 1 else Verdict.CAUTION,
         text,
         faster(case, _SPARE / ratio, "lower rate x period"),
         numbers,
@@ -86,7 +86,7 @@ def bears_lag(case: Case) -> Answer | None:
     numbers = {"lag": longest, "limit": limit}
     if longest >= _CYCLES * period:
         return Answer(LAG, Verdict.YES, text, "", numbers)
-    return Answer(LAG, Verdict.UNKNOWN, text, "Lower the gain, or model the lag and pair through it.", numbers)
+    return Answer(LAG, Verdict.CAUTION, text, "Lower the gain, or model the lag and pair through it.", numbers)
 
 
 def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
@@ -132,7 +132,7 @@ def plan_keeps_up(case: Case) -> Answer | None:
     numbers = {"ratio": ratio, "least": factor * size}
     if ratio >= _PLAN_SPARE:
         return Answer(FAST, Verdict.YES, text, "", numbers)
-    verdict = Verdict.NO if ratio < 1 and not case.controller.learns else Verdict.UNKNOWN
+    verdict = Verdict.NO if ratio < 1 and not case.controller.learns else Verdict.CAUTION
     return Answer(FAST, verdict, text, faster(case, _PLAN_SPARE * factor, "plan with a shorter period"), numbers)
 
 

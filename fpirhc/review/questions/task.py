@@ -44,7 +44,7 @@ def well_posed(grid: ReviewGrid) -> Answer:
     if share < 1:
         text = f"finite commands at {100 * share:.3g} % of the points and draws of the parameters"
         return Answer(
-            WELL_POSED, Verdict.UNKNOWN, text, "Narrow the box of the parameters, or move the reference.", numbers
+            WELL_POSED, Verdict.CAUTION, text, "Narrow the box of the parameters, or move the reference.", numbers
         )
     return Answer(
         WELL_POSED,
@@ -107,7 +107,7 @@ def start_keeps_limits(grid: ReviewGrid) -> Answer | None:
         return Answer(START, Verdict.YES, text, "", numbers)
     soft = set(outside) <= {*problem.limits.soft, *problem.limits.prices}
     change = f"Move the start of {', '.join(outside)} inside the limits, widen them, or make them soft."
-    return Answer(START, Verdict.UNKNOWN if soft else Verdict.NO, text, change, numbers)
+    return Answer(START, Verdict.CAUTION if soft else Verdict.NO, text, change, numbers)
 
 
 OUTSIDE = "Do signals from outside stay where the review sees them?"
@@ -130,7 +130,7 @@ def stay_nominal(grid: ReviewGrid) -> Answer | None:
         values = f"{low:.6g}" if f"{low:.6g}" == f"{high:.6g}" else f"{low:.6g} to {high:.6g}"
         facts.append(f"{name} is {nominal:.6g} {plant.parameters[name].unit} here, {values} in the run")
     change = "Review other values too: outside(nominal=...)." if moves else ""
-    return Answer(OUTSIDE, Verdict.UNKNOWN if moves else Verdict.YES, "; ".join(facts), change)
+    return Answer(OUTSIDE, Verdict.CAUTION if moves else Verdict.YES, "; ".join(facts), change)
 
 
 BELIEVED = "Are the believed states right after a while?"
