@@ -1,7 +1,6 @@
 """Counts what reviews of the shipped problems leave unknown: `python benchmarks/unknown_answers.py [PROBLEM...]`.
 
-An answer is unknown where nothing decides, and also where a loop or a run has decided and the number is no reason to stop: too
-little margin, a latency that need not be there. The two are told apart by the numbers of the answer.
+Cautions, which are known and no reason to stop, are counted by problem beside them.
 """
 
 from __future__ import annotations
@@ -32,7 +31,8 @@ def main(names: list[str]) -> None:
         review = fp.review(task.problem, task.controllers, mismatch=0.0, seed=0)
         unknown = [(a.question, reason(a)) for a in review.answers if a.verdict == Verdict.UNKNOWN]
         counts.update(unknown)
-        print(f"{name:24s} {len(unknown)} unknown of {len(review.answers)}", flush=True)
+        cautions = sum(a.verdict == Verdict.CAUTION for a in review.answers)
+        print(f"{name:24s} {len(unknown)} unknown and {cautions} cautions of {len(review.answers)}", flush=True)
     for (question, why), count in sorted(counts.items(), key=lambda one: (one[0][0], -one[1])):
         print(f"{count:4d}  {question:62s} {why}")
     print(f"{sum(counts.values()):4d}  in all")
@@ -40,8 +40,7 @@ def main(names: list[str]) -> None:
 
 def reason(answer: Answer) -> str:
     """Return why an answer is unknown."""
-    named = next((why for words, why in REASONS.items() if words in answer.evidence), "")
-    return named or ("decided, and no reason to stop" if answer.numbers else "not decided")
+    return next((why for words, why in REASONS.items() if words in answer.evidence), "nothing decides")
 
 
 if __name__ == "__main__":

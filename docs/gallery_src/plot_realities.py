@@ -184,7 +184,7 @@ print(f"The answer was right in {sum(agree)} of {len(agree)} cases.")
 # rms, is the delay itself, which no adaptation of the model removes.
 #
 # Two rules say where a law with equal poles stops, and by how much: one for the lag, one
-# for the resonance; "unknown" is a loop that converges with less damping than 0.3. They are
+# for the resonance; "caution" is a loop that converges with less damping than 0.3. They are
 # shown for the increment form. A plan counts as one of every cycle
 # in the review; here it is made in every tenth. `fpirhc review my_problem.py` asks all of this
 # about a problem of your own.

@@ -14,6 +14,7 @@ from test_review_laws import moving
 import fpirhc as fp
 from fpirhc.deformation import Deformation
 from fpirhc.review.answer import Verdict
+from fpirhc.review.prediction import NominalRuns
 from fpirhc.review.questions.right_model import forms_of, map_inside
 
 POLE = 86.7  # 1/s
@@ -151,3 +152,29 @@ def test_a_null_test_of_commands_at_a_limit_shows_nothing():
         "stands at a limit in 100 % of the cycles, where no adaptation can act"
     )
     assert one.change == "Run it where the commands are free."
+
+
+def test_a_null_test_goes_on_until_errors_count():
+    """The input is too weak for the start, so the first 2000 cycles show nothing; the plain form disturbs a right model later."""
+    plant = fp.Plant(
+        {"y": "m"}, {"u": "m/s"}, {"b": fp.Parameter(1.0, 1.5, "1")}, lambda y, u, p: {"y": p.b * u.u}, order=1
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": 0.1 * ca.sin(t)}),
+        start={"y": 1.0},
+        period=1e-3,
+        duration=10.0,
+        limits=fp.Limits(inputs={"u": (-0.4, 0.4)}),
+        measure_from=8.0,
+    )
+    law = fp.ComputedTorque(fp.Exponential(rate=5.0, integral=False, bumpless=False), fp.Affine(gain=-0.05))
+    assert NominalRuns(replace(problem, duration=2.0, measure_from=1.0)).null(law).stuck
+    found = NominalRuns(problem).null(law)
+    assert not found.stuck
+    right = replace(problem, plant=replace(plant, parameters={"b": fp.Parameter(1.0, 1.0, "1")}))
+    pair = [
+        fp.measure(right, fp.simulate(right, one, seed=0, compiled=False)).rms_error["y"]
+        for one in (fp.ComputedTorque(law.tracking), law)
+    ]
+    assert [found.without["y"], found.adapted["y"]] == pytest.approx(pair, rel=1e-6)

@@ -183,3 +183,29 @@ def test_cycles_that_are_skipped_have_no_linear_loop():
     assert points.asked.skips(points.quiet(0))
     assert not points.asked.skips(points.quiet(20))
     assert not own_loops(grid, controller).loops
+
+
+@pytest.mark.parametrize("limit", [2.0, 1.0])
+def test_plans_that_keep_no_hard_limit_have_no_linear_loop(limit):
+    """Held at 1.5 m: with a limit of 1 m no plan is feasible, and the slope of what the optimiser leaves there means nothing."""
+    held = fp.Trajectory(lambda t: {"q": 1.5 + 0 * t})
+    problem = oscillator(reference=held, start={"q": 1.5}, limits=fp.Limits(states={"q": (-limit, limit)}))
+    found = own_loops(review_grid(problem, 0.0, 0), PLAIN)
+    assert bool(found.loops) == (limit > 1.5)
+    assert found.reason == ("" if found.loops else "no plan along the reference keeps its limits of states")
+    margin = answer(problem, PLAIN, "margin")
+    assert (margin.verdict == "unknown") == (not found.loops)
+
+
+def test_a_plan_that_feeds_no_state_back_says_nothing_about_its_horizon():
+    """A cost that is linear in the states has no second derivative by them; only the change of the input holds it."""
+    tariff = fp.CustomCost(
+        lambda v: {"change": (v.input.u - v.input_before.u) ** 2}, terminal=lambda v: v.state.q, rate=True
+    )
+    problem = oscillator(cost=tariff)
+    assert problem.horizon is not None
+    gain = plan_gain(problem, problem.horizon)
+    np.testing.assert_allclose(gain, [[0.0, 0.0, 1.0]], atol=1e-12)
+    found = answer(problem, PLAIN, "horizon long")
+    assert found.verdict == "unknown"
+    assert found.evidence == "3 s; near the reference the plan feeds no state back, whatever its length"

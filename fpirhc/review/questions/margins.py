@@ -91,7 +91,7 @@ def _outside(radii: np.ndarray, text: str, numbers: dict[str, float], *, learns:
     where = "all along" if smallest >= 1 else "at some points of"
     on_circle = float(radii.max()) < 1 + NEUTRAL
     text += f"; a pole is {'on' if on_circle else 'outside'} the unit circle {where} the reference"
-    verdict = Verdict.NO if smallest >= 1 + NEUTRAL and not learns else Verdict.UNKNOWN
+    verdict = Verdict.UNKNOWN if learns else Verdict.NO if smallest >= 1 + NEUTRAL else Verdict.CAUTION
     return Answer(MARGINS, verdict, text, "", numbers)
 
 
