@@ -52,8 +52,7 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
         return Answer(LONG_ENOUGH, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
     if not any(gain[:, : -len(plant.inputs)].any() for gain in (first, second)):
         text = f"{reach:g} {unit}; near the reference the plan feeds no state back, whatever its length"
-        change = "Run it with a longer horizon and compare."
-        return Answer(LONG_ENOUGH, Verdict.UNKNOWN, text, change, {"reach": reach})
+        return Answer(LONG_ENOUGH, Verdict.UNKNOWN, text, "Run it with a longer horizon and compare.", {"reach": reach})
     change = float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
     grows = _growth(grid, first)
     slowest = _slowest(grid)
