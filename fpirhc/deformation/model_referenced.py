@@ -13,8 +13,7 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, memory_of_map
 from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
-from fpirhc.errors import InvalidValue
-from fpirhc.fields.kinds import BelowOne, finite_number
+from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal, stays
@@ -42,7 +41,7 @@ class ModelReferenced(Wrapper):
 
     cycles: Cycles | None = field(default=None, metadata={"of_problem": True})
     measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle
-    lag: float | tuple[float, ...] | None = field(default=None, metadata={"of_problem": True})
+    lag: NotNegative | tuple[NotNegative, ...] | None = field(default=None, metadata={"of_problem": True})
     uncertainty: int | None = None
     pole: BelowOne | None = None
     longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given", "structure": True})
@@ -52,11 +51,6 @@ class ModelReferenced(Wrapper):
         check_cycles("ModelReferenced", self._cycles)
         check_cycles("ModelReferenced", self.measurement, "measurement")
         check_cycles("ModelReferenced", self._delays)
-        taus = every(self._lag)
-        if not taus or not all(finite_number(t) and t >= 0 for t in taus):
-            raise InvalidValue(
-                f"ModelReferenced(lag={self.lag!r}): expected a time constant of at least 0 s, or a tuple with one per input"
-            )
         if self.uncertainty is not None and self.cycles is not None:  # else it is checked with the problem's dead times
             check_uncertainty("ModelReferenced", self.uncertainty, self._delays)
 

@@ -11,11 +11,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Count, whole
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, OfPositions, backward_difference, combine, spline_weights
@@ -180,23 +182,18 @@ class SavitzkyGolay(_Finite):
         Chemistry 36(8), 1964.
     """
 
-    window: int
-    degree: int
+    window: Annotated[int, whole(1, LONGEST)]
+    degree: Count
 
     def __post_init__(self) -> None:
         what = f"SavitzkyGolay(window={self.window!r}, degree={self.degree!r})"
-        if (
-            not all(isinstance(v, int) and not isinstance(v, bool) for v in (self.window, self.degree))
-            or self.degree < 1
-        ):
-            raise InvalidValue(f"{what}: expected whole numbers, the degree at least 1")
         if self.window % 2 == 0:
             raise InvalidValue(
                 f"{what}: expected an odd window, whose centre is a sample; use {self.window - 1} or {self.window + 1}"
             )
-        if not self.degree < self.window <= LONGEST:
+        if not self.degree < self.window:
             raise InvalidValue(
-                f"{what}: expected more samples than the degree, and at most {LONGEST}; "
+                f"{what}: expected more samples than the degree; "
                 f"use a window of at least {self.degree + 1 + self.degree % 2}"
             )
 

@@ -400,7 +400,7 @@ def test_all_mistakes_of_sensing_are_told_at_once():
         (lambda: fp.SavitzkyGolay(window=3, degree=3), "more samples than the degree.*at least 5"),
         (
             lambda: fp.SavitzkyGolay(window=5.0, degree=2),  # type: ignore[arg-type]  # a float is refused
-            "window: expected a whole number, got 5.0; write 5",
+            "window: expected a whole number from 1 to 1001, got 5.0; write 5",
         ),
         (lambda: fp.LowPassDifference(time_constant=0.0), r"positive number of seconds.*VelocityDifference\(\)"),
         (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=1.0), "pole: expected a number from 0 to below 1, got 1.0"),

@@ -5,7 +5,6 @@ Theory: docs/theory-rivals.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,8 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.rivals.reference_model import decay_gains, model_block
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.errors import Mistakes
+from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
@@ -36,18 +36,12 @@ class BacksteppingMRAC(Controller):
         deformation: the fixed-point map between desired response and request; Identity() is no adaptation.
 
     Raises:
-        InvalidValue: a rate that is not positive.
+        InvalidField: a rate that is not positive.
     """
 
-    model_rate: float
-    rates: Sequence[float]
+    model_rate: Positive
+    rates: Sequence[Positive]
     deformation: Deformation
-
-    def __post_init__(self) -> None:
-        if not self.rates or not all(math.isfinite(k) and k > 0 for k in (self.model_rate, *self.rates)):
-            raise InvalidValue(
-                f"BacksteppingMRAC(model_rate={self.model_rate!r}, rates={self.rates!r}): expected positive numbers, 1/s"
-            )
 
     def check(self, problem: Problem) -> None:
         """Raise if the rates do not fit the relative orders.

@@ -11,15 +11,15 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NoAnswer
-from fpirhc.fields.kinds import Deviation, finite_number
+from fpirhc.errors import InvalidProblem, Mistakes, NoAnswer
+from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
 from fpirhc.plant.disturbed import disturbance_name, disturbed
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import quantities, response_names
+from fpirhc.sensing.base import quantities, require_named, response_names
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -72,14 +72,10 @@ class DisturbanceKalman(ParameterEstimator):
     drift: Mapping[str, Deviation]
     measured: Mapping[str, Deviation]
     noise: Mapping[str, Deviation] = field(default_factory=dict)
-    frequencies: Sequence[float] = field(default=(), metadata={"setting": "where given", "structure": True})
+    frequencies: Sequence[Positive] = field(default=(), metadata={"setting": "where given", "structure": True})
 
     def __post_init__(self) -> None:
-        if not all(finite_number(w) and w > 0 for w in self.frequencies):
-            raise InvalidValue(f"DisturbanceKalman(frequencies={self.frequencies!r}): expected positive numbers, rad/s")
-        for name, values in (("drift", self.drift), ("measured", self.measured)):
-            if not values:
-                raise InvalidValue(f"DisturbanceKalman({name}={{}}): name at least one")
+        require_named("DisturbanceKalman", drift=self.drift, measured=self.measured)
 
     def model(self, plant: Plant) -> Plant:
         return disturbed(plant, tuple(self.drift))
