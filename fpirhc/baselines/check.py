@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from fpirhc.baselines.baseline import (
     BANDED,
@@ -43,7 +43,7 @@ from fpirhc.baselines.measuring import (
 from fpirhc.baselines.places import baseline_path, check_inside
 from fpirhc.errors import BaselineError, FpirhcError, InvalidName, InvalidValue, OutputError
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import Seed
+from fpirhc.fields.kinds import Few, Range, Seed
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.simulation import metrics as run_metrics
 from fpirhc.studies.comparison.compare import select
@@ -203,7 +203,7 @@ def check_baseline(
     controllers: Sequence[str] | None = None,
     baselines: Path | None = None,
     compiled: bool = True,
-    processes: int = 1,
+    processes: Few = 1,
     progress: Progress | None = None,
 ) -> Judgement:
     """Measure a problem's controllers and compare them with its baseline; nothing is written.
@@ -243,7 +243,7 @@ def check_file(
     *,
     baselines: Path | None = None,
     compiled: bool = True,
-    processes: int = 1,
+    processes: Few = 1,
     progress: Progress | None = None,
 ) -> Judgement:
     """Return the judgement of a problem by name or path; a problem that cannot be loaded is `broken`."""
@@ -261,7 +261,7 @@ def measure_expected(
     seed: Seed = 0,
     seeds: int = 8,
     compiled: bool = True,
-    processes: int = 1,
+    processes: Few = 1,
     progress: Progress | None = None,
 ) -> dict[str, Expected]:
     """Run controllers under every variant and return the expectations of their baseline."""
@@ -334,10 +334,10 @@ def accept(
     reason: str,
     *,
     seed: Seed = 0,
-    seeds: int = 8,
+    seeds: Annotated[int, Range("a whole number of at least 2 (8 is usual)", low=2)] = 8,
     baselines: Path | None = None,
     compiled: bool = True,
-    processes: int = 1,
+    processes: Few = 1,
     working: Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[Baseline, Path]:
@@ -354,10 +354,6 @@ def accept(
         OutputError: the file cannot be written, or lies outside of the project.
     """
     require_reason(reason)
-    if seeds < 2 or seed < 0:
-        raise InvalidValue(
-            f"accept: expected a seed of at least 0 and at least 2 seeds, got seed={seed} and seeds={seeds}; 8 seeds are usual"
-        )
     project = working or Path.cwd()
     check_inside(baseline_path(task.path, baselines), project)
     expectations = measure_expected(

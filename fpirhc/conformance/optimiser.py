@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from fpirhc.conformance.horizons import BOUND, CORRIDOR, STAGES, STEP, Trial, TrialHorizon, TrialPlan
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
-from fpirhc.errors import InvalidValue
-from fpirhc.fields.checked import replaced
+from fpirhc.fields.checked import checked_call, replaced
+from fpirhc.fields.kinds import Count, Range, Seed
 from fpirhc.optimisers.base import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser
 from fpirhc.status import Status
 
@@ -23,7 +24,14 @@ _SOLVERS = ("Nlpsol", "Conic", "Rootfinder", "Integrator", "External", "Callback
 _FEW = 5  # calls on a problem without solution
 
 
-def check_optimiser(optimiser: Optimiser, *, tolerance: float, seed: int, calls: int = 50) -> None:
+@checked_call
+def check_optimiser(
+    optimiser: Optimiser,
+    *,
+    tolerance: Annotated[float, Range("a number above 0 and up to 1e-3", 0.0, 1e-3, open_low=True)],
+    seed: Seed,
+    calls: Count = 50,
+) -> None:
     """Check every law on an optimiser.
 
     Args:
@@ -36,8 +44,6 @@ def check_optimiser(optimiser: Optimiser, *, tolerance: float, seed: int, calls:
         AssertionError: the first law that does not hold, in one sentence.
         InvalidValue: a tolerance that is not positive, or above 1e-3, which is too coarse to recognise a solution.
     """
-    if not 0 < tolerance <= 1e-3:
-        raise InvalidValue(f"check_optimiser(tolerance={tolerance!r}): expected a number above 0 and up to 1e-3")
     keep(optimiser, Trial(optimiser, tolerance, calls), LAWS, seed)
 
 

@@ -15,6 +15,8 @@ import numpy as np
 from fpirhc.contraction.spectrum import Array
 from fpirhc.deformation.base import Deformation, Iteration, Mirror
 from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import AboveZero, Count, NotNegative, Positive
 
 _NONE = 1e-9  # a damping below this counts as none
 _DIGITS = 6  # decimals of the pairing in cycles, so that a number next to a whole one becomes whole
@@ -198,7 +200,8 @@ def _circled_nothing(curves: Array) -> Array:
 _BISECTIONS = 60
 
 
-def damped_product(period: float, lag: float, rate: float, poles: int, *, damping: float) -> float:
+@checked_call
+def damped_product(period: Positive, lag: NotNegative, rate: NotNegative, poles: Count, *, damping: Positive) -> float:
     """Return the largest a lambda whose fast pair keeps that damping behind an unknown lag; 0 where none does.
 
     It is (T / tau) ((1 - N Lambda tau) / (2 zeta))^2 for the increment and the model-referenced form, and infinite without a lag.
@@ -213,18 +216,14 @@ def damped_product(period: float, lag: float, rate: float, poles: int, *, dampin
     Raises:
         InvalidValue: a period or a damping that is not positive, a negative lag or rate, fewer than one pole.
     """
-    _check(period, lag, poles)
-    if not (damping > 0 and rate >= 0):
-        raise InvalidValue(
-            f"damped_product(rate={rate!r}, damping={damping!r}): expected a rate of at least 0, 1/s, and a positive damping"
-        )
     if not lag:
         return math.inf
     spare = max(1 - poles * rate * lag, 0.0)
     return period / lag * (spare / (2 * damping)) ** 2
 
 
-def bearable_lag(product: float, period: float, rate: float, poles: int, *, damping: float) -> float:
+@checked_call
+def bearable_lag(product: Positive, period: Positive, rate: NotNegative, poles: Count, *, damping: Positive) -> float:
     """Return the longest unknown lag, s, with which the fast pair keeps that damping: `damped_product` solved for tau.
 
     Args:
@@ -237,9 +236,7 @@ def bearable_lag(product: float, period: float, rate: float, poles: int, *, damp
     Raises:
         InvalidValue: a product, period or damping that is not positive, a negative rate, fewer than one pole.
     """
-    if not 0 < product < math.inf:
-        raise InvalidValue(f"bearable_lag(product={product!r}): expected a positive product of gain and eigenvalue")
-    low, high = 0.0, period / product / (2 * damping) ** 2 if damping > 0 else 1.0
+    low, high = 0.0, period / product / (2 * damping) ** 2
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         fits = damped_product(period, middle, rate, poles, damping=damping) >= product
@@ -247,16 +244,15 @@ def bearable_lag(product: float, period: float, rate: float, poles: int, *, damp
     return low
 
 
-def _check(period: float, lag: float, poles: int = 1) -> None:
-    if not (0 < period < math.inf and 0 <= lag < math.inf and poles >= 1):
-        raise InvalidValue(
-            f"period={period!r}, lag={lag!r}, poles={poles!r}: expected a positive period and a lag of at least 0, s, and at least "
-            "one pole of the tracking law"
-        )
-
-
+@checked_call
 def resonant_limit(
-    period: float, rate: float, poles: int, *, frequency: float, damping: float, eigenvalue: float = 1.0
+    period: Positive,
+    rate: NotNegative,
+    poles: Count,
+    *,
+    frequency: Positive,
+    damping: NotNegative,
+    eigenvalue: Positive = 1.0,
 ) -> float:
     """Return the largest effective gain behind the resonance, T (2 zeta w0 / lambda - N Lambda); 0 or less where none is stable.
 
@@ -274,13 +270,6 @@ def resonant_limit(
     Raises:
         InvalidValue: a period, frequency or eigenvalue that is not positive, a negative rate or damping, fewer than one pole.
     """
-    positive = all(0 < v < math.inf for v in (period, frequency, eigenvalue))
-    if not (positive and rate >= 0 and damping >= 0 and poles >= 1):
-        raise InvalidValue(
-            f"resonant_limit(period={period!r}, rate={rate!r}, poles={poles!r}, frequency={frequency!r}, damping={damping!r}, "
-            f"eigenvalue={eigenvalue!r}): expected a positive period, frequency and eigenvalue, a rate and a damping of at "
-            "least 0, and at least one pole"
-        )
     return period * (2 * damping * frequency / eigenvalue - poles * rate)
 
 
@@ -292,19 +281,19 @@ _POINTS = 400
 _BISECTED = 50
 
 
-def slowest_iteration(poles: int) -> float:
+@checked_call
+def slowest_iteration(poles: Count) -> float:
     """Return the least a lambda / (T Lambda) with which the plain form is stable, for N poles of the tracking law at -Lambda.
 
     It is sin(theta)^N tan(theta), theta = (N - 1) pi / (2 N): 0, 1/2, 9/8, 1.759, 2.395 for N = 1 ... 5; N = n + 1 for relative
     order n with the integral, n without it.
     """
-    if poles < 1:
-        raise InvalidValue(f"slowest_iteration(poles={poles!r}): expected at least one pole of the tracking law")
     angle = (poles - 1) * math.pi / (2 * poles)
     return math.sin(angle) ** poles * math.tan(angle)
 
 
-def least_product(poles: int, rate: float, period: float) -> float:
+@checked_call
+def least_product(poles: Count, rate: Positive, period: Positive) -> float:
     """Return the least a lambda with which the plain form is stable around a tracking law of that rate.
 
     It holds to first order in rate x period.
@@ -317,13 +306,12 @@ def least_product(poles: int, rate: float, period: float) -> float:
     Raises:
         InvalidValue: fewer than one pole, a rate or a period that is not positive.
     """
-    if not (0 < rate < math.inf and 0 < period < math.inf):
-        raise InvalidValue(f"least_product(rate={rate!r}, period={period!r}): expected positive numbers, 1/s and s")
     return slowest_iteration(poles) * rate * period
 
 
+@checked_call
 def basin_of_plain_form(
-    largest_step: float, poles: int, rate: float, period: float, *, eigenvalue: float = 1.0
+    largest_step: AboveZero, poles: Count, rate: Positive, period: Positive, *, eigenvalue: Positive = 1.0
 ) -> float:
     """Return the largest |f - d| from which the plain form comes back; infinite for one pole or an unbounded step.
 
@@ -337,15 +325,14 @@ def basin_of_plain_form(
     Raises:
         InvalidValue: a step, rate, period or eigenvalue that is not positive, or fewer than one pole.
     """
-    if not (largest_step > 0 and 0 < eigenvalue < math.inf):
-        raise InvalidValue(
-            f"basin_of_plain_form(largest_step={largest_step!r}, eigenvalue={eigenvalue!r}): expected positive numbers"
-        )
     slowest = least_product(poles, rate, period)
     return largest_step * eigenvalue / slowest if slowest else math.inf
 
 
-def step_for_basin(largest_error: float, poles: int, rate: float, period: float, *, eigenvalue: float = 1.0) -> float:
+@checked_call
+def step_for_basin(
+    largest_error: NotNegative, poles: Count, rate: Positive, period: Positive, *, eigenvalue: Positive = 1.0
+) -> float:
     """Return the step per cycle that a map needs to come back from an error of that size, with its spare factor.
 
     Args:
@@ -358,11 +345,6 @@ def step_for_basin(largest_error: float, poles: int, rate: float, period: float,
     Raises:
         InvalidValue: a negative error, a rate, period or eigenvalue that is not positive, or fewer than one pole.
     """
-    if not (largest_error >= 0 and 0 < eigenvalue < math.inf):
-        raise InvalidValue(
-            f"step_for_basin(largest_error={largest_error!r}, eigenvalue={eigenvalue!r}): expected an error of at least 0 and a "
-            "positive eigenvalue"
-        )
     spare = _SPARE_OF_TWO_POLES if poles == 2 else _SPARE
     return spare * least_product(poles, rate, period) * largest_error / eigenvalue
 
@@ -395,7 +377,8 @@ def two_cycle_limit(low: np.ndarray, high: np.ndarray, gains: Sequence[float]) -
     return float(1 / real.max()) if real.size else float("inf")
 
 
-def two_cycle_amplitudes(deformation: Deformation, limit: float, *, size: float) -> tuple[float, ...]:
+@checked_call
+def two_cycle_amplitudes(deformation: Deformation, limit: AboveZero, *, size: Positive) -> tuple[float, ...]:
     """Return every |h| at which the map's secant is the limit, smallest first; empty where there is no two-cycle.
 
     Args:
@@ -408,10 +391,6 @@ def two_cycle_amplitudes(deformation: Deformation, limit: float, *, size: float)
     """
     if deformation.memory(("q",)).size:
         raise InvalidValue(f"{deformation}: expected a map without memory; give the innermost one")
-    if not (limit > 0 and size > 0):
-        raise InvalidValue(
-            f"two_cycle_amplitudes(limit={limit!r}, size={size!r}): expected a positive limit and a positive size of errors"
-        )
     h = ca.SX.sym("h")
     secant = ca.Function("secant", [h], [ca.fabs(deformation.step(ca.SX(0), h, ca.SX(0), {})[0] / h)])
 

@@ -17,6 +17,8 @@ import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive, nearest
+from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import Count, Seed
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
@@ -116,8 +118,9 @@ def spectrum_over_run(
     return _spectrum(plant, states[rows], deformed[rows], parameters, approximate)
 
 
+@checked_call
 def spectrum_over_box(
-    plant: Plant, box: Mapping[str, tuple[float, float]], states: Array, deformed: Array, *, samples: int, seed: int
+    plant: Plant, box: Mapping[str, tuple[float, float]], states: Array, deformed: Array, *, samples: Count, seed: Seed
 ) -> Spectrum:
     """Return the eigenvalues of J for exact parameters drawn from a box, at states drawn from the given rows.
 
@@ -138,8 +141,6 @@ def spectrum_over_box(
         InvalidShape: arrays that do not fit the plant or each other.
     """
     states, deformed = _checked_rows(plant, states, deformed)
-    if samples < 1:
-        raise InvalidValue(f"samples={samples}: expected at least 1")
     lower, upper = _box_ends(plant, box)
     generator = np.random.default_rng(seed)
     parameters = generator.uniform(lower, upper, size=(samples, lower.size))

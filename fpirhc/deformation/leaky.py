@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.kinds import finite_number
+from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import BelowOne, NotNegative, Product, finite_number
 from fpirhc.symbolic.live import between, ceil, larger, largest, positive, smaller, sqrt
 from fpirhc.task.dead_time import MOST, Cycles, every
 
@@ -18,7 +19,8 @@ _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the 
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
 
-def leaky_pole(product: float, uncertainty: float) -> float:
+@checked_call
+def leaky_pole(product: Product, uncertainty: NotNegative) -> float:
     """Return the least pole p that the theorem allows for a dead time wrong by at most `uncertainty` cycles.
 
     p = (2 c + 1 - sqrt(4 c + 1)) / (2 c) with c = g (2 + g) m^2 / 4; 0 where the dead time is certain.
@@ -30,13 +32,11 @@ def leaky_pole(product: float, uncertainty: float) -> float:
     Raises:
         InvalidValue: a product outside (0, 2), for which no pole is large enough; a negative or infinite uncertainty.
     """
-    _check_product("leaky_pole", product)
-    if not (math.isfinite(uncertainty) and uncertainty >= 0):
-        raise InvalidValue(f"leaky_pole(uncertainty={uncertainty!r}): expected a number of cycles of at least 0")
     return _least_pole(product, uncertainty)
 
 
-def leaky_margin(product: float, pole: float) -> float:
+@checked_call
+def leaky_margin(product: Product, pole: BelowOne) -> float:
     """Return the error of the dead time, in cycles, up to which the pairing is stable: 2 sqrt(p / (g (2 + g))) / (1 - p).
 
     The bound is sufficient: the true margin may be larger.
@@ -48,9 +48,6 @@ def leaky_margin(product: float, pole: float) -> float:
     Raises:
         InvalidValue: a product outside (0, 2), a pole outside [0, 1).
     """
-    _check_product("leaky_margin", product)
-    if not (finite_number(pole) and 0 <= pole < 1):
-        raise InvalidValue(f"leaky_margin(pole={pole!r}): expected a number from 0 (no leak) to below 1")
     return 2 * math.sqrt(pole / (product * (2 + product))) / (1 - pole)
 
 
@@ -109,11 +106,3 @@ def _least_pole(product: float, uncertainty: float) -> float:
     """The formula of `leaky_pole` without cancellation at small bounds; the product may be live."""
     bound = product * (2 + product) * uncertainty**2 / 4
     return 2 * bound / (2 * bound + 1 + sqrt(4 * bound + 1))
-
-
-def _check_product(owner: str, product: float) -> None:
-    if not 0 < product < 2:
-        raise InvalidValue(
-            f"{owner}(product={product!r}): expected effective gain times largest eigenvalue in (0, 2); outside it the iteration "
-            "diverges with the right dead time too"
-        )

@@ -110,6 +110,7 @@ class _JudgedByOwner(Range):
 
 JudgedByOwner: TypeAlias = Annotated[float, _JudgedByOwner("a finite number")]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
+AboveZero: TypeAlias = Annotated[float, Range("a number above 0", low=0.0, open_low=True)]  # infinite too
 Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
 NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
 NotZero: TypeAlias = Annotated[float, _NotZero("a finite number other than zero (no adaptation is Identity())")]
@@ -122,6 +123,10 @@ Duration: TypeAlias = Annotated[
 ]
 Accuracy: TypeAlias = Annotated[
     float, Range("a number above 0 and below 1", low=0.0, high=1.0, open_low=True, open_high=True)
+]
+Product: TypeAlias = Annotated[  # of effective gain and eigenvalue, with which an iteration converges without dead time
+    float,
+    Range("effective gain times eigenvalue above 0 and below 2", low=0.0, high=2.0, open_low=True, open_high=True),
 ]
 Count: TypeAlias = Annotated[int, whole(1, 1_000_000)]
 Few: TypeAlias = Annotated[int, whole(1, 1000)]

@@ -14,9 +14,9 @@ import numpy as np
 from fpirhc.contraction.spectrum import response_jacobians
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import refuse_without, resolved, with_margins
-from fpirhc.errors import InvalidProblem, InvalidValue, NoAnswer, NotSupported
+from fpirhc.errors import InvalidProblem, NoAnswer, NotSupported
 from fpirhc.fields.checked import ByName, checked_call
-from fpirhc.fields.kinds import Seed
+from fpirhc.fields.kinds import CountOrZero, Positive, Seed
 from fpirhc.plant.plant import Plant, check_mismatch
 from fpirhc.review.grid import ReviewGrid, each, review_grid, state_slopes
 from fpirhc.review.loops import ideal_loops, ideal_places, own_loops
@@ -262,8 +262,8 @@ def tightened(
     controller: Controller,
     *,
     mismatch: float | None = None,
-    widen: float = 1.1,
-    passes: int = 12,
+    widen: Positive = 1.1,
+    passes: CountOrZero = 12,
     seed: Seed = 0,
 ) -> Controller:
     """Return the controller whose plans keep a margin from the limits of states, and with which the plants keep the limits.
@@ -297,15 +297,11 @@ def state_margins(
     controller: Controller,
     *,
     mismatch: float | None = None,
-    widen: float = 1.1,
-    passes: int = 12,
+    widen: Positive = 1.1,
+    passes: CountOrZero = 12,
     seed: Seed = 0,
 ) -> Margins:
     """Return the margins of `tightened` by name of the limited state, one number for every stage; arguments as there."""
-    if not 0 < widen < np.inf:
-        raise InvalidValue(f"tightened(widen={widen!r}): expected a positive number")
-    if passes < 0:
-        raise InvalidValue(f"tightened(passes={passes!r}): expected 0 or a positive number of runs")
     plants = _parameters(problem, mismatch, seed)
     margins = _predicted(problem, controller, plants, widen)
     for k in range(passes):

@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller, believing
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import Seed
+from fpirhc.fields.kinds import AboveZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensor
@@ -136,7 +136,7 @@ def operating_limits(
     *,
     over: Sequence[str] | None = None,
     controllers: Sequence[str] | None = None,
-    fails: float = FAILS,
+    fails: AboveZero = FAILS,
     seed: Seed = 0,
     compiled: bool = True,
     command: str = "",
@@ -170,8 +170,6 @@ def operating_limits(
         InvalidValue: `fails` is not positive.
     """
     begin = time.perf_counter()
-    if not fails > 0:
-        raise InvalidValue(f"fails={fails!r}: expected a positive share of the reference's range")
     chosen = select(task, controllers)
     check_gains(task, chosen)
     quantities, unfit = _quantities(task.problem, over)

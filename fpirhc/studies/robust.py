@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller, believing
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import Seed
+from fpirhc.fields.kinds import AboveZero, Accuracy, Seed
 from fpirhc.plant.plant import Parametric, drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.lanes import Lanes
@@ -87,9 +87,9 @@ def robust_boxes(
     task: Task,
     *,
     controllers: Sequence[str] | None = None,
-    risk: float = RISK,
-    confidence: float = CONFIDENCE,
-    fails: float = FAILS,
+    risk: Accuracy = RISK,
+    confidence: Accuracy = CONFIDENCE,
+    fails: AboveZero = FAILS,
     seed: Seed = 0,
     compiled: bool = True,
     command: str = "",
@@ -122,11 +122,6 @@ def robust_boxes(
         InvalidValue: a share that is none, `fails` that is not positive, or a plant without parameters to draw.
     """
     begin = time.perf_counter()
-    for name, value in (("risk", risk), ("confidence", confidence)):
-        if not 0 < value < 1:
-            raise InvalidValue(f"{name}={value!r}: expected a share above 0 and below 1")
-    if not fails > 0:
-        raise InvalidValue(f"fails={fails!r}: expected a positive share of the reference's range")
     most = _most(task)
     chosen = select(task, controllers)
     check_gains(task, chosen)

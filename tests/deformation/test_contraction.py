@@ -143,7 +143,7 @@ def test_bad_arguments_raise() -> None:
         spectrum_over_box(plant, {"m_1": (1.0, 2.0)}, state, request, samples=4, seed=0)
     with pytest.raises(InvalidValue, match="lower <= upper"):
         spectrum_over_box(plant, {"m1": (2.0, 1.0)}, state, request, samples=4, seed=0)
-    with pytest.raises(InvalidValue, match="samples=0"):
+    with pytest.raises(InvalidValue, match=r"samples: .* got 0"):
         spectrum_over_box(plant, {"m1": (1.0, 2.0)}, state, request, samples=0, seed=0)
     with pytest.raises(InvalidShape, match=r"\(cycles, 4\)"):
         spectrum_over_run(plant, np.zeros((3, 2)), np.zeros((3, 2)))

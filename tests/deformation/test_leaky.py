@@ -264,9 +264,9 @@ def test_a_dead_time_for_every_channel():
         (lambda: fp.Increment.within(affine(0.5), -1), r"Increment.within\(most=-1\): expected a dead time between 0"),
         (lambda: fp.Increment(affine(0.5), cycles=()), "or a tuple with one for every controlled coordinate"),
         (lambda: fp.ModelReferenced(affine(0.5), cycles=900, measurement=200), "between 0 and 1000"),
-        (lambda: leaky_pole(2.0, 1), r"leaky_pole\(product=2.0\): expected .* in \(0, 2\)"),
-        (lambda: leaky_pole(1.0, -1), "uncertainty=-1"),
-        (lambda: leaky_margin(1.0, 1.0), "pole=1.0"),
+        (lambda: leaky_pole(2.0, 1), r"leaky_pole.product: expected .* above 0 and below 2, got 2.0"),
+        (lambda: leaky_pole(1.0, -1), "leaky_pole.uncertainty: .* at least 0, got -1"),
+        (lambda: leaky_margin(1.0, 1.0), "leaky_margin.pole: .* below 1, got 1.0"),
     ],
 )
 def test_bad_settings(build, sentence):

@@ -194,7 +194,7 @@ def test_two_cycles_refuse_bad_input():
         two_cycle_limit(np.eye(2), np.eye(2), (0.3, 0.3))
     with pytest.raises(InvalidValue, match="without memory"):
         two_cycle_amplitudes(fp.Filtered(fp.Affine(gain=-1.0), pole=0.5), 1.0, size=1.0)
-    with pytest.raises(InvalidValue, match="positive limit"):
+    with pytest.raises(InvalidValue, match="limit: expected a number above 0"):
         two_cycle_amplitudes(fp.Affine(gain=-1.0), 0.0, size=1.0)
 
 

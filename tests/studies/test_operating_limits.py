@@ -206,7 +206,7 @@ def test_a_refusal_far_from_the_problem_is_a_limit(monkeypatch):
     ("wrong", "error", "says"),
     [
         ({"over": ["latncy"]}, InvalidName, "Did you mean 'latency'"),
-        ({"fails": 0.0}, InvalidValue, "expected a positive share"),
+        ({"fails": 0.0}, InvalidValue, "fails: expected a number above 0"),
     ],
 )
 def test_wrong_input_is_named(wrong, error, says):

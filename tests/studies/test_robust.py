@@ -122,9 +122,9 @@ def test_equal_seeds_have_equal_answers():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"risk": 0.0}, "risk=0.0: expected a share above 0 and below 1"),
-        ({"confidence": 1.0}, "confidence=1.0: expected a share above 0 and below 1"),
-        ({"fails": -1.0}, "fails=-1.0: expected a positive share of the reference's range"),
+        ({"risk": 0.0}, "robust_boxes.risk: expected a number above 0 and below 1, got 0.0"),
+        ({"confidence": 1.0}, "robust_boxes.confidence: expected a number above 0 and below 1, got 1.0"),
+        ({"fails": -1.0}, "robust_boxes.fails: expected a number above 0, got -1.0"),
     ],
 )
 def test_wrong_shares_are_named(wrong, message):

@@ -14,7 +14,8 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.kinds import Range
+from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import Count, Range
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import asin, larger, power, sqrt
 
@@ -110,7 +111,8 @@ def examples(inner: Deformation) -> tuple[Deformation, ...]:
     return (Tuned(inner, largest_gain=1.2 * inner.effective_gain()),)
 
 
-def expected_sign(product: float, components: int) -> float:
+@checked_call
+def expected_sign(product: Annotated[float, Range("a product from 0 to 2", 0.0, 2.0)], components: Count) -> float:
     """Return the mean of sgn(h_k' h_{k-1}) in white noise, 2 I_{(1+rho)/2}(m/2, m/2) - 1 with rho = -g / 2.
 
     I is the regularised incomplete beta function; the proof stands in docs/theory-robust.md.
@@ -122,10 +124,6 @@ def expected_sign(product: float, components: int) -> float:
     Raises:
         InvalidValue: a product outside [0, 2], fewer than one component.
     """
-    if not (0 <= product <= 2 and components >= 1):
-        raise InvalidValue(
-            f"expected_sign(product={product!r}, components={components!r}): expected a product from 0 to 2, at least one component"
-        )
     return _mean_sign(product, components)
 
 

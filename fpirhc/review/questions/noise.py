@@ -20,6 +20,7 @@ from fpirhc.deformation.base import Deformation, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotContractive, nearest
 from fpirhc.fields.checked import FoundByName, checked_call
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.motion import with_space
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, review_grid
@@ -82,7 +83,7 @@ def suggest(
     *,
     chatter: float | Mapping[str, float],
     noise: Mapping[str, float] | None = None,
-    ringing: float = RINGING,
+    ringing: NotNegative = RINGING,
 ) -> Suggestion:
     """Return the largest gain, with the pole of a filter of its error, whose chatter is within a budget.
 
@@ -108,11 +109,12 @@ def _within_budget(
     controller: Controller,
     chatter: float | Mapping[str, float],
     noise: Mapping[str, float] | None = None,
-    ringing: float = RINGING,
+    ringing: NotNegative = RINGING,
 ) -> Suggestion:
     """Return what `suggest` does, before it is run."""
     ready = resolved(problem, controller)
-    _check(ready, ringing)
+    if ready.deformation.effective_gain() == 0:
+        refuse_without(ready, "deformation to choose a gain for; give it Sigmoid(gain=...)")
     budget = _allowed(problem, chatter)
     grid = review_grid(problem, 0.0, 0)
     noisy = noisy_points(grid, ready, noise)
@@ -140,15 +142,6 @@ def _harm(problem: Problem, controller: Controller, deformation: Deformation) ->
         return harm_in(*trials.errors(controller.with_deformation(deformation)))
     except FpirhcError as error:
         return f"it cannot be tried ({error})"
-
-
-def _check(controller: Controller, ringing: float) -> None:
-    if controller.deformation.effective_gain() == 0:
-        refuse_without(controller, "deformation to choose a gain for; give it Sigmoid(gain=...)")
-    if not (math.isfinite(ringing) and ringing >= 0):
-        raise InvalidValue(
-            f"suggest(ringing={ringing!r}): expected a number of at least 0; 4 to 8 is usual, 0 is no filter"
-        )
 
 
 def _allowed(problem: Problem, chatter: float | Mapping[str, float]) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidValue, OutputError
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import Seed
+from fpirhc.fields.kinds import Few, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
@@ -59,7 +59,7 @@ def compare_scenarios(
     controllers: Sequence[str] | None = None,
     baseline: str | None = None,
     headline: str | None = None,
-    processes: int = 1,
+    processes: Few = 1,
     cluster: str | None = None,
     tuned: Mapping[str, Values] | None = None,
     tuning: Mapping[str, str] | None = None,
@@ -101,8 +101,6 @@ def compare_scenarios(
     figure = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
     every = scenario_numbers(task, count, percent, cases)
     numbers = _of_shard(every, *shard)
-    if processes < 1:
-        raise InvalidValue(f"processes {processes}: expected at least 1")
     task = with_tuned(task, tuned or {})
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
