@@ -58,7 +58,10 @@ def publish(view: View, page: str, folder: Path, *, as_json: bool) -> None:
 
 
 def table_writer(form: str | None) -> Callable[[DataFrame, Path], None]:
-    """Return a function that writes a table to a path whose suffix becomes that of the form; it writes nothing without a form."""
+    """Return a function that writes a table to a path whose suffix becomes that of the form; it writes nothing without a form.
+
+    Units, `attrs["units"]` by column, stand behind the names of a CSV file: 'rms_error.q1 [m]'. A Parquet file keeps attributes.
+    """
     from fpirhc.errors import NotInstalled
     from fpirhc.whole_file import write_whole
 
@@ -67,7 +70,8 @@ def table_writer(form: str | None) -> Callable[[DataFrame, Path], None]:
 
     def write(table: DataFrame, path: Path) -> None:
         if form is not None:
-            content = table.to_csv(index=False) if form == "csv" else table.to_parquet(index=False)
+            named = table.rename(columns={name: f"{name} [{unit}]" for name, unit in table.attrs["units"].items()})
+            content = named.to_csv(index=False) if form == "csv" else table.to_parquet(index=False)
             write_whole(content, path.with_suffix(f".{form}"), "table")
 
     return write

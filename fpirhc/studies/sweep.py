@@ -42,6 +42,7 @@ LEDGER = "sweep.jsonl"
 _MOST = 2  # settings of a map
 _BLOCK = 64  # cells that run side by side, and are finished together
 _LOG = "log"
+_TIMES = ("dead_time", "duration", "measure_from", "period")  # fields of a problem
 _FORM = "PATH=LOW:HIGH:COUNT, or PATH=LOW:HIGH:COUNT:log"
 
 
@@ -137,6 +138,7 @@ class Sweep(Study):
     maps: tuple[SweepMap, ...]  # one per controller
     aim: Objective  # the figure that is judged
     seed: int  # of the noise, the same in all cells
+    units: Mapping[str, str]  # units of the settings and of the figure that have one, by name
 
     def __repr__(self) -> str:
         names = " x ".join(f"{len(axis.values)} {axis.path}" for axis in self.axes)
@@ -187,10 +189,12 @@ class Sweep(Study):
                 }
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return the rows as a pandas DataFrame."""
+        """Return the rows as a pandas DataFrame; `attrs["units"]` has the units of columns that have one, by name."""
         import pandas as pd
 
-        return pd.DataFrame(self.rows())
+        frame = pd.DataFrame(self.rows())
+        frame.attrs["units"] = dict(self.units)
+        return frame
 
     @property
     def view(self) -> View:
@@ -243,7 +247,9 @@ def sweep(
     header = {**fingerprint(task, conditions), "axes": describe(axes), "metric": aim.name}
     with Ledger(folder / LEDGER, header, CellFields) as ledger:
         maps = tuple(_Runner(task, name, grid, conditions, aim, ledger).map(progress) for name in chosen)
-    return Sweep(axes=axes, maps=maps, aim=aim, seed=seed, **circumstances(task, chosen, command, begin))
+    units = {**{axis.path: _unit(task.problem, axis.path) for axis in axes}, aim.name: aim.unit}
+    told = {name: unit for name, unit in units.items() if unit not in ("", "1")}
+    return Sweep(axes=axes, maps=maps, aim=aim, seed=seed, units=told, **circumstances(task, chosen, command, begin))
 
 
 # --- The grid ------------------------------------------------------------------------------------------------------------
@@ -310,6 +316,16 @@ def _of_problem(problem: Problem, path: str) -> float | None:
         return float(current_setting(problem, path))
     except FpirhcError:
         return None
+
+
+def _unit(problem: Problem, path: str) -> str:
+    """The unit of a setting of the problem, as far as it is known; '' for others."""
+    word, _, name = path.partition(".")
+    if word in PARAMETERS:
+        return (problem.moved if word == "exact" else problem.plant).parameters[name].unit
+    if word == START:
+        return problem.plant.state.units[problem.plant.state.elements.index(name)]
+    return problem.time_unit if word in _TIMES else ""
 
 
 class _Grid:

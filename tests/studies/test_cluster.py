@@ -122,11 +122,12 @@ def test_a_file_that_a_worker_cannot_load_is_named(tmp_path: Path) -> None:
     assert "nowhere_at_all" in answer["error"]
 
 
-def test_an_address_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense", "", "http://127.0.0.1:8786"])
+def test_an_address_that_does_not_answer_is_named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "_WAIT", 0.5)
     opening, greeting = opening_of(fp.load_problem("two_mass").path)
-    with pytest.raises(InvalidValue, match=r"--cluster tcp://127\.0\.0\.1:1: no scheduler answers there"):
-        Cluster("tcp://127.0.0.1:1", opening, greeting, 1)
+    with pytest.raises(InvalidValue, match=rf"--cluster {address}: no scheduler answers there"):
+        Cluster(address, opening, greeting, 1)
 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -508,7 +508,7 @@ def test_command_line_journey(task, capsys):
     assert lines_of(Path("out"))[: len(before)] == before
     rows = pd.read_csv("out/scenarios.csv")
     assert rows[rows.controller == "CTC"]["error"].tolist()[:4] == document["controllers"]["CTC"]["errors"]
-    assert {"scenario", "mismatch", "outcome", "rms_error.y", "at_limit"} <= set(rows.columns)
+    assert {"scenario", "mismatch", "outcome", "rms_error.y [m]", "settling.y [s]", "at_limit"} <= set(rows.columns)
     Path("line.py").write_text(LINE.replace("rate=6.0", "rate=7.0"))
     assert main([*ARGUMENTS, "--out", "out"]) == 3
     message = capsys.readouterr().err

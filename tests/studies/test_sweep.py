@@ -201,8 +201,11 @@ def test_a_table_in_parquet_is_the_table_in_csv(tmp_path: Path) -> None:
     table = swept(tmp_path, "exact.b=0.5:2:3").to_dataframe()
     for form in ("csv", "parquet"):
         table_writer(form)(table, tmp_path / "sweep")
-    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "sweep.parquet"), table)
-    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "sweep.csv"), table)
+    kept = pd.read_parquet(tmp_path / "sweep.parquet")
+    pd.testing.assert_frame_equal(kept, table)
+    assert kept.attrs == {"units": {"exact.b": "m/(s V)"}}
+    with_units = table.rename(columns={"exact.b": "exact.b [m/(s V)]"})
+    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "sweep.csv"), with_units)
 
 
 def test_the_command_writes_table_page_picture_and_facts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,7 +216,7 @@ def test_the_command_writes_table_page_picture_and_facts(tmp_path: Path, capsys:
     with (tmp_path / "sweep.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     facts = json.loads((tmp_path / "results.json").read_text())
-    assert [row["exact.m1"] for row in rows[:4]] == ["0.8", "1.2", "0.8", "1.2"]
+    assert [row["exact.m1 [kg]"] for row in rows[:4]] == ["0.8", "1.2", "0.8", "1.2"]
     assert [float(row["relative error"]) for row in rows[4:]] == facts["maps"][1]["values"]
     page = (tmp_path / "report.html").read_text()
     assert "Over deformation.gain and exact.m1" in page

@@ -66,6 +66,7 @@ A path that begins with exact. (the parameter of what moves), approximate., know
 limits.inputs.Q1.1 or dead_time.inputs.Q1, is the problem's. Every other path is the controllers'; those without it are the same
 along it. Settings that can be live are numbers of one compiled loop; for others every value has a loop of its own, and the
 report says so. Finished runs are kept, and the same command goes on with them.
-sweep.csv (with --format parquet sweep.parquet) has a row per run.
+sweep.csv (with --format parquet sweep.parquet) has a row per run; units stand behind the names, or in
+the attributes of a table in Parquet.
 """,
 )

@@ -256,9 +256,12 @@ class Cluster:
         where: Any = address
         if address == LOCAL:
             with package("dask.config", "cluster", "--cluster").set(_LOCAL):
-                local = self._dask.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0")
+                facts = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
+                local = self._dask.LocalCluster(n_workers=count, threads_per_worker=1, **facts)
             where = self._stack.enter_context(local)
         try:
+            if where is address:  # a client of what is no address hangs when it is closed
+                self._dask.comm.get_address_host_port(address)
             return self._stack.enter_context(self._dask.Client(where, timeout=_WAIT, set_as_default=False))
         except (OSError, ValueError, TypeError) as error:
             self._stack.close()

@@ -184,17 +184,17 @@ class Ledger:
         records, summed = Records(self._path), True
         for number, text in enumerate(self._whole_lines(), 1):
             if number == 1 or not summed or not _is_as_written(text):
-                line = _parsed(self._path, text, f", line {number}")
+                what = (
+                    "remove the line, and its result is computed again"
+                    if number > 1
+                    else "remove the file to begin again"
+                )
+                line = _parsed(self._path, text, f", line {number}", what)
                 if number == 1:
                     summed = _SUM in line
                 else:
                     self._check(number, line)
                 if summed and line.pop(_SUM, "") != _sum(line):
-                    what = (
-                        "remove the line, and its result is computed again"
-                        if number > 1
-                        else "remove the file to begin again"
-                    )
                     raise OutputError(f"'{self._path}', line {number} is damaged: its checksum does not fit; {what}")
                 if number == 1 and line != header:
                     raise OutputError(_refusal(self._path, line, header))
@@ -256,13 +256,13 @@ def begun_with(path: Path, name: str, other: Any) -> Any:
     return other
 
 
-def _parsed(path: Path, text: bytes, where: str = "") -> dict[str, Any]:
+def _parsed(path: Path, text: bytes, where: str = "", what: str = "remove the file to begin again") -> dict[str, Any]:
     try:
         value = json.loads(text)
     except ValueError:
         value = None
     if not isinstance(value, dict):
-        raise OutputError(f"'{path}'{where} is damaged; remove the file to begin again")
+        raise OutputError(f"'{path}'{where} is damaged; {what}")
     return value
 
 

@@ -63,7 +63,7 @@ class _Running:
         number = int(record["scenario"])
         if value > self._worst or not self._shown.count:
             self._worst, self._worst_of = value, (str(record.get("name", number)), number)
-        if self._first_ended is None and not math.isfinite(value):
+        if self._first_ended is None and record["outcome"] == "ended early":
             self._first_ended = number
         self._shown.add((number, error, value, record["mismatch"]))
         self._outcomes[str(record["outcome"])] += 1

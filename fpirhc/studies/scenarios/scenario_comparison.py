@@ -53,6 +53,7 @@ class ScenarioComparison(Study, FoundByName):
         pictures: those of the problem file; they are drawn where they keep something of every run.
         apart: why runs of some controllers were one after the other, and not side by side.
         to_look_at: options of `fpirhc run` for some scenarios, by controller and what they are.
+        units: units of the numbers of records, by 'metric.element'.
     """
 
     count: int
@@ -72,13 +73,17 @@ class ScenarioComparison(Study, FoundByName):
     pictures: tuple[Picture, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
     to_look_at: Mapping[str, Mapping[str, Sequence[str]]] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"
         return line(self, self.problem, *counts, self.verdict[0])
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return a row per controller and scenario as a pandas DataFrame: numbers of a metric in columns 'rms_error.q1'."""
+        """Return a row per controller and scenario as a pandas DataFrame: numbers of a metric in columns 'rms_error.q1'.
+
+        `attrs["units"]` has the units of columns that have one, by name.
+        """
         import pandas as pd
 
         rows = [
@@ -89,7 +94,9 @@ class ScenarioComparison(Study, FoundByName):
             for some in self.records.values()
             for record in some
         ]
-        return pd.DataFrame(rows)
+        frame = pd.DataFrame(rows)
+        frame.attrs["units"] = {name: unit for name, unit in self.units.items() if unit not in ("", "1")}
+        return frame
 
     @property
     def view(self) -> View:

@@ -146,6 +146,12 @@ def compare_scenarios(
         if many > begun
         else {n: w for n, w in bench.apart.items() if n in records},
         to_look_at={} if tuned else _to_look_at(task, conditions, summaries),
+        units={
+            metric.key(element): metric.unit_of(task.problem, element)
+            for metric in task.metrics
+            for one in summaries
+            for element in one.metrics.get(metric.name, ())
+        },
     )
 
 

@@ -66,7 +66,7 @@ class Objective:
     def text(self, value: float) -> str:
         """Return a value as text, in the unit and with the sign of the metric."""
         if not math.isfinite(value):
-            return "none (failed)"
+            return "none"
         if self.metric is None:
             return in_percent(value)
         return self.metric.text(self._sign * value) + self._unit
