@@ -6,6 +6,7 @@ A type checker reads a kind as float or int.
 from __future__ import annotations
 
 import collections.abc
+import difflib
 import inspect
 import math
 import numbers
@@ -113,6 +114,7 @@ Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0,
 AboveZero: TypeAlias = Annotated[float, Range("a number above 0", low=0.0, open_low=True)]  # infinite too
 Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
 NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
+AtLeastOne: TypeAlias = Annotated[float, Range("a finite number of at least 1", low=1.0, open_high=True)]
 NotZero: TypeAlias = Annotated[float, _NotZero("a finite number other than zero (no adaptation is Identity())")]
 BelowOne: TypeAlias = Annotated[float, Range("a number from 0 to below 1", low=0.0, high=1.0, open_high=True)]
 Deviation: TypeAlias = Annotated[  # its square is finite, and not zero
@@ -239,6 +241,24 @@ class Number(Expected):
         if number is None:  # a whole number beyond the largest float is a whole number
             return self.whole and type(value) is int and (self.within is None or self.within.holds(value))
         return not math.isnan(number) if self.within is None else self.within.holds(number)
+
+
+@dataclass(frozen=True)
+class OneOf(Expected):
+    """One of some texts."""
+
+    texts: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        return " or ".join(f"'{text}'" for text in self.texts)
+
+    def fits(self, value: object) -> bool:
+        return isinstance(value, str) and value in self.texts
+
+    def completed(self, part: object) -> str:
+        near = difflib.get_close_matches(part, self.texts, n=1) if isinstance(part, str) else []
+        return f"write '{near[0]}'" if near else ""
 
 
 @dataclass(frozen=True)
@@ -379,6 +399,8 @@ def expected_by(annotation: object) -> Expected:  # noqa: PLR0911 -- one line pe
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return _annotated(arguments)
+    if origin is typing.Literal:
+        return OneOf(arguments)
     if origin in (typing.Union, types.UnionType):
         return Choice(tuple(expected_by(a) for a in arguments))
     if origin is collections.abc.Callable or annotation is collections.abc.Callable:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -11,7 +10,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Count, Duration, described
+from fpirhc.fields.kinds import AtLeastOne, Count, Duration, NotNegative, described
 from fpirhc.plant.integrators import USUAL, Integrator
 
 
@@ -51,11 +50,11 @@ class Horizon(Checked):
     step: Duration
     discretisation: Integrator = USUAL
     terminal: tuple[str, ...] = ()
-    blocks: tuple[int, ...] = ()
-    margins: Mapping[str, Sequence[float]] = field(
+    blocks: tuple[Count, ...] = ()
+    margins: Mapping[str, Sequence[NotNegative]] = field(
         default_factory=dict, hash=False, metadata={"setting": "where given"}
     )
-    lengths: tuple[float, ...] = field(default=(), kw_only=True, metadata={"setting": "where given"})
+    lengths: tuple[AtLeastOne, ...] = field(default=(), kw_only=True, metadata={"setting": "where given"})
     measured: tuple[str, ...] = field(default=(), kw_only=True, metadata={"setting": False})
     replan: Literal["stage", "cycle"] | Count = field(
         default="stage", kw_only=True, metadata={"setting": "where given"}
@@ -63,29 +62,19 @@ class Horizon(Checked):
     share: float = field(default=1.0, kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
-        whole = isinstance(self.replan, int) and not isinstance(self.replan, bool) and self.replan >= 1
-        if not whole and self.replan not in ("stage", "cycle"):
-            raise InvalidValue(
-                f'horizon: replan must be "stage", "cycle" or a whole number of control cycles from 1, got {self.replan!r}'
-            )
-        if self.lengths and (
-            len(self.lengths) != self.stages
-            or self.lengths[0] != 1
-            or not all(1 <= length < math.inf for length in self.lengths)
-        ):
+        if self.lengths and (len(self.lengths) != self.stages or self.lengths[0] != 1):
             raise InvalidValue(
                 f"horizon: lengths must be {self.stages} finite numbers of at least 1, one for every stage in steps of the first, "
                 f"which is 1; got {described(self.lengths)}"
             )
-        if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):
+        if self.blocks and sum(self.blocks) != self.stages:
             raise InvalidValue(
                 f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"
             )
         for name, margin in self.margins.items():
-            if len(margin) != self.stages or not all(0 <= m < math.inf for m in margin):
+            if len(margin) != self.stages:
                 raise InvalidValue(
-                    f"horizon: margins of '{name}' must be {self.stages} finite numbers of at least 0, one for every stage, got "
-                    f"{margin!r}"
+                    f"horizon: margins of '{name}' must be {self.stages} numbers, one for every stage, got {margin!r}"
                 )
         if self.discretisation.opaque:
             raise InvalidValue(

@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidShape, InvalidValue, Mistakes, nearest
+from fpirhc.errors import FpirhcError, InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import outside_names
@@ -25,7 +25,6 @@ from fpirhc.symbolic.layout import Expression
 
 _FILLED: Latest[ca.Function] = Latest(16)  # every run asks for those of the plant and of the model
 _REAL: Latest[Mapping[str, Exogenous]] = Latest(8)
-_HOLDS = ("zero", "linear")
 
 
 class Exogenous(Checked, ABC):
@@ -231,8 +230,6 @@ class Samples(Checked):
     hold: Literal["zero", "linear"] = "zero"
 
     def __post_init__(self) -> None:
-        if self.hold not in _HOLDS:
-            raise InvalidValue(f"Samples: hold {self.hold!r} is unknown.{nearest(str(self.hold), _HOLDS)}")
         times, values = (np.asarray(v, dtype=float) for v in (self.times, self.values))
         least = 1 if self.hold == "zero" else 2
         if times.ndim != 1 or times.size < least or values.shape != times.shape:

@@ -63,6 +63,10 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: ANY.compare_scenarios(TASK, seed=0, folder="results"),
         "compare_scenarios.folder: expected a Path, got the text 'results'; write pathlib.Path('results')",
     ),
+    "a misspelt word": (
+        lambda: ANY.Horizon(10, 0.01, replan="cycles"),
+        "Horizon.replan: expected 'stage' or 'cycle' or a whole number from 1 to 1000000, got the text 'cycles'; write 'cycle'",
+    ),
     "a stepper of a name": (
         lambda: ANY.Stepper(PROBLEM, "CTC"),
         "Stepper.controller: expected a Controller, got the text 'CTC'; write controllers['CTC'] of a loaded problem file",

@@ -7,11 +7,11 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
-from fpirhc.errors import InvalidName, InvalidValue, nearest
+from fpirhc.errors import InvalidName, InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.motion import followed_units
 from fpirhc.simulation.metrics.summed import Summed
@@ -85,14 +85,6 @@ class Metric(Checked):
                 f"metric {self.name!r}: expected a name of small letters, digits and '_', such as 'rms_error' or "
                 "'solve.worst_iterations'"
             )
-        for what, value, valid in (
-            ("better", self.better, get_args(Better)),
-            ("compared", self.compared, get_args(Compared)),
-        ):
-            if value not in valid:
-                raise InvalidValue(
-                    f"metric '{self.name}': {what} is {value!r}, expected one of {', '.join(valid)}.{nearest(value, valid)}"
-                )
 
     @property
     def summed(self) -> Summed | None:
