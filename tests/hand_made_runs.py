@@ -7,8 +7,7 @@ import numpy as np
 from plants import linear
 
 import fpirhc as fp
-from fpirhc.simulation.log import with_common_columns
-from fpirhc.simulation.run import Run
+from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 PERIOD, CYCLES = 0.1, 100

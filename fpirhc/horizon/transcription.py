@@ -146,7 +146,7 @@ def _transcribed(
 class _Stage:
     """Symbols x, before, u, theta of one stage, and its expressions; `before` is empty unless the input is part of the state.
 
-    theta ends with the symbols of live `settings` and of what follows from them (see `live_data`).
+    theta ends with the symbols of live `settings` and of what follows from them (see `live_signals`).
     """
 
     x: Expression

@@ -27,7 +27,7 @@ from fpirhc.simulation.drawing import (
     thinned,
     time_label,
 )
-from fpirhc.simulation.log import shown_motion
+from fpirhc.simulation.run import shown_motion
 from fpirhc.summary import number
 
 if TYPE_CHECKING:

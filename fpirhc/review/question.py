@@ -147,7 +147,7 @@ class Case:
 
     @cached_property
     def nominal(self) -> NominalRun | str:
-        """The model's own run over at most `nominal_runs.CYCLES` cycles, or the reason why there is none."""
+        """The model's own run over at most `prediction.CYCLES` cycles, or the reason why there is none."""
         return self.runs.of(self.controller)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.simulation.log import Log, responses_of, shown_motion
+from fpirhc.simulation.run import Run, responses_of, shown_motion
 from fpirhc.summary import printable
 
 if TYPE_CHECKING:
@@ -60,18 +60,18 @@ def literal(text: str) -> str:
     return printable(text).replace("$", r"\$")
 
 
-def time_label(run: Log) -> str:
+def time_label(run: Run) -> str:
     """Return the label of a time axis: 'time [s]'."""
     return literal(f"time [{run.time_unit}]")
 
 
-def quantity_label(run: Log, signal: str, names: Sequence[str]) -> str:
+def quantity_label(run: Run, signal: str, names: Sequence[str]) -> str:
     """Return the label of an axis that shows these entries of a signal, with their unit where they have one in common."""
     units = list(dict.fromkeys(run.unit(f"{signal}.{name}") for name in names))
     return literal(", ".join(names) + (f" [{units[0]}]" if len(units) == 1 else ""))
 
 
-def by_unit(run: Log, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
+def by_unit(run: Run, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
     """Return these entries of a signal by their unit, in their order: a chart has one unit."""
     groups: dict[str, list[str]] = {}
     for name in names:
@@ -79,7 +79,7 @@ def by_unit(run: Log, signal: str, names: Sequence[str]) -> dict[str, list[str]]
     return groups
 
 
-def draw_bands(axis: Axes, run: Log) -> None:
+def draw_bands(axis: Axes, run: Run) -> None:
     """Draw time slots as shaded bands, named in the legend."""
     named: set[int] = set()
     for start, end, slot in run.spans():
@@ -95,7 +95,7 @@ def draw_bands(axis: Axes, run: Log) -> None:
         named.add(slot)
 
 
-def draw_changes(axis: Axes, run: Log) -> None:
+def draw_changes(axis: Axes, run: Run) -> None:
     """Draw the times at which live settings changed as vertical lines, named in the legend."""
     for k, (time, _) in enumerate(run.in_force[1:]):
         axis.axvline(time, color="#777777", lw=0.8, ls=":", label=None if k else "change of settings")
@@ -106,7 +106,7 @@ def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
     return values[:: max(1, values.shape[0] // points)]
 
 
-def draw_line(axis: Axes, run: Log, column: str, label: str, color: str, style: str = "-") -> None:
+def draw_line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:
     """Draw one column of a run over time; its unit stands in the legend."""
     axis.plot(
         thinned(run.time),
@@ -125,7 +125,7 @@ def draw_legend(axis: Axes) -> None:
         axis.legend(fontsize=7, loc="best", framealpha=0.8)
 
 
-def draw_responses(axis: Axes, run: Log, name: str) -> None:
+def draw_responses(axis: Axes, run: Run, name: str) -> None:
     """Draw the nominal, desired, deformed and realised response of one coordinate; a spike does not hide the rest."""
     columns = {what: f"{signal}.{name}" for what, signal in responses_of(run.layout).items()}
     for what, column in columns.items():
@@ -136,7 +136,7 @@ def draw_responses(axis: Axes, run: Log, name: str) -> None:
         axis.set_ylim(-3 * usual, 3 * usual)
 
 
-def draw_signal(axis: Axes, run: Log, names: Sequence[str], signal: str) -> None:
+def draw_signal(axis: Axes, run: Run, names: Sequence[str], signal: str) -> None:
     """Draw entries of a signal of a run over time, each in its colour."""
     for k, name in enumerate(names):
         draw_line(axis, run, f"{signal}.{name}", name, PALETTE[k % len(PALETTE)])
@@ -149,7 +149,7 @@ def caption_axes(axis: Axes, across: str, up: str) -> None:
     axis.grid(visible=True, alpha=0.25)
 
 
-def run_figure(run: Log) -> Figure:
+def run_figure(run: Run) -> Figure:
     """Return a figure with errors, coordinates, commands and responses of one run over time, one chart per unit."""
     judged, inputs, first = (
         run.layout["error"].elements,
@@ -174,7 +174,7 @@ def run_figure(run: Log) -> Figure:
     return figure
 
 
-def _draw_motion(axis: Axes, run: Log, names: Sequence[str], signal: str) -> None:
+def _draw_motion(axis: Axes, run: Run, names: Sequence[str], signal: str) -> None:
     for k, name in enumerate(names):
         color = PALETTE[k % len(PALETTE)]
         draw_line(axis, run, f"{signal}.{name}", name, color)
@@ -183,5 +183,5 @@ def _draw_motion(axis: Axes, run: Log, names: Sequence[str], signal: str) -> Non
             draw_line(axis, run, f"setpoint.{name}", f"{name} set-point", color, ":")
 
 
-def _draw_first_response(axis: Axes, run: Log, names: Sequence[str], _: str) -> None:
+def _draw_first_response(axis: Axes, run: Run, names: Sequence[str], _: str) -> None:
     draw_responses(axis, run, names[0])

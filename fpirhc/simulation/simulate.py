@@ -26,11 +26,10 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.changes import Changes, InForce, in_force
-from fpirhc.simulation.log import with_common_columns
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, disturbance_values, moving
 from fpirhc.simulation.ranges import Dropped
-from fpirhc.simulation.run import Run
+from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record, set_point_table
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, Latest, attempted

@@ -10,12 +10,11 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NoCode
-from fpirhc.simulation.log import with_common_columns
 from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.metrics.base import Metric, first_measured
 from fpirhc.simulation.metrics.summed import Cycle, Measured, Summed, Term, some
 from fpirhc.simulation.ranges import ranges_of
-from fpirhc.simulation.run import Run
+from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 

@@ -27,10 +27,10 @@ from fpirhc.plant.motion import forcing_units
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
-from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.pictures.planar import Planar
+from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, run_tables, simulator
 from fpirhc.studies.comparison.compare import select
 from fpirhc.symbolic.live import PREFIX

@@ -13,9 +13,9 @@ from fpirhc.errors import FpirhcError
 from fpirhc.export.binaries import web_module
 from fpirhc.export.device import c_of
 from fpirhc.export.targets.c import template, with_own_math
-from fpirhc.simulation.log import judged_motion
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.pictures.planar import Planar
+from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, run_tables
 from fpirhc.symbolic.driver import SIGNATURE
 from fpirhc.symbolic.live import PREFIX, LiveNumber

@@ -1,4 +1,4 @@
-"""A process that runs scenarios for another one: `python -m fpirhc.studies.scenarios.worker`, see `processes`.
+"""A process that runs scenarios for another one: `python -m fpirhc.studies.scenarios.worker`, see `cluster`.
 
 Its first line of input has the problem file and the conditions, and it answers with the fingerprint. Every other line has jobs
 [[scenarios, controller], ...], and it answers with their records.
