@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.errors import WorkerDied
+from fpirhc.studies.scenarios import ledger as ledgers
 from fpirhc.studies.scenarios import scenario_study
 from fpirhc.studies.scenarios.bench import RecordFields
 from fpirhc.studies.scenarios.ledger import Ledger, header_of
@@ -58,6 +60,28 @@ def test_a_result_that_stands_in_two_parts_is_kept_once(parts, tmp_path):
     assert (joined.records, joined.scenarios, joined.twice) == (10, 5, 6)
     again = merge_shards([parts / "part2"], tmp_path)
     assert (again.records, again.twice) == (10, 4)
+
+
+def test_joining_holds_places_and_checksums_alone(parts, tmp_path, monkeypatch):
+    """Thirty bytes a result, some of which is the growth of arrays: 12 for each of the two files, 4 for its place in the whole."""
+    monkeypatch.setattr(ledgers, "_BLOCK", 4096)
+    header = header_of(parts / "part1" / LEDGER)
+    with Ledger(parts / "part1" / LEDGER, header) as part:
+        record = part.records[0]
+
+    def most(count: int) -> int:
+        folder = tmp_path / f"{count}"
+        with Ledger(folder / LEDGER, header) as ledger:
+            for number in range(count):
+                ledger.append({**record, "scenario": number})
+        tracemalloc.start()
+        try:
+            assert merge_shards([folder], tmp_path / f"all{count}").scenarios == count
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    assert most(2500) - most(500) < 45 * 2000
 
 
 def test_parts_that_do_not_belong_together_are_refused(parts, tmp_path, capsys):

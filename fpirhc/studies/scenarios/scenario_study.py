@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import time
+from array import array
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -297,31 +298,60 @@ def merge_shards(folders: Sequence[Path], out: Path) -> Joined:
     Raises:
         OutputError: a folder without results, results under other conditions, or one result that differs between two folders.
     """
-    header = header_of(folders[0] / LEDGER)
+    header, twice = header_of(folders[0] / LEDGER), 0
     with Ledger(out / LEDGER, header, RecordFields) as whole:
-        known, twice = {_key(record): k for k, record in enumerate(whole.records)}, 0
+        known = _Places()
+        for place, record in enumerate(whole.records):
+            known.put(record, place)
         for folder in folders:
             header_of(folder / LEDGER)  # a folder without results is named, and gets none
             with Ledger(folder / LEDGER, header, RecordFields) as part:
                 for record in part.records:
-                    key = _key(record)
-                    if key not in known:
-                        known[key] = len(whole.records)
+                    before = known.of(record)
+                    if before is None:
+                        known.put(record, len(whole.records))
                         whole.append(record)
-                    elif _result(whole.records[known[key]]) == _result(record):
+                    elif _result(whole.records[before]) == _result(record):
                         twice += 1
                     else:
-                        name, number = key
                         raise OutputError(
-                            f"'{folder / LEDGER}': scenario {number} of '{name}' has another result than in another folder; run "
-                            "this part again on one of the machines"
+                            f"'{folder / LEDGER}': scenario {record['scenario']} of '{record['controller']}' has another result "
+                            "than in another folder; run this part again on one of the machines"
                         )
-        names = tuple(dict.fromkeys(name for name, _ in known))
-        return Joined(len(known), names, len({number for _, number in known}), twice)
+        return Joined(len(whole.records), known.controllers, known.scenarios, twice)
 
 
-def _key(record: Mapping[str, Any]) -> tuple[str, int]:
-    return record["controller"], record["scenario"]
+class _Places:
+    """Where records stand among others, by controller and scenario, four bytes each."""
+
+    def __init__(self) -> None:
+        self._by_name: dict[
+            str, array[int]
+        ] = {}  # by controller; the place after a scenario's, and 0 where there is none
+
+    @property
+    def controllers(self) -> tuple[str, ...]:
+        """Names in the order of their first records."""
+        return tuple(self._by_name)
+
+    @property
+    def scenarios(self) -> int:
+        """Number of different scenarios."""
+        there = np.zeros(max(map(len, self._by_name.values()), default=0), dtype=bool)
+        for places in self._by_name.values():
+            there[: len(places)] |= np.frombuffer(places, places.typecode) > 0
+        return int(there.sum())
+
+    def of(self, record: Mapping[str, Any]) -> int | None:
+        """Return the place of the record with this one's controller and scenario."""
+        places, number = self._by_name.get(record["controller"], ()), record["scenario"]
+        return places[number] - 1 if number < len(places) and places[number] else None
+
+    def put(self, record: Mapping[str, Any], place: int) -> None:
+        """Set the place of a record."""
+        places, number = self._by_name.setdefault(record["controller"], array("I")), record["scenario"]
+        places.frombytes(bytes(max(0, number + 1 - len(places)) * places.itemsize))
+        places[number] = place + 1
 
 
 def _result(record: Mapping[str, Any]) -> dict[str, Any]:
