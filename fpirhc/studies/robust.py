@@ -232,14 +232,11 @@ class _Plants:
     def _worst_of_lanes(self, lanes: Lanes, percent: int) -> Point | None:
         """The same by plants side by side; None where rounding decides which one fails first, or a plant cannot run."""
         for begin in range(0, len(self._shares), _SIDE_BY_SIDE):
-            places = range(begin, min(begin + _SIDE_BY_SIDE, len(self._shares)))
-            try:
-                plants = [self._problem.with_exact(self._exact(percent, self._shares[k])) for k in places]
-                pairs = zip(plants, (self._noise[k] for k in places), strict=True)
-                runs = [lanes.one_run(self._loop, problem, noise, exact_alone=True) for problem, noise in pairs]
-            except FpirhcError:  # the loop one after the other names the plant
+            some = slice(begin, begin + _SIDE_BY_SIDE)
+            errors = self._errors_of_lanes(lanes, percent, self._shares[some], self._noise[some])
+            if errors is None:
                 return None
-            self._errors[places] = errors = np.array([self._error(one) for one in lanes.values(runs)])
+            self._errors[some] = errors
             failing = np.flatnonzero(~(errors <= self._judge.fails))
             if failing.size:
                 k = begin + int(failing[0])
@@ -248,6 +245,18 @@ class _Plants:
         worst = int(np.argmax(self._errors))
         largest = self._point(percent, self._shares[worst], self._noise[worst])
         return None if largest.why else largest
+
+    def _errors_of_lanes(
+        self, lanes: Lanes, percent: int, shares: np.ndarray, noise: Sequence[int]
+    ) -> np.ndarray | None:
+        """The errors of plants side by side; None where one cannot run, which the loop one after the other names."""
+        try:
+            plants = [self._problem.with_exact(self._exact(percent, one)) for one in shares]
+            pairs = zip(plants, noise, strict=True)
+            runs = [lanes.one_run(self._loop, problem, own, exact_alone=True) for problem, own in pairs]
+        except FpirhcError:
+            return None
+        return np.array([self._error(one) for one in lanes.values(runs)])
 
     def _error(self, values: Values | None) -> float:
         """The relative error of a run; infinite where it ends early."""
@@ -269,23 +278,43 @@ class _Plants:
         start = np.vstack([worst, np.round(worst), 1 - np.round(worst)])  # their corners, and the corners across
         largest, noise = 0.0, self._noise[int(order[0])]
 
-        def negative_error(shares: np.ndarray) -> float:
+        def negative_errors(columns: np.ndarray) -> np.ndarray:
             nonlocal largest
-            one = self._point(percent, shares, noise)
-            largest = max(largest, one.error)
-            if one.why:
-                raise _Found(shares, one)
-            return -one.error
+            errors = self._searched(percent, columns.T, noise)
+            largest = max(largest, float(errors.max()))
+            return -errors
 
         limits = [(0.0, 1.0)] * len(self._parameters)
         generations = max(len(self._shares) // len(start) - 1, 1)
         try:
             differential_evolution(
-                negative_error, limits, init=start, maxiter=generations, tol=0, polish=False, seed=self._seed
+                negative_errors,
+                limits,
+                init=start,
+                maxiter=generations,
+                tol=0,
+                polish=False,
+                seed=self._seed,
+                vectorized=True,
+                updating="deferred",
             )
         except _Found as failing:
-            return largest, self._counterexample(percent, failing, noise)
+            return max(largest, failing.point.error), self._counterexample(percent, failing, noise)
         return largest, None
+
+    def _searched(self, percent: int, generation: np.ndarray, noise: int) -> np.ndarray:
+        """The errors of the plants of a generation, shape (plants, np); the first that fails ends the search."""
+        if self._lanes is not None:
+            errors = self._errors_of_lanes(self._lanes, percent, generation, [noise] * len(generation))
+            if errors is not None and (errors <= self._judge.fails).all():
+                return errors
+        errors = np.empty(len(generation))
+        for k, shares in enumerate(generation):
+            one = self._point(percent, shares, noise)
+            if one.why:
+                raise _Found(shares, one)
+            errors[k] = one.error
+        return errors
 
     def _counterexample(self, percent: int, failing: _Found, noise: int) -> Counterexample:
         holds, fails = 0, percent
