@@ -92,7 +92,7 @@ def test_with_the_recommended_gain_the_wheel_moves_as_without_adaptation():
 
 @pytest.mark.parametrize(
     ("effective", "verdict", "recommended"),
-    [(0.4, "unknown", None), (1.6, "yes", -1.66), (1.8, "unknown", -1.66), (2.4, "no", -1.66)],
+    [(0.4, "unknown", None), (1.6, "yes", -1.66), (1.8, "caution", -1.66), (2.4, "no", -1.66)],
 )
 def test_the_gain_of_a_plain_form(folder, capsys, effective, verdict, recommended):
     """Its whole loop has the limit 1.66 in the box, where its map alone has 2.

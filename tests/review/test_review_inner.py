@@ -76,13 +76,13 @@ def test_unstable_zero_dynamics_that_a_plan_holds_are_told_as_both():
     ("rate", "planned", "radius", "learns", "verdict"),
     [
         (19.0, True, 0.999, False, "yes"),  # the plan holds them
-        (19.0, True, 1 + 1e-9, False, "unknown"),  # a mode that neither grows nor decays
-        (19.0, True, 1.0003, False, "unknown"),  # growth of 8 % over the 250 cycles of the run does not show
+        (19.0, True, 1 + 1e-9, False, "caution"),  # a mode that neither grows nor decays
+        (19.0, True, 1.0003, False, "caution"),  # growth of 8 % over the 250 cycles of the run does not show
         (19.0, True, 1.01, False, "no"),
         # By themselves they grow by 5 % in the run, and no plan needs to hold them.
-        (0.01, True, 1.01, False, "unknown"),
+        (0.01, True, 1.01, False, "caution"),
         (19.0, True, 1.01, True, "unknown"),  # what learns changes the loop
-        (1e-6, False, 1.01, False, "unknown"),  # neutral
+        (1e-6, False, 1.01, False, "caution"),  # neutral
         (19.0, False, 0.9, False, "no"),  # a law that does not see them holds none
         (0.01, False, 1.01, False, "unknown"),
         (-1.0, True, 1.01, False, "yes"),
@@ -99,9 +99,9 @@ def test_zero_dynamics_that_grow_are_a_no_where_nothing_holds_them_and_the_run_s
     ("rate", "radius", "verdict", "change"),
     [
         (-32.9, 0.999, "yes", ""),
-        (-32.9, 1.0 + 1e-9, "unknown", "A mode neither grows nor decays"),
+        (-32.9, 1.0 + 1e-9, "caution", "A mode neither grows nor decays"),
         (-32.9, 1.2, "no", "Lower the rate, or shorten the period."),
-        (19.0, 1.4, "unknown", "It is the mode of the zero dynamics"),  # e^(19 x .02) = 1.46
+        (19.0, 1.4, "caution", "It is the mode of the zero dynamics"),  # e^(19 x .02) = 1.46
         (19.0, 1.6, "no", "Lower the rate, or shorten the period."),
     ],
 )
@@ -135,7 +135,7 @@ def test_an_integral_that_nobody_judges_is_no_fault(controller, words):
 def test_an_integral_that_is_judged_is_not_called_stable():
     """The same integral among the judged coordinates: its error stays, which is no yes."""
     assert answer(companion(0.0, judged=("y", "z")), LAW, "zero dynamics").verdict == "caution"
-    assert answer(companion(0.0, judged=("y", "z")), LAW, "margin").verdict == "unknown"
+    assert answer(companion(0.0, judged=("y", "z")), LAW, "margin").verdict == "caution"
 
 
 def test_times_have_the_unit_of_the_problem():

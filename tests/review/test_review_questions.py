@@ -84,8 +84,8 @@ KEEPS = "keep the limits of states"
     [
         ({"states": {"q": (-0.6, 0.6)}}, "yes"),
         ({"states": {"q": (-0.4, 0.6)}}, "no"),
-        ({"states": {"q": (-0.4, 0.6)}, "soft": {"q": 10.0}}, "unknown"),
-        ({"states": {"q": (-0.4, 0.6)}, "prices": {"q": 10.0}}, "unknown"),
+        ({"states": {"q": (-0.4, 0.6)}, "soft": {"q": 10.0}}, "caution"),
+        ({"states": {"q": (-0.4, 0.6)}, "prices": {"q": 10.0}}, "caution"),
         ({"rates": {"u": (-1.2, 1.2)}}, "yes"),
         ({"rates": {"u": (-0.8, 0.8)}}, "no"),
         ({"paths": {"power": replace(POWER, lower=-0.3, upper=0.3)}}, "yes"),
