@@ -13,7 +13,7 @@ from fpirhc.report.html import css_class, render
 from fpirhc.report.terminal import STYLES
 from fpirhc.review.questions.margins import SLOWER
 from fpirhc.studies.comparison.changes import Outcome
-from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.compare import broken_limits, compare
 from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.view import to_json
 
@@ -141,7 +141,7 @@ def test_an_exact_model_that_is_beaten_is_no_bound():
     found = compare(task, seed=0, controllers=["RHC", "RHC+FPI", "RHC exact model"])
     [text] = [t for t in found.verdict if "no bound" in t]
     assert text.startswith("RHC exact model is no bound here: it has an rms error of size of")
-    assert "its model does not hold the disturbance of dose; it plans every 20 cycles" in text
+    assert "its model is without the disturbance of dose; it plans every 20 cycles" in text
 
 
 def test_at_the_same_rate_and_with_the_same_information_it_is_parity():
@@ -181,3 +181,25 @@ def test_two_loops_that_swing_by_themselves_are_not_told_to_ask_for_less():
         "both swing to and fro where the reference does not. Mend the loop without adaptation first; see its review."
     )
     assert "slow the reference down" not in text
+
+
+def test_a_hard_limit_that_a_run_breaks_is_told():
+    """The mass begins faster than its hard limit: the note says how fast; with a soft limit there is none, and none inside."""
+    mass = fp.Plant({"q": "m"}, {"u": "N"}, {"m": fp.Parameter(1.0, 1.0, "kg")}, lambda q, v, u, p: {"q": u.u / p.m})
+
+    def notes(limit: float, **soft: float) -> tuple[str, ...]:
+        problem = fp.Problem(
+            plant=mass,
+            reference=fp.Trajectory(lambda t: {"q": 0 * t}),
+            start={"q'": -1.5},
+            period=0.05,
+            duration=1.0,
+            limits=fp.Limits(states={"q'": (-limit, limit)}, soft=soft),
+            horizon=fp.Horizon(stages=10, step=0.05),
+            cost=fp.Quadratic(states={"q": 1.0, "q'": 0.1}, effort={"u": 1e-2}),
+        )
+        plan = fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3))
+        return broken_limits(problem, fp.simulate(problem, plan, seed=0, compiled=False))
+
+    assert notes(1.0) == ("q' reaches -1.5 m/s, beyond its hard limit of -1 m/s",)
+    assert notes(2.0) == notes(1.0, **{"q'": 10.0}) == ()

@@ -48,7 +48,10 @@ def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, erro
     factor = changes.get("factor")
     growing = changes.get("growing", float((factor or 0.0) >= 1))
     report = SimpleNamespace(
-        predicted=factor, growing=growing, report=SimpleNamespace(text=changes.get("advice", "Lower the gain."))
+        predicted=factor,
+        growing=growing,
+        report=SimpleNamespace(text=changes.get("advice", "Lower the gain.")),
+        spectrum=SimpleNamespace(eigenvalues=np.array(changes.get("slopes", [1.0]))),
     )
     cycle = None if micro is None else CycleTime(micro, micro, micro, micro, micro)
     contraction = cast(Any, None if factor is None else report)
@@ -445,6 +448,15 @@ def test_a_gain_is_the_cause_from_a_factor_of_one_on():
     assert no_difference(factor=1.0) == " Its iteration is no contraction (predicted factor 1). Lower the gain."
     assert no_difference(factor=1.2345) == " Its iteration is no contraction (predicted factor 1.23). Lower the gain."
     assert no_difference(factor=0.99) == no_difference() == ""
+
+
+def test_a_factor_of_one_without_any_slope_is_not_the_iterations():
+    """A reality that rounds its dose: no gain is to be lowered for it."""
+    text = no_difference(factor=1.0, slopes=[0.0, 0.0])
+    assert text == (
+        " The predicted factor of 1 is not its iteration's: no small change of a command moves the response, as where it "
+        "is rounded."
+    )
 
 
 def test_a_gain_is_the_cause_where_the_factor_is_above_one_in_a_twentieth_of_the_cycles():

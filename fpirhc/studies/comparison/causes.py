@@ -162,6 +162,10 @@ def _gain_cause(entry: Entry) -> str:
     one = entry.contraction
     if one is None or not grows(entry):
         return entry.reviewed_gain
+    if not np.any(one.spectrum.eigenvalues):
+        fact = "The predicted factor of 1 is not its iteration's: no small change of a command moves the response"
+        fact += ", as where it is rounded."
+        return f"{fact} {entry.reviewed_gain}".strip()
     share = "" if one.growing == 1 else f" in {in_percent(one.growing)} of the cycles"
     advice = entry.reviewed_gain or f"{one.report.text.rstrip('.')}."
     return f"Its iteration is no contraction{share} (predicted factor {one.predicted:.3g}). {advice}"

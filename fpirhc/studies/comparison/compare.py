@@ -17,6 +17,8 @@ from fpirhc.describe import describe, identity
 from fpirhc.errors import FpirhcError, Mistakes, NotContractive, NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
+from fpirhc.optimisers.base import FEASIBLE
+from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.questions.gain import recommended_for
 from fpirhc.review.response_prediction import Prediction, predict_response
@@ -233,7 +235,15 @@ def _entry(
         pair=_pair(controllers, name) if adaptive else None,
         contraction=contraction,
         optimality=optimality,
-        notes=(*_notes(controller, ready), *ready.notes(problem), *told, *run.remarks, *broken, *metrics.broken),
+        notes=(
+            *broken_limits(problem, run),
+            *_notes(controller, ready),
+            *ready.notes(problem),
+            *told,
+            *run.remarks,
+            *broken,
+            *metrics.broken,
+        ),
         lyapunov=view,
         prediction=prediction,
         weighed=weighed(problem, ready),
@@ -286,6 +296,23 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
     spectrum, measured = sampled_spectrum(problem, run), metrics["contraction.measured"][""]
     growing = metrics["contraction.growing"][""]
     return Contraction(predicted[""], growing, measured, assess_gain(controller.deformation, spectrum), spectrum)
+
+
+_CLOSE = 1e-3  # share of a limit, within which a state keeps it
+
+
+def broken_limits(problem: Problem, run: Run) -> tuple[str, ...]:
+    """By how much the run leaves each hard limit of a state."""
+    limits, names, units = problem.limits, problem.plant.state.elements, problem.plant.state.units
+    hard = [k for k, name in enumerate(names) if name in limits.states and name not in {**limits.soft, **limits.prices}]
+    texts = []
+    for k in hard:
+        (low, high), values = limits.states[names[k]], run["plant_state"][:, k]
+        for beyond, limit, end in ((values.max() - high, high, values.max()), (low - values.min(), low, values.min())):
+            if beyond > max(FEASIBLE, _CLOSE * abs(limit)):
+                unit = with_space(units[k])
+                texts.append(f"{names[k]} reaches {end:.4g}{unit}, beyond its hard limit of {limit:g}{unit}")
+    return tuple(texts)
 
 
 def _notes(controller: Controller, ready: Controller) -> tuple[str, ...]:

@@ -191,7 +191,7 @@ def no_bound_because(
     """Return why a controller with the exact model need not have the smallest error."""
     reasons = []
     if problem.disturbances:
-        reasons.append(f"its model does not hold the disturbance of {', '.join(problem.disturbances)}")
+        reasons.append(f"its model is without the disturbance of {', '.join(problem.disturbances)}")
     if any(problem.dead_time.inputs.values()) or problem.dead_time.measurement:
         reasons.append("dead time stands between its model and the plant")
     reasons += _plans_of(problem, controller, metrics, optimality)
