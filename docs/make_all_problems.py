@@ -73,7 +73,21 @@ def row_of(path: Path, tried: dict[str, Any]) -> tuple[str, ...] | None:
     cells = [_cell(base, plain), _cell(best, adapted), _cell(rival, rivals)]
     cells[2] = "none holds it" if lost and not rivals else cells[2]
     bound = _cell(min(exact, key=exact.__getitem__, default=""), exact)
-    return path.stem, metric, *cells, bound, *_judged(plain, adapted[best], rivals.get(rival))
+    winner, why = _judged(plain, adapted[best], rivals.get(rival))
+    if winner == "rival" and rival == tried.get("rival"):
+        why += ": " + (LARGE if _measured_at_once(path) else TUNED)
+    return path.stem, metric, *cells, bound, winner, why
+
+
+LARGE = "tuned on this run, where all is measured exactly and at once, it bears the largest gain that is tried"
+TUNED = "it is tuned on this run"
+
+
+def _measured_at_once(path: Path) -> bool:
+    """Whether a controller has every derivative in the cycle in which it is there, without noise and estimates."""
+    problem = fp.load_problem(str(path)).problem
+    late = any(problem.dead_time.inputs.values()) or problem.dead_time.measurement
+    return problem.sensing.ideal and not late and not problem.sensing.estimates
 
 
 def _of_baseline(path: Path, stored: Path) -> tuple[str, dict[str, float], dict[str, str]]:

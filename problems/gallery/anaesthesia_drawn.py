@@ -40,8 +40,22 @@ Each is the least and the most of three seeds of the noise:
     PID, tuned here                     0.0 to 0.0    25.8 to 26.3  86.7 to 86.8  13 to 15
     cascade in mg/l, tuned here         0.0 to 0.0    26.4 to 27.0  86.2 to 86.4  15 to 17
 
-No controller passes, and none that was tuned here does. D078 stays at 64 with the pump's largest target, 12 mg/l. In twelve people
-the effect site lags by more than 20 min, in D066 by 79: they are late, or their first doses were too large. A larger gain than that
+No controller passes, with at least 90, 37 and 97, and none that was tuned here does. Two people no controller can serve: with the
+pump's largest target, 12 mg/l, from the beginning on, D066 is in the range after half an hour and D078 never, at 64. For the others
+`python benchmarks/patients.py anaesthesia_drawn --reasons` gives everybody one thing as the controllers believe it. Of fifty, those
+in the range for less than 90 % of the time, and the lowest bis, with the PID law that was tuned here and seed 0:
+
+    below 90 %, lowest       D001 to D050    D051 to D100
+    as they are              14    21.0      13    26.3
+    no noise                 12    19.9      13    26.3
+    dead time as believed    13    19.6      14    27.4
+    effect site as believed   1    16.9       3    26.7
+    kinetics as believed      7    20.9      11    18.6
+    curve as believed        16    26.2      16    24.9
+
+Neither noise nor dead times are the reason. The effect site is: the drug's way to it takes about twice as long as the pump
+believes, in twelve people more than 20 min, in D066 79. They are late, or their first doses were too large. The lowest bis is that
+of sensitive people, whose curve nobody knows in the induction. A larger gain than that
 of the measured people keeps more people in the range, and takes the most sensitive ones of the first half lower: a person who needs
 half the concentration gives the loop twice the gain. Of the two that draw on the measured people, the PID law is the safer one in
 the first half and as safe in the second, and it keeps more people in the range.

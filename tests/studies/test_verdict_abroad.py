@@ -191,7 +191,7 @@ def test_a_hard_limit_that_a_run_breaks_is_told():
         problem = fp.Problem(
             plant=mass,
             reference=fp.Trajectory(lambda t: {"q": 0 * t}),
-            start={"q'": -1.5},
+            start={"q": 0.0, "q'": -1.5},
             period=0.05,
             duration=1.0,
             limits=fp.Limits(states={"q'": (-limit, limit)}, soft=soft),
