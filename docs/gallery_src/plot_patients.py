@@ -25,7 +25,7 @@ task = fp.load_problem("anaesthesia_people")
 
 about = task.description
 head, *rows = about[
-    about.index("    worst, lowest, mean") : about.index("\n\nOf the settings")
+    about.index("    worst, lowest, mean") : about.index("\n\nAt least 90")
 ].splitlines()
 for number, group in enumerate(("A tuned", "A unseen", "B", "C")):
     print(f"{group:38s}worst  lowest    mean")
