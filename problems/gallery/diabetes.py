@@ -275,6 +275,6 @@ metrics = (
 )
 headline_metric = "in_range"
 pictures = (
-    fp.Band("Glucose", what=GLUCOSE, target=(70.0, 180.0)),
+    fp.Band("Ambulatory glucose profile", what=GLUCOSE, target=(70.0, 180.0), fold=1440.0),  # min
     fp.Grid("Control variability", what=GLUCOSE, low=(110.0, 90.0, 70.0, 50.0), high=(110.0, 180.0, 300.0, 400.0)),
 )

@@ -197,6 +197,23 @@ def test_a_band_has_the_quantiles_of_the_cases():
     assert (upper.get_ylabel(), lower.get_xlabel()) == ("q [m]", "time [s]")
 
 
+def test_days_of_all_cases_lie_over_each_other():
+    """Two and a half days of three cases, ten values a day: nine mornings count, and six evenings."""
+    values = np.random.default_rng(6).normal(size=(3, 25))
+    cases = [case_of(row.tolist()) for row in values]
+    times = np.array(cases[0]["times"], dtype=float)
+    day = 10 * (times[1] - times[0])
+    figure = Figure()
+    fp.Band("b", what="state.q", fold=day).draw_cases(figure, {"RHC": cases})
+    least, most, middle = (np.asarray(line.get_ydata(), dtype=float) for line in figure.axes[0].lines)
+    late = np.full((3, 5), np.nan)
+    days = np.hstack([values, late]).reshape(9, 10)
+    np.testing.assert_allclose(least, np.nanmin(days, axis=0))
+    np.testing.assert_allclose(most, np.nanmax(days, axis=0))
+    np.testing.assert_allclose(middle, np.nanmedian(days, axis=0))
+    assert figure.axes[0].lines[2].get_xdata()[-1] < day
+
+
 def test_a_band_of_a_comparison_shows_its_runs(runs):
     """The median of one run is the run, averaged."""
     figure = Figure()

@@ -39,6 +39,8 @@ class Band(Picture):
         target: (low, high) of the range to be kept, shaded; empty: none.
         caption: of the picture.
         controllers: names of those shown; empty: all.
+        fold: time after which the axis begins anew, such as a day: every day of every case counts then, as in an ambulatory
+            glucose profile; 0: never.
     """
 
     title: str
@@ -46,6 +48,7 @@ class Band(Picture):
     target: tuple[float, ...] = ()
     caption: str = ""
     controllers: tuple[str, ...] = ()
+    fold: float = 0.0
     keeps: ClassVar[bool] = True
 
     def size(self, count: int) -> tuple[float, float]:
@@ -67,6 +70,8 @@ class Band(Picture):
         panels = figure.subplots(len(kept), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for k, (axis, (name, cases)) in enumerate(zip(panels, kept.items(), strict=True)):
             times, values = together(cases)
+            if self.fold > 0:
+                times, values = folded(times, values, self.fold)
             colour = drawing.PALETTE[k % len(drawing.PALETTE)]
             if self.target:
                 axis.axhspan(*self.target, color=_TARGET, alpha=0.1, lw=0)
@@ -92,6 +97,14 @@ def together(cases: Sequence[Kept]) -> tuple[np.ndarray, np.ndarray]:
         for own, one in zip(series, cases, strict=True)
     ]
     return times, np.array(rows)
+
+
+def folded(times: np.ndarray, values: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of one period, and every whole or begun period of every case at them, a row each; NaN after its end."""
+    once = times[times < period]
+    begins = np.arange(0.0, times[-1], period)
+    rows = [np.interp(once + begin, times, case, right=np.nan) for case in values for begin in begins]
+    return once, np.array(rows)
 
 
 ZONES = (("A", "B", "C"), ("B", "B", "D"), ("C", "D", "E"))  # by how low (rows) and how high (columns) a case goes
