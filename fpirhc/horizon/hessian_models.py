@@ -8,6 +8,7 @@ Loops in C call the parts, because they need Jacobians later, or not at all: `ev
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -98,7 +99,8 @@ class ChainRule:
 
     partials: ca.SX  # m, a column of expressions of the variables and parameters
     symbols: ca.SX  # a column of as many symbols for m
-    pulled: ca.SX  # J' w of the symbols and of the symbols `weights`
+    data: ca.SX  # parameters that the second part is given too
+    pulled: ca.SX  # J' w of the symbols, of the data and of the symbols `weights`
     weights: ca.SX  # w, as long as the results
     graph: Graph  # from which J is made
 
@@ -117,15 +119,19 @@ class ChainRule:
         return jacobian
 
 
-def chain_rule(results: ca.SX, variables: ca.SX, parameters: ca.SX) -> ChainRule:
-    """Return both parts of the derivative of a column of results."""
+def chain_rule(results: ca.SX, variables: ca.SX, parameters: ca.SX, data: ca.SX | None = None) -> ChainRule:
+    """Return both parts of the derivative of a column of results.
+
+    `data`: symbols among the parameters that are there in the second part too. What takes a sum or two of them is not kept.
+    """
+    data = ca.SX(0, 1) if data is None else data
     function = ca.Function("fpirhc_values", [variables, parameters], [results], {"cse": True})
     weights = ca.SX.sym("w", results.numel())
     calls = any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
     edges, ends, values = _direct(results, variables) if calls else _graph(function, variables, parameters)
-    partials, symbols = _named(edges, values)
+    partials, symbols = _named(edges, values, data)
     pulled = _pulled(edges, ends, weights, variables.numel())
-    return ChainRule(partials, symbols, pulled, weights, _compressed(edges, ends, variables.numel()))
+    return ChainRule(partials, symbols, data, pulled, weights, _compressed(edges, ends, variables.numel()))
 
 
 def _direct(results: ca.SX, variables: ca.SX) -> tuple[_Edges, list[int], list[ca.SX]]:
@@ -200,9 +206,16 @@ def _operation(kind: int, operands: int) -> ca.Function:
     return ca.Function("fpirhc_operation", symbols, [value, *(ca.densify(ca.jacobian(value, s)) for s in symbols)])
 
 
-def _named(edges: _Edges, values: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
+def _named(edges: _Edges, values: list[ca.SX], data: ca.SX) -> tuple[ca.SX, ca.SX]:
     """The partial derivatives that are not constant, each once, and symbols, which take their place at the edges."""
-    places = [(n, place) for n, by in enumerate(edges) for place, slope in by.items() if not slope.is_constant()]
+    known, places = {one.element_hash() for one in ca.vertsplit(data)}, list[tuple[int, int]]()
+    for n, by in enumerate(edges):
+        for place, slope in by.items():
+            anew = _anew(slope, known)
+            if anew is not None:
+                by[place] = anew
+            elif not slope.is_constant():
+                places.append((n, place))
     slopes = ca.cse(ca.vertcat(*(edges[n][place] for n, place in places), *values))
     partials, symbols = list[ca.SX](), dict[int, ca.SX]()
     for (n, place), slope in zip(places, ca.vertsplit(slopes[: len(places)]) if places else [], strict=True):
@@ -215,6 +228,24 @@ def _named(edges: _Edges, values: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
     if not partials:  # linear: a column must have an entry
         return ca.SX(0.0), ca.SX.sym("m")
     return ca.vertcat(*partials), ca.vertcat(*symbols.values())
+
+
+def _anew(slope: ca.SX, known: set[int], most: int = 2) -> ca.SX | None:
+    """A slope that so many products and sums of known symbols are; None: it is not."""
+    if slope.is_constant() or slope.element_hash() in known:
+        return slope
+    if not slope.n_dep() or not most:
+        return None
+    operands = list[ca.SX]()
+    for k in range(slope.n_dep()):
+        one = _anew(slope.dep(k), known, most - 1)
+        if one is None:
+            return None
+        operands.append(one)
+    code = slope.op()
+    if code == ca.OP_DIV and operands[1].is_constant() and abs(math.frexp(float(operands[1]))[0]) == 0.5:
+        return _times(operands[0], ca.SX(1 / float(operands[1])))  # the same number
+    return ca.SX.binary(code, *operands) if code in (ca.OP_ADD, ca.OP_SUB, ca.OP_MUL) else None
 
 
 def _half(slope: ca.SX) -> ca.SX:
@@ -272,13 +303,13 @@ def _eliminate(n: int, back: _Edges, ahead: list[set[int]]) -> bool:
 
 
 def slopes_function(rule: ChainRule, name: str) -> ca.Function:
-    """Function m -> the slopes of the graph that are not 1, in the order in which `tangent_code` reads them."""
+    """Function (m, data) -> the slopes of the graph that are not 1, in the order in which `tangent_code` reads them."""
     slopes = [slope for slope in _slopes(rule.graph) if not slope.is_one()]
-    return ca.Function(name, [rule.symbols], [ca.cse(ca.densify(ca.vertcat(*slopes, 0)))])
+    return ca.Function(name, [rule.symbols, rule.data], [ca.cse(ca.densify(ca.vertcat(*slopes, 0)))])
 
 
 def tangent_code(rule: ChainRule, name: str, slopes: str, blocks: tuple[int, int]) -> str:
-    """Return C code of `name`, CasADi's signature, m -> (A, B, l_s, l_u), for the results (s+, l) of the variables (s, u).
+    """Return C code of `name`, CasADi's signature, (m, data) -> (A, B, l_s, l_u), for the results (s+, l) of the variables (s, u).
 
     All directions of a tangent stand side by side: a line that does all of them at once is a loop of known length, which compilers
     turn into wide instructions,  t_n[:] = sum over the operands k of n of (dn/dk) t_k[:],  for every result n that is left after
@@ -467,7 +498,7 @@ def linearise_stage(ocp: OptimalControl) -> ca.Function:
         ns = ocp.state.size
         rates, slopes = rule.jacobian[:ns, :], rule.jacobian[ns, :].T
         results = [rates[:, :ns], rates[:, ns:], slopes[:ns], slopes[ns:]]
-        parts["linearise"] = _dense("fpirhc_linearise_stage", [rule.symbols], results)
+        parts["linearise"] = _dense("fpirhc_linearise_stage", [rule.symbols, rule.data], results)
     return parts["linearise"]
 
 
@@ -484,7 +515,7 @@ def stage_leaves(ocp: OptimalControl, names: tuple[str, ...]) -> tuple[_Parts, s
 
 
 def partial_count(ocp: OptimalControl) -> int:
-    """Return the number of partial derivatives m of a stage."""
+    """Return the number of partial derivatives m of a stage that are kept."""
     return int(split_stage(ocp)["pull"].numel_in(0))
 
 
@@ -514,10 +545,10 @@ def _split(ocp: OptimalControl) -> tuple[ChainRule, _Parts]:
     ns, nu = ocp.state.size, ocp.input.size
     s, u, theta = stage_symbols(ocp)
     next_state, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)
-    parts = chain_rule(ca.densify(ca.vertcat(next_state, cost)), ca.vertcat(s, u), theta)
+    parts = chain_rule(ca.densify(ca.vertcat(next_state, cost)), ca.vertcat(s, u), theta, theta)
     after = ca.SX.sym("lambda", ns)
     pulled = ca.substitute(parts.pulled, parts.weights, ca.vertcat(after, 1))
     return parts, {
         "evaluate": _dense("fpirhc_evaluate_stage", [s, u, theta], [next_state, cost, parts.partials]),
-        "pull": _dense("fpirhc_pull_stage", [parts.symbols, after], [pulled[:ns], pulled[ns : ns + nu]]),
+        "pull": _dense("fpirhc_pull_stage", [parts.symbols, after, theta], [pulled[:ns], pulled[ns : ns + nu]]),
     }

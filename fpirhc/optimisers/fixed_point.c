@@ -12,13 +12,15 @@ typedef struct {
 
 typedef struct {
   Plan plans[2];
-  casadi_real v[N * NU], k[N * NU * NS];
+  casadi_real v[N * NU];
   casadi_real partials[N * NM], lambda[COSTATES * NS], final[NS * NS];
   casadi_real envelope, reach, tau, gamma, resume;
 #ifdef SCALE_AT
   casadi_real metric[NU], first_gamma; /* settings are live: the scale and the first gamma are data of the call */
 #endif
 } Search;
+
+#define GAINS (N * (NU + NS)) /* where they begin in the memory */
 
 /* The costate of a node: that of the end stays, and of the others all or the last two. */
 #define COSTATE(i) (s->lambda + NS * (COSTATES > N ? (i) : (i) == N ? 2 : (i) & 1))
@@ -44,7 +46,7 @@ INLINE casadi_real descended(const Search* s, const Plan* plan, int k) {
 
 /* Roll out the next plan, with its cost and gradient; NO when something is not finite. The partial derivatives stay, for the
    Jacobians of a plan that is accepted. */
-INLINE Truth try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In lower, In upper) {
+INLINE Truth try_next(Search* s, const Plan* best, Plan* plan, In gains, In s0, In data, In lower, In upper) {
   int i, j, l;
   Truth bold = s->tau >= SHORTEST, untried = best->value >= UNTRIED;
   In arg[8];
@@ -58,7 +60,7 @@ INLINE Truth try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, I
     for (j = 0; j < NS; ++j) apart[j] = x[j] - best->x[i * NS + j];
     for (l = 0; l < NU; ++l) {
       casadi_real wanted = best->u[i * NU + l] + s->tau * s->v[i * NU + l];
-      for (j = 0; j < NS; ++j) wanted += s->k[(i * NS + j) * NU + l] * apart[j];
+      for (j = 0; j < NS; ++j) wanted += gains[(i * NS + j) * NU + l] * apart[j];
       if (!EVERY(bold)) {
         casadi_real plain = EITHER(untried, ALL(0), descended(s, best, i * NU + l));
         wanted = EITHER(bold, wanted, plain);
@@ -76,7 +78,7 @@ INLINE Truth try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, I
   plan->value += cost;
   for (j = 0; j < NS; ++j) COSTATE(N)[j] = slope[j];
   for (i = N - 1; i >= 0; --i) {
-    arg[0] = s->partials + i * NM, arg[1] = COSTATE(i + 1);
+    arg[0] = s->partials + i * NM, arg[1] = COSTATE(i + 1), arg[2] = data + i * NT;
     res[0] = COSTATE(i), res[1] = plan->g + i * NU;
     if (pull(arg, res, 0, 0, 0)) return NO;
   }
@@ -223,7 +225,7 @@ INLINE void box_policy(In slope, In matrix, In low, In high, Out v, Truth* free,
 }
 
 /* One Riccati sweep around the accepted plan: feedforward v, deformed, and feedback K. */
-INLINE int direct(Search* s, const Plan* plan, Truth accepted, In data, In lower, In upper) {
+INLINE int direct(Search* s, const Plan* plan, Out gains, Truth accepted, In data, In lower, In upper) {
   int i, j, l, m;
   In arg[8];
   Out res[8];
@@ -236,7 +238,7 @@ INLINE int direct(Search* s, const Plan* plan, Truth accepted, In data, In lower
     casadi_real steep[NU], low[NU], high[NU], factor[NU * NU], pivots[NU], *v = wanted + i * NU, k[NU * NS];
     casadi_real next[NS], pull[NU], gap[NU];
     Truth free[NU];
-    arg[0] = s->partials + i * NM;
+    arg[0] = s->partials + i * NM, arg[1] = data + i * NT;
     res[0] = a, res[1] = b, res[2] = ls, res[3] = lu;
     if (linearise(arg, res, 0, 0, 0)) return 1;
     arg[0] = plan->x + i * NS, arg[1] = plan->u + i * NU, arg[2] = data + i * NT, arg[3] = COSTATE(i + 1);
@@ -254,7 +256,10 @@ INLINE int direct(Search* s, const Plan* plan, Truth accepted, In data, In lower
     for (j = 0; j < NS; ++j) {
       for (l = 0; l < NU; ++l) k[j * NU + l] = -cross[j * NU + l];
       substitute(free, factor, pivots, k + j * NU);
-      for (l = 0; l < NU; ++l) s->k[(i * NS + j) * NU + l] = EITHER(accepted, k[j * NU + l], s->k[(i * NS + j) * NU + l]);
+      for (l = 0; l < NU; ++l) {
+        Out one = gains + (i * NS + j) * NU + l;
+        *one = EITHER(accepted, k[j * NU + l], *one);
+      }
     }
     for (l = 0; l < NU; ++l) {
       gap[l] = steep[l];
@@ -292,7 +297,7 @@ INLINE casadi_real residual(const Search* s, const Plan* plan, In lower, In uppe
   return worst;
 }
 
-INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
+INLINE void begin(Search* s, Plan* best, Out gains, In memory, Truth posed, In lower, In upper) {
   int i, l;
   Truth known = all_finite(memory, MEMORY);
   casadi_real gamma = EITHER(known, memory[MEMORY - 2], ALL(0)), tau = EITHER(known, memory[MEMORY - 1], ALL(0));
@@ -302,7 +307,7 @@ INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
       s->v[i * NU + l] = best->g[i * NU + l] = ALL(0);
     }
   for (i = 0; i < N * NS; ++i) best->x[i] = EITHER(known, memory[N * NU + i], ALL(0));
-  for (i = 0; i < N * NU * NS; ++i) s->k[i] = EITHER(known, memory[N * (NU + NS) + i], ALL(0));
+  for (i = 0; i < N * NU * NS; ++i) gains[i] = EITHER(known | NOT(posed), memory[GAINS + i], ALL(0));
   best->value = s->envelope = ALL(10 * UNTRIED);
   s->reach = ALL(0);
   s->tau = ALL(1);
@@ -312,18 +317,19 @@ INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
   s->gamma = EITHER(gamma > 0, s->gamma, ALL(FIRST_GAMMA));
 }
 
-/* The memory of a solved call; else that of a plan amid the limits, and the old one where nothing was posed. */
+/* The memory of a solved call; else that of a plan amid the limits, and the old one where nothing was posed. The gains are there. */
 INLINE void remember(const Search* s, const Plan* best, Truth good, Truth posed, In old, In lower, In upper, Out to) {
   int i;
 #define FRESH(k, value) EITHER(posed, value, old[k])
   for (i = 0; i < N * NU; ++i) to[i] = EITHER(good, best->u[i], FRESH(i, middle(lower[i % NU], upper[i % NU])));
   for (i = 0; i < N * NS; ++i) to[N * NU + i] = EITHER(good, best->x[i], FRESH(N * NU + i, ALL(0)));
-  for (i = 0; i < N * NU * NS; ++i) to[N * (NU + NS) + i] = EITHER(good, s->k[i], FRESH(N * (NU + NS) + i, ALL(0)));
+  for (i = 0; i < N * NU * NS; ++i) to[GAINS + i] = EITHER(good | NOT(posed), to[GAINS + i], ALL(0));
   to[MEMORY - 2] = EITHER(good, s->gamma, FRESH(MEMORY - 2, ALL(0)));
   to[MEMORY - 1] = EITHER(good, s->tau, FRESH(MEMORY - 1, ALL(0)));
 }
 
-/* The new memory may lie where the old one lies, which is read as a whole before. */
+/* The new memory may lie where the old one lies. Its gains serve as those of the search, and stay the old ones where nothing is
+   posed; the rest is read before it is written. */
 INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
 #ifdef __OPENCL_VERSION__
 #define GIVEN(k) arg[k]
@@ -336,15 +342,16 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
   Plan *best = s->plans, *plan = s->plans + 1;
   int i, tried;
   Truth posed = sane(s0, data, lower, upper), on = YES, empty = NO, good;
+  Out gains = res[2] + GAINS;
   casadi_real left, count = ALL(0), plain = ALL(0);
 #ifdef SCALE_AT
   for (i = 0; i < NU; ++i) s->metric[i] = data[SCALE_AT + i];
   s->first_gamma = SHARE / data[STEEPEST_AT];
 #endif
-  begin(s, best, memory, lower, upper);
+  begin(s, best, gains, memory, posed, lower, upper);
   for (tried = 0;; ++tried) {
-    Truth bold = s->tau >= SHORTEST, ok = try_next(s, best, plan, s0, data, lower, upper);
-    Truth accepted = judged(s, best, plan, ok, on, lower, upper);
+    Truth bold = s->tau >= SHORTEST, ok = try_next(s, best, plan, gains, s0, data, lower, upper);
+    Truth accepted = judged(s, best, plan, ok & posed, on, lower, upper);
     exchange(&best, &plan, accepted);
     if (tried == ITERATIONS) break;
     if (STOP_EARLY) {
@@ -355,7 +362,7 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
       accepted &= on;
     }
     count += EITHER(on, ALL(1), ALL(0));
-    if (ANY(accepted) && direct(s, best, accepted, data, lower, upper)) return 1;
+    if (ANY(accepted) && direct(s, best, gains, accepted, data, lower, upper)) return 1;
   }
   good = posed & (best->value < UNTRIED);
   left = residual(s, best, lower, upper);
@@ -369,9 +376,7 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
     res[1][4] = EITHER(good, EITHER(left <= TOLERANCE, ALL(CONVERGED), ALL(NOT_CONVERGED)), ALL(NON_FINITE));
     res[1][4] = EITHER(empty, ALL(INFEASIBLE), res[1][4]);
   }
-  if (res[2]) {
-    if (EVERY(good)) remember(s, best, YES, posed, memory, lower, upper, res[2]);
-    else remember(s, best, good, posed, memory, lower, upper, res[2]);
-  }
+  if (EVERY(good)) remember(s, best, YES, posed, memory, lower, upper, res[2]);
+  else remember(s, best, good, posed, memory, lower, upper, res[2]);
   return 0;
 }

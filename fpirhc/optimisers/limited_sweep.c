@@ -45,7 +45,7 @@ static int expand(Point* p, In k, int rolled, In gaps, In s0, In data, In lower,
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
     res[0] = p->f + i * NS, res[1] = &cost, res[2] = partials;
     if (evaluate(arg, res, 0, 0, 0)) return 0;
-    arg[0] = partials;
+    arg[0] = partials, arg[1] = data + i * NT;
     res[0] = p->a + i * NS * NS, res[1] = p->b + i * NS * NU, res[2] = p->ls + i * NS, res[3] = p->lu + i * NU;
     if (linearise(arg, res, 0, 0, 0)) return 0;
     p->value += cost;

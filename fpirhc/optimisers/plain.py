@@ -136,7 +136,7 @@ def _room(ocp: OptimalControl, costates: int) -> int:
     """Numbers of the struct Search of fixed_point.c."""
     nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
     plan = 2 * n * nu + (n + 1) * ns + 1
-    course = n * (nu + nu * ns + partial_count(ocp)) + costates * ns + ns * ns
+    course = n * (nu + partial_count(ocp)) + costates * ns + ns * ns
     return 2 * plan + course + 5 + (nu + 1 if ocp.settings else 0)
 
 

@@ -14,7 +14,7 @@ from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_sta
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import backward_sweep, in_reverse
 from fpirhc.horizon.stage_data import STEEPEST, settings_in
-from fpirhc.optimisers.base import clip
+from fpirhc.optimisers.base import clip, sane
 from fpirhc.symbolic.expression import FINITE, TINY, is_finite
 from fpirhc.symbolic.live import PREFIX, Number
 
@@ -89,6 +89,7 @@ class Search:
         tried = self._try(arguments.s0, arguments.data, arguments.lower, arguments.upper, *anchor[:5], anchor.step)
         inputs, states, costs, a, b, by_state, by_input = tried
         value, slope, costates = self._expand(states, inputs, costs, arguments.data, a, b, by_state, by_input)
+        value = ca.if_else(sane(*arguments), value, ca.inf)  # where nothing is posed no plan is accepted
         live = [self._ocp.scale_in(arguments.data)] if self._ocp.settings else []
         judged = self._judge(inputs, states, value, slope, arguments.lower, arguments.upper, *anchor, *live)
         *fields, accepted = judged

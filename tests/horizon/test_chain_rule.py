@@ -54,21 +54,30 @@ def operations(function: ca.Function) -> Counter[int]:
     return Counter(function.instruction_id(k) for k in range(function.n_instructions()))
 
 
+@pytest.mark.parametrize("data", [None, P], ids=["", "data"])
 @pytest.mark.parametrize("results", EXPRESSIONS.values(), ids=EXPRESSIONS.keys())
-def test_both_parts_are_the_derivative(results):
+def test_both_parts_are_the_derivative(results, data):
     """J(m) is the Jacobian, and J(m)' w its transpose times any w; of twice a number the number is kept."""
-    parts = chain_rule(ca.densify(results), X, P)
+    parts = chain_rule(ca.densify(results), X, P, data)
     assert not any(one.is_op(ca.OP_TWICE) for one in ca.vertsplit(parts.partials))
     made = ca.Function("made", [X, P], [parts.partials])
-    jacobian = ca.Function("jacobian", [parts.symbols], [ca.densify(parts.jacobian)])
-    pulled = ca.Function("pulled", [parts.symbols, parts.weights], [ca.densify(parts.pulled)])
+    jacobian = ca.Function("jacobian", [parts.symbols, P], [ca.densify(parts.jacobian)])
+    pulled = ca.Function("pulled", [parts.symbols, P, parts.weights], [ca.densify(parts.pulled)])
     expected = ca.Function("expected", [X, P], [ca.densify(ca.jacobian(results, X))])
     rng = np.random.default_rng(4)
     for _ in range(20):
         x, p, w = rng.normal(size=3), rng.uniform(0.5, 1.5, size=2), rng.normal(size=results.numel())
         m, j = made(x, p), expected(x, p).full()
-        np.testing.assert_allclose(jacobian(m).full(), j, rtol=1e-13, atol=1e-14)
-        np.testing.assert_allclose(pulled(m, w).full().ravel(), j.T @ w, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(jacobian(m, p).full(), j, rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(pulled(m, p, w).full().ravel(), j.T @ w, rtol=1e-12, atol=1e-13)
+
+
+def test_what_parameters_tell_in_two_operations_is_not_kept():
+    """A quotient is, because it would be computed again for every use."""
+    results = ca.vertcat(P[0] * X[0] + (P[1] - 1) / 2 * X[1], X[2] / P[0], P[0] * (P[1] - 1) / 2 * X[0])
+    parts = chain_rule(results, X, P, P)
+    assert [ca.is_equal(one, 1 / P[0], 2) for one in ca.vertsplit(parts.partials)] == [True, False]
+    assert chain_rule(results, X, P).partials.numel() == 4
 
 
 def test_linear_results_have_no_partial_derivatives_to_compute():
@@ -89,9 +98,9 @@ def test_a_stage_in_parts_is_the_linear_stage(ocp):
         split_next, split_cost, m = parts["evaluate"](s, u, data[:, 0])
         assert (split_next.full() == next_state).all()
         assert float(split_cost) == cost
-        for mine, theirs in zip(parts["linearise"](m), (a, b, by_state, by_input), strict=True):
+        for mine, theirs in zip(parts["linearise"](m, data[:, 0]), (a, b, by_state, by_input), strict=True):
             np.testing.assert_allclose(mine.full(), theirs, rtol=1e-12, atol=1e-13)
-        before, slope = parts["pull"](m, after)
+        before, slope = parts["pull"](m, after, data[:, 0])
         np.testing.assert_allclose(before.full(), by_state + a.T @ after[:, None], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(slope.full(), by_input + b.T @ after[:, None], rtol=1e-12, atol=1e-12)
 

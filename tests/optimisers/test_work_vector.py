@@ -33,7 +33,7 @@ def stepping(name, states):
     return problem, stepper, texts, size
 
 
-CASES = [("two_mass", {}, 2150), ("two_mass", {"q1": (1.85, 2.35)}, 5300), ("cart_pole", {}, 2000)]
+CASES = [("two_mass", {}, 1900), ("two_mass", {"q1": (1.85, 2.35)}, 5300), ("cart_pole", {}, 2000)]
 
 
 @pytest.mark.parametrize(("name", "states", "most"), CASES, ids=["two_mass", "state limits", "cart_pole"])
