@@ -34,7 +34,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.probing.identification import Estimates
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing, Sensor
-from fpirhc.simulation.linearise.asked_loop import AskedLoop
+from fpirhc.simulation.linearise.asked_loop import AskedLoop, linear
 from fpirhc.simulation.model_as_plant import behind_actuators
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
@@ -538,43 +538,51 @@ class Margins:
 
     def _stable(self, deformation: Deformation | None, case: Case) -> bool:
         corner, factor, draw = case
-        return self._loop(corner, deformation).radius(factor, draw) < _STABLE
+        gain = None if deformation is None else deformation.effective_gain()
+        return self._loop(corner, deformation).radius(gain, factor, draw) < _STABLE
 
     def _loop(self, corner: Corner, deformation: Deformation | None) -> _Loop:
-        """The loop at a corner; None: of the controller alone."""
+        """The loop at a corner, which deformations share that differ in their gain alone; None: of the controller alone."""
         if corner not in self._problems:
             gains = self._estimates.gains
             self._problems[corner] = estimated_problem(self._problem, gains, corner.cycles, corner.lags)
-        if (corner, deformation) not in self._loops:
-            controller = self._bare if deformation is None else self._bare.with_deformation(deformation)
-            self._loops[corner, deformation] = _Loop(self._problems[corner], controller, self._estimates)
-        return self._loops[corner, deformation]
+        form = None if deformation is None else linear(deformation.with_effective_gain(1.0))
+        if (corner, form) not in self._loops:
+            controller = self._bare if form is None else self._bare.with_deformation(form)
+            self._loops[corner, form] = _Loop(self._problems[corner], controller, self._estimates)
+        return self._loops[corner, form]
 
 
 class _Loop:
-    """A loop on the estimated plant, linearised for any gains."""
+    """A loop on the estimated plant, linearised for any gains of plant and map."""
 
     def __init__(self, problem: Problem, controller: Controller, estimates: Estimates) -> None:
         self._matrices = (estimates.gains, *estimates.draws)
-        self._radii: dict[tuple[float, int], float] = {}
-        self._memory: np.ndarray | None = None
+        self._radii: dict[tuple[float | None, float, int], float] = {}
+        self._quiet: dict[float | None, np.ndarray] = {}
+        self._loop: AskedLoop | None = None
         try:
             self._loop = AskedLoop(problem, controller)
-            self._memory = self._loop.quietest(self._loop.run(self._loop.start(), 4 * self._loop.warm + _FEW))
-        except FpirhcError:  # it does not run
+        except FpirhcError:  # it cannot be composed
             return
         first, names = self._loop.loop.memory.slice("_exact").start, list(problem.real_plant.parameters)
         self._places = [first + names.index(gain_name(i, j)) for i, j in np.ndindex(estimates.gains.shape)]
 
-    def radius(self, factor: float, draw: int) -> float:
-        """Return the radius for a factor of the gains; infinite where the loop does not run."""
-        if self._memory is None:
+    def radius(self, gain: float | None, factor: float, draw: int) -> float:
+        """Return the radius for a gain of the map and a factor of those of the plant; infinite where the loop does not run."""
+        if self._loop is None:
             return math.inf
-        if (factor, draw) not in self._radii:
-            changed = self._memory.copy()
-            changed[self._places] = factor * self._matrices[draw].ravel()
+        if (gain, factor, draw) not in self._radii:
             try:
-                self._radii[factor, draw] = self._loop.at(changed).radius
+                changed = self._memory(self._loop, gain).copy()
+                changed[self._places] = factor * self._matrices[draw].ravel()
+                self._radii[gain, factor, draw] = self._loop.at(changed).radius
             except FpirhcError:
-                self._radii[factor, draw] = math.inf
-        return self._radii[factor, draw]
+                self._radii[gain, factor, draw] = math.inf
+        return self._radii[gain, factor, draw]
+
+    def _memory(self, loop: AskedLoop, gain: float | None) -> np.ndarray:
+        """The quietest memory of a run with a gain."""
+        if gain not in self._quiet:
+            self._quiet[gain] = loop.quietest(loop.run(loop.start(gain=gain), 4 * loop.warm + _FEW))
+        return self._quiet[gain]

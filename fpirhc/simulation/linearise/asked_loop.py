@@ -92,20 +92,21 @@ def near_fixed_point(controller: Controller) -> Controller:
     if not deformation.adapts or not deformation.iteration.constant:
         return controller
     try:
-        return controller.with_deformation(_linear(deformation))
+        return controller.with_deformation(linear(deformation))
     except FpirhcError:  # a controller whose map cannot be replaced
         return controller
 
 
 def behind_noise(controller: Controller) -> Controller:
     """Return the controller with its map as it is near the fixed point, behind noise of the response and a filter of the error."""
-    return controller.with_deformation(_linear(controller.deformation, noisy=True))
+    return controller.with_deformation(linear(controller.deformation, noisy=True))
 
 
-def _linear(deformation: Deformation, *, noisy: bool = False) -> Deformation:
+def linear(deformation: Deformation, *, noisy: bool = False) -> Deformation:
+    """Return the deformation with its map as a `LinearMap`."""
     if deformation.inner is None:
         return LinearMap(deformation.effective_gain(), deformation.iteration.weights, noisy)
-    return with_inner(deformation, _linear(deformation.inner, noisy=noisy))
+    return with_inner(deformation, linear(deformation.inner, noisy=noisy))
 
 
 _SHARE = 0.01  # of their sizes, by which states and inputs are moved to find the scales of all else
