@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -54,10 +54,15 @@ class Channel:
     drift: np.ndarray = field(repr=False)  # what is, and the model does not have: w by cycle
     drifting: float = 0.0  # rms change of w per square root of the unit of time
     edge: str = ""  # what the record is too short to bound: "dead time", "lag", or nothing
+    ends: tuple[Fit, ...] = field(
+        default=(), repr=False
+    )  # the best, and the likeliest at the ends of dead time and lag
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class Fit:
+    """The likeliest gains with one dead time, lag, and share of the drift."""
+
     likelihood: float
     dead: int
     lag: float
@@ -112,7 +117,7 @@ def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> C
     return _answer(f, m, period, fits, (most, float(lags[-1])))
 
 
-def _answer(f: np.ndarray, m: np.ndarray, period: float, fits: list[_Fit], searched: tuple[int, float]) -> Channel:
+def _answer(f: np.ndarray, m: np.ndarray, period: float, fits: list[Fit], searched: tuple[int, float]) -> Channel:
     best, near = max(fits, key=lambda one: one.likelihood), _near(fits, _ENOUGH * _WIDER**2)
     nearest = _near(fits, _ENOUGH)
     beside = [
@@ -129,8 +134,12 @@ def _answer(f: np.ndarray, m: np.ndarray, period: float, fits: list[_Fit], searc
     rest = f - delayed(m, best.dead, best.lag, period) @ best.gains
     drift = _smoothed(rest, *best.noise, 10.0**best.ratio)
     moved = float(np.sqrt(np.mean(np.diff(drift[_SETTLED:]) ** 2) / period))
+    ends = [best]
+    for fixed, interval in (("dead", dead), ("lag", lag)):
+        for end in (interval.low, interval.high):
+            ends.append(max((one for one in fits if getattr(one, fixed) == end), key=lambda one: one.likelihood))
     edge = "dead time" if dead.high >= searched[0] else "lag" if lag.high >= searched[1] else ""
-    return Channel(gains, dead, lag, noise, drift, moved, edge)
+    return Channel(gains, dead, lag, noise, drift, moved, edge, tuple(ends))
 
 
 def delayed(m: np.ndarray, dead: int, lag: float, period: float) -> np.ndarray:
@@ -150,7 +159,7 @@ def _profile(
     deads: Sequence[int],
     lags: np.ndarray,
     ratios: np.ndarray,
-) -> list[_Fit]:
+) -> list[Fit]:
     """The best gains at every point of a grid; all points of one noise are whitened together."""
     points = [(d, float(tau)) for d in deads for tau in lags]
     rows = np.array([delayed(m, d, tau, period).T for d, tau in points])  # (points, n, cycles)
@@ -172,19 +181,19 @@ def _profile(
             spread = np.sqrt(rest[:, None] * np.diagonal(inverse, axis1=1, axis2=2))
             likelihood = -0.5 * total * np.log(rest)
             channels += [
-                _Fit(float(value), d, tau, (p, c), float(ratio), gain, std, float(s))
+                Fit(float(value), d, tau, (p, c), float(ratio), gain, std, float(s))
                 for (d, tau), value, gain, std, s in zip(points, likelihood, gains, spread, rest, strict=True)
             ]
     return channels
 
 
-def _near(fits: Sequence[_Fit], distance: float) -> list[_Fit]:
+def _near(fits: Sequence[Fit], distance: float) -> list[Fit]:
     """The points whose 2 log L is that near to the best."""
     best = max(one.likelihood for one in fits)
     return [one for one in fits if 2 * (best - one.likelihood) < distance]
 
 
-def _around(fits: Sequence[_Fit], near: Sequence[_Fit]) -> tuple[float, float]:
+def _around(fits: Sequence[Fit], near: Sequence[Fit]) -> tuple[float, float]:
     """The searched lags just outside those that are near: the ends of an interval are before these."""
     low, high = min(one.lag for one in near), max(one.lag for one in near)
     below, above = (one.lag for one in fits if one.lag < low), (one.lag for one in fits if one.lag > high)
@@ -222,12 +231,22 @@ _DRAWS, _QUANTILE = 400, 0.025
 _COUPLED = 1.2  # ratio of the eigenvalues' sizes from which one gain for all directions wastes some
 
 
+@dataclass(frozen=True, eq=False)
+class End:
+    """A plant that the likelihood allows: the gains that go with its dead times and lags, and a draw about them."""
+
+    cycles: tuple[float, ...]
+    lags: tuple[float, ...]
+    gains: np.ndarray
+    drawn: np.ndarray
+
+
 class Estimates:
     """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them."""
 
     def __init__(self, channels: Sequence[Channel], seed: int) -> None:
         """Take the channels and the seed of the draws."""
-        self.channels = tuple(channels)
+        self.channels, self._seed = tuple(channels), seed
         self.gains = np.array([[g.value for g in one.gains] for one in channels])
         self._deviations = np.array([[(g.high - g.low) / 4 for g in one.gains] for one in channels])
         random = np.random.default_rng(seed)
@@ -237,6 +256,21 @@ class Estimates:
         self.smallest = float(np.quantile(real, _QUANTILE))
         self.largest_real = float(np.quantile(values.real.max(axis=1), 1 - _QUANTILE))
         self.largest = float(np.quantile(size.max(axis=1), 1 - _QUANTILE))
+
+    @cached_property
+    def ends(self) -> tuple[End, ...]:
+        """The best estimate, then the likeliest plants at both ends of the dead times, and of the lags, of all inputs."""
+        random, found = np.random.default_rng(self._seed), []
+        for fits in zip(*(one.ends for one in self.channels), strict=True):
+            gains, deviations = (np.array([getattr(one, what) for one in fits]) for what in ("gains", "deviation"))
+            drawn = gains + _WIDER * deviations * random.standard_normal(gains.shape)
+            found.append(End(tuple(float(f.dead) for f in fits), tuple(f.lag for f in fits), gains, drawn))
+        return tuple(found)
+
+    @cached_property
+    def wide(self) -> End:
+        """The best estimate, with a draw from the intervals of the gains, whatever the lag is."""
+        return replace(self.ends[0], drawn=self.draws[0])
 
     @cached_property
     def weights(self) -> tuple[tuple[float, ...], ...] | None:

@@ -118,7 +118,7 @@ def probe(
         f_i = sum_j lambda_ij (f^_j, late by d cycles and a lag) + drift + noise,      f^: the model's response to the same commands
 
     The controller keeps the plant safe, without its deformation, while a small random binary sequence adds to its desired response.
-    Candidates are chosen on the plant as estimated and keep their margins at every corner of the intervals, two of them at the
+    Candidates are chosen on the plant as estimated and keep their margins at the ends of what the record allows, two of them at the
     estimate alone. They are then run on the plant itself, beside the controller alone: the best one is kept, or none.
 
     Args:

@@ -1,4 +1,4 @@
-"""Which adaptation suits a plant as estimated: candidates are run on it, and keep their margins at the corners of all intervals.
+"""Which adaptation suits a plant as estimated: candidates are run on it, and keep their margins at the ends of what the record allows.
 
 Gains are shares g of the deadbeat gain: 1 / the largest eigenvalue of Lambda, or the inverse of Lambda where responses are coupled.
 A mirror that is right takes lateness for right and leaves it, so mirrors without dead time and lag are candidates too, and one with
@@ -31,7 +31,7 @@ from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.plant.chain import require_rates
 from fpirhc.plant.parameter import Parameter, outside
 from fpirhc.plant.plant import Plant
-from fpirhc.probing.identification import Estimates
+from fpirhc.probing.identification import End, Estimates
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing, Sensor
 from fpirhc.simulation.linearise.asked_loop import AskedLoop, linear
@@ -155,7 +155,7 @@ _FORMS = 2  # model-referenced ones that are searched in full, beside the plain 
 _LARGEST_PRODUCT = 1.99
 _STEPS, _OF_RANGE = 1.5, 0.02  # largest step of a command: times that of the controller alone, or of the input's range
 _NEAR, _WORTH = 1.1, 0.95  # errors that count as equal, and one that is worth an adaptation
-_FINE = 1.1  # ratio of two shares, between which no other is tried
+_FINE = 1.05  # ratio of two shares, between which no other is tried
 
 
 @dataclass(frozen=True)
@@ -323,7 +323,7 @@ class Rule:
     def beside(self, one: Predicted, tried: Iterable[Predicted]) -> dict[float, Predicted]:
         """Return by share the next smaller and the next larger share of the same form, safe and calm where this one is safe.
 
-        They are those of the list. Where the next larger one is tried already, it is their geometric mean, down to a ratio of 1.1:
+        They are those of the list. Where the next larger one is tried already, it is their geometric mean, down to a ratio of 1.05:
         an error falls with the share until the loop is lost, so the best one is near that limit.
         """
         known = {other.setting.share for other in tried if other.setting.form == one.setting.form}
@@ -382,7 +382,7 @@ class Rule:
             return None
         cycles = tuple(map(float, np.ceil(self.estimates.dead[[0, 2]].mean(axis=0))))
         one = self._predicted(Setting(True, _LONG, 0.0, cycles, lag, 1.0))
-        return one if self._safe(one) else None
+        return one if one.error < 1 and self._safe(one) else None
 
     def _predicted(self, setting: Setting) -> Predicted:
         if setting not in self._predictions:
@@ -485,8 +485,21 @@ class Corner:
     lags: tuple[float, ...]
 
 
-# a corner, a factor of the gains, and the number of a draw; 0: the estimate
-Case: TypeAlias = tuple[Corner, float, int]
+@dataclass(frozen=True)
+class Case:
+    """A corner, and the gains of the plant there: those of an end of the likelihood, or the draw about them, times a factor."""
+
+    corner: Corner
+    end: End
+    factor: float = 1.0
+    drawn: bool = False
+
+    @property
+    def gains(self) -> np.ndarray:
+        """Lambda."""
+        return self.factor * (self.end.drawn if self.drawn else self.end.gains)
+
+
 Cases: TypeAlias = tuple[Case, ...]
 
 
@@ -517,29 +530,36 @@ class Margins:
     @cached_property
     def middle(self) -> Cases:
         """A gain margin of 1.4 to both sides of the estimate alone, and a command that is a cycle later."""
-        dead, lag = self._estimates.dead[1], self._estimates.lag[1]
-        there = Corner(tuple(dead), tuple(lag))
-        return (there, 1.4, 0), (there, 0.6, 0), (Corner(tuple(dead + 1), tuple(lag)), 1.0, 0)
+        best, (there, later) = self._estimates.ends[0], self._estimated()
+        return Case(there, best, 1.4), Case(there, best, 0.6), Case(later, best)
 
     @cached_property
     def near(self) -> Cases:
-        """A gain margin of 1.4 to both sides of the estimate and of a draw, and a command that is a cycle later."""
-        dead, lag = self._estimates.dead, self._estimates.lag
-        corners = dict.fromkeys(Corner(tuple(dead[i]), tuple(lag[j])) for i in (2, 0) for j in (0, 2))
-        late = (Corner(tuple(dead[2] + 1), tuple(lag[1])), 1.0, 0)
-        return late, *((corner, *case) for case in ((1.4, 0), (0.6, 0), (1.4, 1)) for corner in corners)
+        """A gain margin of 1.4 to both sides at every end of the likelihood, and for a draw there; and a command a cycle later.
+
+        An end has its own gains: a longer lag with a larger gain says much the same of a record as a shorter one with a smaller.
+        """
+        ends = {Corner(one.cycles, one.lags): one for one in reversed(self._estimates.ends)}
+        late = Corner(tuple(self._estimates.dead[2] + 1), tuple(self._estimates.lag[1]))
+        cases = ((1.4, False), (0.6, False), (1.4, True))
+        return Case(late, self._estimates.ends[0]), *(Case(c, one, *case) for case in cases for c, one in ends.items())
 
     @cached_property
     def far(self) -> Cases:
         """Twice the gain, and a plant slower by half, because a lag is only a picture of what is slow; a command a cycle later."""
         dead, slow = self._estimates.dead[2], 1.5 * np.maximum(self._estimates.lag[2], 0.25 * self._problem.period)
-        later = Corner(tuple(dead + 1), tuple(slow))
-        return (later, 1.4, 0), (later, 1.4, 1), *((Corner(tuple(dead), tuple(slow)), 2.0, k) for k in (0, 1))
+        there, later = (Corner(tuple(dead + more), tuple(slow)) for more in (0, 1))
+        cases = ((later, 1.4), (there, 2.0))
+        return tuple(Case(c, self._estimates.wide, factor, drawn) for c, factor in cases for drawn in (False, True))
+
+    def _estimated(self) -> tuple[Corner, Corner]:
+        """The estimate, and the same a cycle later."""
+        dead, lag = self._estimates.dead[1], tuple(self._estimates.lag[1])
+        return Corner(tuple(dead), lag), Corner(tuple(dead + 1), lag)
 
     def _stable(self, deformation: Deformation | None, case: Case) -> bool:
-        corner, factor, draw = case
         gain = None if deformation is None else deformation.effective_gain()
-        return self._loop(corner, deformation).radius(gain, factor, draw) < _STABLE
+        return self._loop(case.corner, deformation).radius(gain, case.gains) < _STABLE
 
     def _loop(self, corner: Corner, deformation: Deformation | None) -> _Loop:
         """The loop at a corner, which deformations share that differ in their gain alone; None: of the controller alone."""
@@ -549,16 +569,15 @@ class Margins:
         form = None if deformation is None else linear(deformation.with_effective_gain(1.0))
         if (corner, form) not in self._loops:
             controller = self._bare if form is None else self._bare.with_deformation(form)
-            self._loops[corner, form] = _Loop(self._problems[corner], controller, self._estimates)
+            self._loops[corner, form] = _Loop(self._problems[corner], controller, self._estimates.gains.shape)
         return self._loops[corner, form]
 
 
 class _Loop:
     """A loop on the estimated plant, linearised for any gains of plant and map."""
 
-    def __init__(self, problem: Problem, controller: Controller, estimates: Estimates) -> None:
-        self._matrices = (estimates.gains, *estimates.draws)
-        self._radii: dict[tuple[float | None, float, int], float] = {}
+    def __init__(self, problem: Problem, controller: Controller, shape: tuple[int, ...]) -> None:
+        self._radii: dict[tuple[float | None, bytes], float] = {}
         self._quiet: dict[float | None, np.ndarray] = {}
         self._loop: AskedLoop | None = None
         try:
@@ -566,20 +585,21 @@ class _Loop:
         except FpirhcError:  # it cannot be composed
             return
         first, names = self._loop.loop.memory.slice("_exact").start, list(problem.real_plant.parameters)
-        self._places = [first + names.index(gain_name(i, j)) for i, j in np.ndindex(estimates.gains.shape)]
+        self._places = [first + names.index(gain_name(i, j)) for i, j in np.ndindex(shape)]
 
-    def radius(self, gain: float | None, factor: float, draw: int) -> float:
-        """Return the radius for a gain of the map and a factor of those of the plant; infinite where the loop does not run."""
+    def radius(self, gain: float | None, gains: np.ndarray) -> float:
+        """Return the radius for a gain of the map and the gains of the plant; infinite where the loop does not run."""
         if self._loop is None:
             return math.inf
-        if (gain, factor, draw) not in self._radii:
+        key = gain, gains.tobytes()
+        if key not in self._radii:
             try:
                 changed = self._memory(self._loop, gain).copy()
-                changed[self._places] = factor * self._matrices[draw].ravel()
-                self._radii[gain, factor, draw] = self._loop.at(changed).radius
+                changed[self._places] = gains.ravel()
+                self._radii[key] = self._loop.at(changed).radius
             except FpirhcError:
-                self._radii[gain, factor, draw] = math.inf
-        return self._radii[gain, factor, draw]
+                self._radii[key] = math.inf
+        return self._radii[key]
 
     def _memory(self, loop: AskedLoop, gain: float | None) -> np.ndarray:
         """The quietest memory of a run with a gain."""

@@ -105,6 +105,8 @@ class OnPlant:
             beside = rule.beside(chosen, shortlist.values())
             titled = {f"{name.partition(',')[0]}{_SHARE}{share:g}": one for share, one in beside.items()}
             new = {title: one for title, one in titled.items() if one.deformation not in known}
+            # An error falls with the share until the loop is lost, so a smaller one is tried where no larger one is better.
+            new = {title: one for title, one in new.items() if one.setting.is_larger(chosen.setting)} or new
             shortlist |= new
             if not new and name in again:
                 return results

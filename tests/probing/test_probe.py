@@ -14,7 +14,7 @@ from bodies import PERIOD, RHC, body_problem
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
-from fpirhc.probing.identification import Channel, delayed, identify
+from fpirhc.probing.identification import Channel, Estimates, delayed, identify
 from fpirhc.probing.recording import excited, sequence
 from fpirhc.probing.rule import Predicted, Rule, _between
 from fpirhc.probing.trials import OnPlant, Trial, best
@@ -78,6 +78,14 @@ def test_an_interval_of_lags_ends_between_searched_ones():
     )
     assert one.lag.low < 0.0437 < one.lag.high < 1.2 * one.lag.low
     assert one.gains[0].low < 1.3 < one.gains[0].high
+
+
+def test_an_end_of_the_lag_has_the_gains_that_go_with_it():
+    """A record says the same of a longer lag with a larger gain: a margin is asked of both together."""
+    estimates = Estimates(identified(body_problem(0.6, 0, 0.05, 0.05)), 0)
+    (best, *_, short, long), (one,) = estimates.ends, estimates.channels
+    assert (short.lags[0], best.lags[0], long.lags[0]) == (one.lag.low, one.lag.value, one.lag.high)
+    assert short.gains[0, 0] < 0.95 * best.gains[0, 0] < 0.95 * 0.95 * long.gains[0, 0]
 
 
 def test_a_dead_time_beyond_the_first_search_is_found():
@@ -200,11 +208,11 @@ def test_a_daring_candidate_that_bears_no_more_gain_is_told_as_such(monkeypatch)
 
 
 def test_shares_between_two_that_are_tried_are_finer_towards_the_larger_one():
-    """The next ones of the list first; then the geometric mean upwards, until two are a tenth apart."""
+    """The next ones of the list first; then the geometric mean upwards, until two are a twentieth apart."""
     assert set(_between(0.25, {0.25})) == {0.16, 0.4}
     assert set(_between(0.25, {0.16, 0.25, 0.4})) == {0.32}
     assert set(_between(0.25, {0.16, 0.25, 0.32, 0.4})) == {0.28}
-    assert set(_between(0.25, {0.16, 0.25, 0.27})) == set()
+    assert set(_between(0.25, {0.16, 0.25, 0.262})) == set()
     assert set(_between(1.0, {0.65, 1.0})) == set()
 
 
