@@ -7,7 +7,8 @@ so that a user sees them together.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any
 
@@ -209,6 +210,18 @@ class Mistakes:
     def add(self, mistake: str) -> None:
         """Add one mistake."""
         self._mistakes.append(mistake)
+
+    def join(self, others: Mistakes) -> None:
+        """Add all mistakes that were found elsewhere."""
+        self._mistakes += others._mistakes
+
+    @contextmanager
+    def caught(self, where: str = "") -> Iterator[None]:
+        """Add the error with which the body ends, if it does, behind the words `where`."""
+        try:
+            yield
+        except FpirhcError as error:
+            self.add(f"{where}{error}")
 
     @property
     def none(self) -> bool:

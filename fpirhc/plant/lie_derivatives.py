@@ -11,7 +11,7 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, Mistakes
+from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import described, takes
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.maps import shifted
@@ -90,10 +90,8 @@ def check_outputs(plant: Motion, mistakes: Mistakes) -> None:
                 f"command moves it at once; got {described(one.expression)}; write lambda {names}, p: ..."
             )
             continue
-        try:
+        with mistakes.caught():
             _check_one(plant, name, mistakes)
-        except FpirhcError as error:
-            mistakes.add(str(error))
 
 
 def _check_one(plant: Motion, name: str, mistakes: Mistakes) -> None:

@@ -90,10 +90,8 @@ def check_response(plant: Motion, mistakes: Mistakes) -> None:
         if c not in response:
             mistakes.add(f"{function} does not give the derivative {c}{chr(39) * r} of {quantity} '{c}'; return it too")
             continue
-        try:
+        with mistakes.caught():
             scalar_expression(f"{function} of '{c}'", response[c], of=plant.response, symbols=symbols)
-        except FpirhcError as error:
-            mistakes.add(str(error))
     if mistakes.none:
         _check_orders(plant, mistakes)
     if mistakes.none and plant.inverse is not None:
@@ -143,10 +141,8 @@ def _check_inverse(plant: Motion, inverse: Callable[..., Mapping[str, Expression
             f"inverse is called with {arguments} arguments: the derivatives below the order, responses, parameters"
         )
         return
-    try:
+    with mistakes.caught():
         inverse_by_user(plant, inverse)
-    except FpirhcError as error:
-        mistakes.add(str(error))
 
 
 def _check_orders(plant: Motion, mistakes: Mistakes) -> None:
@@ -193,21 +189,16 @@ def check_algebraic(plant: Motion, algebraic: Algebraic, views: tuple[Named, ...
         ),
     }
     for what, part in parts.items():
-        try:
+        with mistakes.caught():
             values = named_results(f"algebraic: {what}", part())
-        except FpirhcError as error:
-            mistakes.add(str(error))
-            continue
-        mistakes.unknown(f"algebraic: {what}: algebraic state", values, algebraic.names)
-        for name in algebraic.names:
-            if name not in values:
-                mistakes.add(f"algebraic: {what} have nothing for '{name}'; add it")
+            mistakes.unknown(f"algebraic: {what}: algebraic state", values, algebraic.names)
+            for name in algebraic.names:
+                if name not in values:
+                    mistakes.add(f"algebraic: {what} have nothing for '{name}'; add it")
     if mistakes.none:
-        try:
+        with mistakes.caught():
             algebraic.residual(views, z)
             algebraic.first(views)
-        except FpirhcError as error:
-            mistakes.add(str(error))
 
 
 def unsolved(plant: Motion, state: np.ndarray, command: np.ndarray, parameters: np.ndarray) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar, TypeVar
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
@@ -173,10 +173,8 @@ def check_tuning(tuning: Any, controllers: Mapping[str, Controller]) -> None:
                 mistakes.add(
                     f"controller '{name}', '{path}': expected Span(low, high) or LogSpan(low, high), got {span!r}"
                 )
-            try:
+            with mistakes.caught(f"controller '{name}': "):
                 current_setting(controllers[name], str(path))
-            except FpirhcError as error:
-                mistakes.add(f"controller '{name}': {error}")
     mistakes.raise_if_any()
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, Mistakes
+from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import BelowOne, Positive
 from fpirhc.plant.chain import response_units
@@ -164,12 +164,11 @@ class Sensing(Checked):
         mistakes.unknown("measured: quantity", self.measured or (), every)
         for mistake in uncovered(plant, self.estimator, self.measured, measures, self.observer):
             mistakes.add(mistake)
-        parts = (lambda: self.estimator.check(plant), lambda: self.observer and self.observer.check(plant, measures))
-        for part in parts:
-            try:
-                part()
-            except FpirhcError as error:
-                mistakes.add(str(error))
+        with mistakes.caught():
+            self.estimator.check(plant)
+        if self.observer is not None:
+            with mistakes.caught():
+                self.observer.check(plant, measures)
         mistakes.raise_if_any()
 
     def delay(self, plant: Plant, period: float) -> float:

@@ -267,14 +267,12 @@ def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
     of_cases = frozenset(axis.path for axis in axes if of_problem(task.problem, axis.path))
     mistakes = Mistakes("sweep")
     for axis in axes:
-        try:
+        with mistakes.caught():
             if axis.path in of_cases:
                 ends = (axis.values[0], axis.values[-1])
                 Cases({f"{axis.path} = {number(v)}": {axis.path: v} for v in ends}).check(task.problem)
             else:
                 _check_controllers(task, axis, words)
-        except FpirhcError as error:
-            mistakes.add(str(error))
     mistakes.raise_if_any()
     return of_cases
 

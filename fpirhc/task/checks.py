@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import casadi as ca
 
-from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.user_code import named_results, scalar_expression
 from fpirhc.horizon.cost import Cost, View
 from fpirhc.horizon.horizon import Horizon
@@ -43,12 +43,11 @@ def settled_maps(
 ) -> dict[str, object]:
     """Return the fields of a problem that follow from its maps, by name, and add to `mistakes` what does not fit their steps."""
     settled: dict[str, object] = {}
-    try:
+    with mistakes.caught():
         settled["plant"] = over(plant, period)
         if reality is not None:
             settled["reality"] = reality.over(period)
-    except InvalidValue as error:
-        mistakes.add(str(error))
+    if not mistakes.none:
         return {}
     if plant.step is not None:
         settled["integrator"] = _steps("integrator", integrator, mistakes)
@@ -120,30 +119,25 @@ def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -
 
 def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
     """Add every mistake in the cost's names and weights, and in the user's functions of a stage; problems share what they share."""
-    for mistake in _STAGES.of((plant, cost, limits), (), lambda: _of_stage(plant, nominal(cost), nominal(limits))):
-        mistakes.add(mistake)
+    mistakes.join(_STAGES.of((plant, cost, limits), (), lambda: _of_stage(plant, nominal(cost), nominal(limits))))
 
 
-_STAGES: Latest[list[str]] = Latest(8)
+_STAGES: Latest[Mistakes] = Latest(8)
 
 
-def _of_stage(plant: Plant, cost: Cost | None, limits: Limits) -> list[str]:
-    mistakes = list[str]()
+def _of_stage(plant: Plant, cost: Cost | None, limits: Limits) -> Mistakes:
+    mistakes = Mistakes("stage")
     view = _view_of_symbols(plant)
     parts = (view.state, view.output, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
     symbols = (*(part.vector for part in parts), view.time)
     if cost is not None:
-        try:
+        with mistakes.caught():
             cost.check(plant)
             for name, term in named_results("cost", cost.stage(view)).items():
                 scalar_expression(f"cost: term '{name}'", term, symbols=symbols, finite=False)
-        except FpirhcError as error:
-            mistakes.append(str(error))
     for name, path in limits.paths.items():
-        try:
+        with mistakes.caught():
             path.named_value(name, view, symbols)
-        except FpirhcError as error:
-            mistakes.append(str(error))
     return mistakes
 
 

@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidShape, InvalidValue, Mistakes
+from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import outside_names
@@ -186,13 +186,10 @@ def _check_course(what: str, course: Course, times: np.ndarray, mistakes: Mistak
             f"{what} are stated from {first:g} to {last:g}, the run is from {times[0]:g} to {times[-1]:g}; add samples"
         )
         return
-    try:
+    with mistakes.caught(f"{what}: "):
         values = np.asarray(_course_function([course]).map(times.size)(times[None, :]).full()).ravel()
-    except FpirhcError as error:
-        mistakes.add(f"{what}: {error}")
-        return
-    if not np.isfinite(values).all():
-        mistakes.add(f"{what} are not finite at t = {times[int(np.argmin(np.isfinite(values)))]:g}")
+        if not np.isfinite(values).all():
+            mistakes.add(f"{what} are not finite at t = {times[int(np.argmin(np.isfinite(values)))]:g}")
 
 
 def _filled(plant: Plant, courses: Mapping[str, Course]) -> ca.Function | None:

@@ -12,7 +12,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration, Finite
 from fpirhc.horizon.cost import Cost
@@ -134,10 +134,8 @@ class Problem(Checked):
             lambda: self.reality.check(plant, *self._needed) if self.reality else None,
         )
         for check in checks:
-            try:
+            with mistakes.caught():
                 check()
-            except FpirhcError as error:
-                mistakes.add(str(error))
         mistakes.raise_if_any()
         check_maps(plant, self.reality, self.sensing, mistakes)
         mistakes.raise_if_any()
@@ -395,10 +393,8 @@ def _check_times(problem: Problem, mistakes: Mistakes) -> None:
     if not 0 <= problem.measure_from < problem.duration:
         mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
     if problem.horizon is not None:
-        try:
+        with mistakes.caught():
             cycles_per_plan(problem.horizon, problem.period, unit)
-        except InvalidValue as error:
-            mistakes.add(str(error))
 
 
 def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:

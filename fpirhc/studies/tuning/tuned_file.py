@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from fpirhc.errors import InvalidName, InvalidValue, Mistakes, ProblemFileError
+from fpirhc.errors import Mistakes, ProblemFileError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values, with_settings
 from fpirhc.studies.comparison.comparison import Comparison
@@ -65,10 +65,8 @@ def with_tuned(task: Task, tuned: Mapping[str, Values]) -> Task:
     changed = dict(task.controllers)
     for name, values in tuned.items():
         if name in changed:
-            try:
+            with mistakes.caught(f"controller '{name}': "):
                 changed[name] = with_settings(changed[name], values)
-            except (InvalidName, InvalidValue) as error:
-                mistakes.add(f"controller '{name}': {error}")
     mistakes.raise_if_any()
     return replace(task, controllers=changed)
 
