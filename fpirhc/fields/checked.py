@@ -289,7 +289,10 @@ def _made_of(expected: Expected, value: object, contract: type | None) -> str:
         return ""
     if inspect.isroutine(value) and signature_of(value) == "()":
         return "call it and give its result"
-    return _part_that_fits(expected, value) or _member(contract)
+    members = [text for one in expected.contracts() if (text := _member(one))]
+    return _part_that_fits(expected, value) or " or ".join(
+        [*members[:1], *(m.removeprefix("write ") for m in members[1:])]
+    )
 
 
 def _mended_text(expected: Expected, text: str, contract: type | None) -> str:

@@ -196,6 +196,11 @@ class Expected(ABC):
         """Return the class whose values are expected, for a hint at the members of a family; None where there is none."""
         return None
 
+    def contracts(self) -> tuple[type, ...]:
+        """Return all such classes."""
+        one = self.contract()
+        return () if one is None else (one,)
+
     def completed(self, part: object) -> str:
         """Return how a value that is only a part of what is expected is written; empty where it is none."""
         del part
@@ -374,8 +379,10 @@ class Choice(Expected):
         yield from accepting.parts(value)
 
     def contract(self) -> type | None:
-        named = (option.contract() for option in self.options if option.contract() not in _WORDS)
-        return next((one for one in named if one is not None), None)
+        return next(iter(self.contracts()), None)
+
+    def contracts(self) -> tuple[type, ...]:
+        return tuple(one for option in self.options for one in option.contracts() if one not in _WORDS)
 
     def completed(self, part: object) -> str:
         return next((text for option in self.options if (text := option.completed(part))), "")

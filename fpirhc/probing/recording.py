@@ -203,9 +203,16 @@ def check_times(columns: Mapping[str, np.ndarray], problem: Problem, mistakes: M
     if "time" not in columns:
         lacking(columns, ["time"], mistakes)
         return
-    steps = np.diff(columns["time"])
-    if not len(steps) or not np.all(np.abs(steps - problem.period) <= _EVEN * problem.period):
-        mistakes.add(f"its times are not {problem.period:g} {problem.time_unit} apart, the period of the problem")
+    times, period, unit = columns["time"], problem.period, problem.time_unit
+    if len(times) < 2:
+        mistakes.add("it has fewer than two rows of numbers below the line of names")
+        return
+    uneven = ~(np.abs(np.diff(times) - period) <= _EVEN * period)
+    if uneven.any():
+        k = int(np.argmax(uneven))
+        mistakes.add(
+            f"its times are not {period:g} {unit} apart, the period of the problem: {times[k]:g} is followed by {times[k + 1]:g}"
+        )
 
 
 def columns_of(path: Path) -> dict[str, np.ndarray]:
@@ -219,7 +226,9 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
     except (ValueError, csv.Error) as error:
         raise InvalidValue(f"recording {path}: cannot be read as a CSV file with a line of names ({error})") from None
     if not numbered:
-        raise InvalidValue(f"recording {path}: is empty; expected a line of names, such as time, and rows of numbers")
+        raise InvalidValue(
+            f"recording {path.name}: it is empty; expected a line of names, such as time, and rows of numbers"
+        )
     (_, head), *rows = numbered
     values = []
     for number, row in rows:

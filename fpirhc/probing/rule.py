@@ -1,4 +1,4 @@
-"""Which adaptation suits a plant as estimated: candidates are run on it, and keep their margins at the ends of what the record allows.
+"""Which adaptation suits a plant as estimated: candidates run on it, and keep margins at the ends of what the record allows.
 
 Gains are shares g of the deadbeat gain: 1 / the largest eigenvalue of Lambda, or the inverse of Lambda where responses are coupled.
 A mirror that is right takes lateness for right and leaves it, so mirrors without dead time and lag are candidates too, and one with

@@ -297,6 +297,13 @@ def _check_change(problem: Problem, changes: Mapping[str, object], path: str) ->
         return
     if word in PARAMETERS:
         settable = {n: one for n, one in _parametric(problem, changes, word).parameters.items() if not one.outside}
+        if not name:
+            raise InvalidName(f"'{word}' alone names no parameter; write one entry for each, '{word}.NAME'")
+        if not settable and problem.foreign is not None and word == _EXACT:
+            raise InvalidName(
+                f"what moves is outside and has no parameter '{name}'; state it: "
+                f"ExternalPlant(make=lambda parameters, seed: body, parameters={{'{name}': ...}})"
+            )
         _check_name(f"'{word}.NAME' has a parameter of {PARAMETERS[word]}", name, settable)
         _check_number(changes[path], settable[name].bounds, settable[name].unit)
         return

@@ -94,8 +94,9 @@ class ExternalPlant(Checked):
         mistakes = Mistakes("ExternalPlant")
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
-        if self.body is not None:
-            _check_body(self.body)
+        mistake = "" if self.body is None else _wrong_body(self.body)
+        if mistake:
+            raise InvalidValue(f"ExternalPlant: its body is {mistake}")
 
     @property
     def name(self) -> str:
@@ -226,8 +227,12 @@ class ExternalPlant(Checked):
     def _begun(self, seed: int) -> Body:
         """The body of the run that begins."""
         if self.make is not None:
-            body = self.make({name: one.exact for name, one in self.parameters.items()}, seed)
-            _check_body(body)
+            try:
+                body = self.make({name: one.exact for name, one in self.parameters.items()}, seed)
+            except Exception as error:  # noqa: BLE001  # a stranger's function may raise anything
+                raise _NoBody(f"make raised {type(error).__name__}{_words(error)}") from None
+            if mistake := _wrong_body(body):
+                raise _NoBody(f"make returned {mistake}")
             self._present[:] = [body]
         return self._present[0]
 
@@ -259,7 +264,8 @@ class ExternalPlant(Checked):
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001  # whatever else a stranger's object raises is a bad answer
-            return Reading(None, f"{who} raised {type(error).__name__}{_words(error)}")
+            raised = f"{who} raised {type(error).__name__}{_words(error)}"
+            return Reading(None, str(error) if isinstance(error, _NoBody) else raised)
         elapsed = self._now() - begin
         answer = _real_numbers(returned)
         expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"
@@ -288,16 +294,19 @@ class ExternalPlant(Checked):
         return float(time)
 
 
-def _check_body(body: object) -> None:
+class _NoBody(Exception):
+    """`make` gave no body; the words say why."""
+
+
+def _wrong_body(body: object) -> str:
+    """What stands in place of a body, and what to write; empty where it is one."""
     if isinstance(body, type):
-        raise InvalidValue(
-            f"ExternalPlant: its body is the class {body.__name__}; write {body.__name__}() for an object of it"
-        )
-    for name in ("reset", "step"):
-        if not callable(getattr(body, name, None)):
-            raise InvalidValue(
-                f"ExternalPlant: its body {type(body).__name__} has no method {name}(...); it needs reset and step"
-            )
+        return f"the class {body.__name__}; write {body.__name__}() for an object of it"
+    lacking = [name for name in ("reset", "step") if not callable(getattr(body, name, None))]
+    if not lacking:
+        return ""
+    what = "None" if body is None else f"a value of the class {type(body).__name__} without {' and '.join(lacking)}"
+    return f"{what}; expected an object with reset(seed) and step(time, command)"
 
 
 def _real_numbers(answer: object) -> np.ndarray | None:

@@ -415,7 +415,7 @@ tune mine.py --trials 0 => --trials: expected a whole number of at least 1, got 
 tune two_mass --metric settling.qq => metric 'settling.qq' is unknown. Did you mean 'settling.q2'?
 replay mine.py RHC => FILE (CSV file: time, what the controller is given, and the inputs
 replay mine.py RHC folder.py => recording 'folder.py' cannot be read: Is a directory
-replay mine.py RHC empty.csv => recording empty.csv: is empty; expected a line of names, such as time
+replay mine.py RHC empty.csv => recording empty.csv: it is empty; expected a line of names, such as time
 replay mine.py RHC words.csv => recording words.csv: line 4 is not made of numbers: 0, abc
 replay mine.py RHC other.csv =>
     1. it lacks columns for angle, angle', angle'', which the controller is given; its columns are time, phi ... 2. its times are

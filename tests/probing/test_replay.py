@@ -104,7 +104,7 @@ INPUT = next(iter(TASK.problem.plant.inputs))
         ({"time": TIMES, **{n: c for n, c in GOOD.items() if "1" in n}}, "lacks columns for q2, q2'"),
         (GOOD, "it lacks a column for time"),
         ({"time": 2 * TIMES, **GOOD}, "its times are not"),
-        ({"time": TIMES[:1], **{n: c[:1] for n, c in GOOD.items()}}, "its times are not"),
+        ({"time": TIMES[:1], **{n: c[:1] for n, c in GOOD.items()}}, "it has fewer than two rows"),
         ({"time": TIMES[::-1], **GOOD}, "its times are not"),
         ({"time": np.where(TIMES > 0, TIMES, np.nan), **GOOD}, "its times are not"),
         ({"time": TIMES, **GOOD, INPUT: np.zeros(5)}, f"it has the commands of {INPUT} alone; expected those of"),

@@ -1,9 +1,10 @@
-"""Twenty wrong uses of an external plant, of cases and of a probe, as a newcomer makes them, each with its whole message."""
+"""Wrong uses of an external plant, of cases and of a probe, as a newcomer makes them, each with its whole message."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,11 @@ def probed(**settings: Any) -> Any:
     return fp.probe(PROBLEM, RHC, **settings)
 
 
+def recorded(text: str) -> Any:
+    Path("run.csv").write_text(text)
+    return probed(recording="run.csv")
+
+
 WRONG: dict[str, tuple[Any, str]] = {
     "a class for a body": (
         lambda: outside(body=Body),
@@ -52,7 +58,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "a function for a body": (
         lambda: outside(body=lambda command: command),
-        "ExternalPlant: its body function has no method reset(...); it needs reset and step",
+        "ExternalPlant: its body is a value of the class function without reset and step; expected an object with "
+        "reset(seed) and step(time, command)",
     ),
     "no measures": (
         lambda: outside(measures={}),
@@ -93,6 +100,33 @@ WRONG: dict[str, tuple[Any, str]] = {
         "the external plant has no exact parameters that a study could draw; state them, "
         "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare without scenarios",
     ),
+    "a body that is not in an external plant": (
+        lambda: replace(PROBLEM, reality=body()),
+        "Problem.reality: expected a Reality or an ExternalPlant or None, got a value of the class Body; "
+        "write fp.Reality(plant=...) or fp.ExternalPlant(body=...)",
+    ),
+    "make that returns nothing": (
+        lambda: run(outside(body=None, make=lambda _parameters, _seed: None)),
+        "reality: make returned None; expected an object with reset(seed) and step(time, command)",
+    ),
+    "make that returns a class": (
+        lambda: run(outside(body=None, make=lambda _parameters, _seed: Body)),
+        "reality: make returned the class Body; write Body() for an object of it",
+    ),
+    "make that fails": (
+        lambda: run(outside(body=None, make=lambda parameters, _seed: parameters["mass"])),
+        "reality: make raised KeyError: 'mass'",
+    ),
+    "a parameter of a plant outside that has none": (
+        lambda: case({"exact.mass": 2.0}),
+        "cases: case 'heavy', 'exact.mass': what moves is outside and has no parameter 'mass'; state it: "
+        "ExternalPlant(make=lambda parameters, seed: body, parameters={'mass': ...})",
+    ),
+    "parameters in a mapping of their own": (
+        lambda: case({"approximate": {"b": 2.0}}),
+        "cases: case 'heavy', 'approximate': 'approximate' alone names no parameter; write one entry for each, "
+        "'approximate.NAME'",
+    ),
     "no case": (lambda: fp.Cases({}), 'cases: there is none; expected {"heavy": {"exact.mass": 2.0}}'),
     "a parameter without its word": (
         lambda: case({"b": 2.0}),
@@ -130,6 +164,14 @@ WRONG: dict[str, tuple[Any, str]] = {
     "the chatter of a coordinate": (
         lambda: probed(chatter={"q": 1.0}),
         "probe(chatter=...): 'q' is unknown. Valid: u.",
+    ),
+    "a record without rows": (
+        lambda: recorded("time,u,q,q'\n"),
+        "recording run.csv: it has fewer than two rows of numbers below the line of names",
+    ),
+    "a record of another period": (
+        lambda: recorded("time,u,q,q'\n0,0,0,0\n0.01,1,0,0\n0.03,0,0,0\n"),
+        "recording run.csv: its times are not 0.01 s apart, the period of the problem: 0.01 is followed by 0.03",
     ),
     "a record that is not there": (
         lambda: probed(recording="run1.csv"),

@@ -437,12 +437,15 @@ class Stepless:
 WRONG: dict[str, tuple[Any, str]] = {
     "no body": (lambda: fp.ExternalPlant(measures=MEASURES), "either a body or make=lambda parameters, seed: body"),
     "two bodies": (lambda: loose(Wrapped(task()), make=lambda _p, _s: None), "either a body or make=lambda parameters"),
-    "half a body": (lambda: loose(Stepless()), "its body Stepless has no method step(...); it needs reset and step"),
+    "half a body": (
+        lambda: loose(Stepless()),
+        "its body is a value of the class Stepless without step; expected an object",
+    ),
     "a body that is a class": (
         lambda: loose(Stepless),
         "its body is the class Stepless; write Stepless() for an object of it",
     ),
-    "a body that is none": (lambda: loose(object()), "its body object has no method reset"),
+    "a body that is none": (lambda: loose(object()), "its body is a value of the class object without reset and step"),
     "measures as a list": (lambda: loose(measures=["y"]), "measures: expected {name: a text}, got ['y']"),
     "nothing measured": (lambda: task(reality=loose(measures={})), "it does not measure y (m), which the sensing"),
     "not all": (lambda: task(reality=loose(measures={"y": "m", "y'": "m/s"})), "y'' (m/s^2), which the sensing"),
@@ -473,9 +476,12 @@ WRONG: dict[str, tuple[Any, str]] = {
     "one argument": (lambda: loose(make=lambda _: None), "make: expected a function of 2 arguments or None"),
     "made of nothing": (
         lambda: run(task(reality=loose(make=lambda _p, _s: None))),
-        "its body NoneType has no method reset",
+        "reality: make returned None; expected an object with reset(seed) and step(time, command)",
     ),
-    "a name in make": (lambda: run(task(reality=loose(make=lambda p, _: p["c"]))), "make returns raised KeyError: 'c'"),
+    "a name in make": (
+        lambda: run(task(reality=loose(make=lambda p, _: p["c"]))),
+        "reality: make raised KeyError: 'c'",
+    ),
     "out of bounds": (lambda: made(task()).with_exact(np.array([20.0])), "outside its bounds"),
     "a disturbance": (lambda: outside(task(disturbances={"y": fp.Step(0.0, 1.0)})), "disturbances"),
     "no object": (lambda: task(reality=Wrapped(task())), "reality: expected a Reality or an ExternalPlant"),
