@@ -142,6 +142,11 @@ print(
 )
 
 # %%
+# The source has a run of its own with two signs, on its smaller demand. Its rates and signs are
+# those of its program from zeros, within 0.02, but no optimum: its first plan ends after 500
+# iterations. From where plans begin here, the same cost has rates that differ by up to 0.65
+# in the first minutes, and a time spent that is 0.09 veh h less.
+#
 # With the exact model the plan lowers the third segment's sign before the queue is full:
 # traffic waits on the road, and the ramp empties into the gap.
 

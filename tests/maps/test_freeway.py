@@ -327,15 +327,19 @@ def test_signs_hold_the_queue_that_metering_alone_does_not() -> None:
 @pytest.mark.slow
 def test_the_iteration_spends_more_time() -> None:
     """The second table of the description: a wrong model, where the density is not what is wrong."""
-    rows = task("freeway_economic").description.split("largest queue [veh]")[1].splitlines()[1:6]
-    table = {name: numbers for name, *numbers in (line.strip().rsplit(maxsplit=2) for line in rows)}
+    rows = task("freeway_economic").description.split("with an open light")[1].splitlines()[1:6]
+    table = {name: numbers for name, *numbers in (line.strip().rsplit(maxsplit=3) for line in rows)}
     states = open_loop()[:174]
     spent = T * (2 * states[:, :6].sum() + states[:, 12:].sum())
     assert float(table.pop("open ramp")[0]) == pytest.approx(spent, abs=0.05)
-    for name, (time, queue) in table.items():
+    for name, (time, queue, open_light) in table.items():
         run = fp.simulate(task("freeway_economic").problem, task("freeway_economic").controllers[name], seed=0)
         assert run["plant_state.spent"].max() == pytest.approx(float(time), abs=0.06), name
         assert run["plant_state.w2"].max() == pytest.approx(float(queue), abs=0.06), name
+        assert (run["command.r"] > 1 - 1e-6).sum() == int(open_light), name
+        if name == "RHC":
+            assert np.flatnonzero(run["command.r"] > 1 - 1e-6).tolist() == [*range(8), 17, 19, 21, 22]
+            assert (run["plant_state.w2"][[17, 19, 21, 22]] > 100).all()
 
 
 # Emission
