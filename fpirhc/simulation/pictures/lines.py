@@ -57,7 +57,9 @@ class OverTime(Picture):
                 axis.axhline(level, color="#777777", lw=0.8, ls="--")
             drawing.caption_axes(axis, "", up)
         axes[-1].set_xlabel(drawing.time_label(next(iter(runs.values()))))
-        axes[0].legend(fontsize=7, loc="best", framealpha=0.8)
+        axes[0].legend(
+            fontsize=7, ncols=3, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0)
+        )  # it hides no line
 
 
 @dataclass(frozen=True, eq=False)
