@@ -17,21 +17,23 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter
+from fpirhc.adapters.names import adapter, require_methods
 from fpirhc.adapters.real_time import RealTime, Setup, device
 from fpirhc.errors import InvalidProblem, package
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import CountOrZero, Nonzero
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
 
 @dataclass(frozen=True)
-class Field:
+class Field(Checked):
     """Where a value is: the identifier of its message, its format (see `struct`) at a byte, and value = scale x number."""
 
-    identifier: int
+    identifier: CountOrZero
     format: str = "<f"
-    byte: int = 0
-    scale: float = 1.0
+    byte: CountOrZero = 0
+    scale: Nonzero = 1.0
     extended: bool = False
 
 
@@ -63,6 +65,7 @@ def can_body(
         NotSupported: python-can is not installed.
         InvalidProblem: a quantity that the model does not have, or an input without field.
     """
+    require_methods("can_body(bus=...)", bus, ("send", "recv"), 'can.Bus(interface="socketcan", channel="can0")')
     can, setup = package("can", "outside"), Setup("can_body", period, oldest, holds, clock, "Field(0x201)")
     return device(setup, model, measures, inputs, lambda sent, read: _Traffic(can, bus, sent, read))
 
@@ -72,11 +75,10 @@ class _Traffic:
 
     def __init__(self, can: Any, bus: Any, sent: list[Field], read: list[Field]) -> None:
         self._can, self._bus, self._sent, self._read = can, bus, sent, read
-        self._newest: dict[int, Any] = {}
 
     def open(self) -> None:
         """Forget what came before the last message of every identifier that waits."""
-        self._newest = {}
+        self._newest: dict[int, Any] = {}
 
     def write(self, command: np.ndarray) -> None:
         """Send one message per identifier."""
@@ -100,5 +102,4 @@ class _Traffic:
                 raise InvalidProblem(f"no message 0x{at.identifier:X} has arrived")
             if len(newest.data) < at.byte + struct.calcsize(at.format):
                 raise InvalidProblem(f"message 0x{at.identifier:X} has {len(newest.data)} bytes, too few for its field")
-            (number,) = struct.unpack_from(at.format, newest.data, at.byte)
-            yield at.scale * float(number), wall.time() - newest.timestamp
+            yield at.scale * struct.unpack_from(at.format, newest.data, at.byte)[0], wall.time() - newest.timestamp

@@ -50,7 +50,7 @@ def commonroad_body(
     count = steps_per_cycle("commonroad_body", period, _STEP)
     body = _Car(kind, speed, vehicle, count, tuple(inputs.values()))
     body.read = [(order, _COORDINATES.index(shown[name])) for name, order in map(base_and_order, units)]
-    return ExternalPlant(body, measures=units)
+    return ExternalPlant(body, measures=units, period=period)
 
 
 class _Car:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from fpirhc.adapters.names import adapter, finite_numbers
-from fpirhc.errors import package
+from fpirhc.errors import InvalidProblem, package
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import Seed
+from fpirhc.fields.kinds import Seed, shortened
+from fpirhc.fields.user_code import called
 from fpirhc.simulation.loop import HELD_INPUT, HeldInput, close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.simulate import run_tables
@@ -103,7 +104,10 @@ class _Play:
         self._row = row.ravel()
         self.signals = self._loop.trace.unpack(self._row)
         self.observation = np.concatenate([np.ravel(self.signals[name]) for name in ("state", "reference")])
-        self.reward = float(self._reward(self.signals))
+        reward = np.ravel(called("as_env(reward=...)", self._reward, self.signals))
+        if reward.size != 1 or reward.dtype.kind not in "biuf":
+            raise InvalidProblem(f"as_env(reward=...): it returned {shortened(reward.tolist())}, expected one number")
+        self.reward = float(reward[0])
 
 
 def _squared_error(signals: Mapping[str, np.ndarray]) -> float:

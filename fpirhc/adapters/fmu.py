@@ -64,7 +64,7 @@ def fmu_body(
     places = ([known[name] for name in names] for names in (sent.values(), measures.values()))
     body = _Body(made, described.fmiVersion[0] == "3", period, *places)
     weakref.finalize(body, rmtree, folder, ignore_errors=True)
-    return ExternalPlant(body, measures={name: units[name] for name in measures})
+    return ExternalPlant(body, measures={name: units[name] for name in measures}, period=period)
 
 
 class _Body:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter
+from fpirhc.adapters.names import adapter, require_methods
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -35,6 +35,7 @@ def gymnasium_body(env: Any, model: Plant, *, measures: Mapping[str, Read]) -> E
     Raises:
         InvalidProblem: a quantity that the model does not have, a place that the observation does not have, or other actions.
     """
+    require_methods("gymnasium_body(env=...)", env, ("reset", "step"), 'gymnasium.make("Pendulum-v1")')
     units, mistakes = quantities(model), Mistakes("gymnasium_body")
     mistakes.unknown("measures: quantity", measures, units)
     actions, size = getattr(env.action_space, "shape", None), int(np.prod(env.observation_space.shape or (0,)))

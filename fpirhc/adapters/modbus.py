@@ -11,27 +11,31 @@ from __future__ import annotations
 import weakref
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from fpirhc.adapters.names import adapter
 from fpirhc.adapters.real_time import RealTime, Setup, device
 from fpirhc.errors import InvalidProblem, package
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import CountOrZero, Nonzero
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
+_Types = Literal["INT16", "UINT16", "INT32", "UINT32", "INT64", "UINT64", "FLOAT32", "FLOAT64"]
+
 
 @dataclass(frozen=True)
-class Register:
+class Register(Checked):
     """Where a value is: its first register, its type there (INT16, UINT16, INT32, ..., FLOAT64), and value = scale x register.
 
     `readonly` registers are those of the table of input registers.
     """
 
-    address: int
-    type: str = "FLOAT32"
-    scale: float = 1.0
+    address: CountOrZero
+    type: _Types = "FLOAT32"
+    scale: Nonzero = 1.0
     readonly: bool = False
 
 

@@ -60,7 +60,7 @@ def mujoco_body(
     count = steps_per_cycle("mujoco_body", period, body.opt.timestep)
     places = {q: (order, of_joint[joint[name]][order]) for q, (name, order) in ((q, base_and_order(q)) for q in units)}
     driven = [motors[name] for name in actuator.values()]
-    return ExternalPlant(_Body(mujoco, body, count, driven, places, start or {}), measures=units)
+    return ExternalPlant(_Body(mujoco, body, count, driven, places, start or {}), measures=units, period=period)
 
 
 class _Body:

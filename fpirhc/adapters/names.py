@@ -11,6 +11,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import described
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -54,6 +55,16 @@ def finite_numbers(where: str, values: object, names: Iterable[str]) -> np.ndarr
     if numbers.shape != (len(wanted),) or not np.isfinite(numbers).all():
         raise InvalidValue(f"{where}({values!r}): expected a finite number for each of {', '.join(wanted)}")
     return numbers
+
+
+def require_methods(where: str, value: object, methods: Iterable[str], example: str) -> None:
+    """Raise where an object of a package is something else.
+
+    Raises:
+        InvalidValue: it lacks a method.
+    """
+    if not all(callable(getattr(value, name, None)) for name in methods) or isinstance(value, type):
+        raise InvalidValue(f"{where}: expected an object such as {example}, got {described(value)}")
 
 
 def counterparts(

@@ -107,7 +107,8 @@ def device(
     counted = [] if counter is None else [counter]
     link = connect([inputs[name] for name in model.inputs], [*counted, *measures.values()])
     body = _Device(link, tuple(measures), setup, bool(counted))
-    return ExternalPlant(body, measures={name: units[name] for name in measures}, holds=setup.holds)
+    told = {name: units[name] for name in measures}
+    return ExternalPlant(body, measures=told, holds=setup.holds, period=setup.period)
 
 
 class _Standstill:

@@ -63,7 +63,7 @@ def rotorpy_body(
     flown = multirotor(loaded, initial_state=first, control_abstraction="cmd_acc", aero=True)
     order = [list(model.inputs).index(name) for name in _SENT]
     body = _Quadrotor(flown, first, period, order, parameters["mass"] / loaded["mass"])
-    return ExternalPlant(body, measures={name: quantities(model)[name] for name in _SEEN})
+    return ExternalPlant(body, measures={name: quantities(model)[name] for name in _SEEN}, period=period)
 
 
 def _hovering(parameters: Mapping[str, Any]) -> dict[str, np.ndarray]:

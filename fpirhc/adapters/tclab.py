@@ -42,7 +42,7 @@ def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) ->
     mistakes.unknown("input", model.inputs, _HEATERS)
     mistakes.raise_if_any()
     body = _Twin(tclab, model, period) if board is None else _Board(tclab, model, period, board)
-    return ExternalPlant(body, measures=dict.fromkeys(model.output.elements, "degC"))
+    return ExternalPlant(body, measures=dict.fromkeys(model.output.elements, "degC"), period=period)
 
 
 class _Twin:

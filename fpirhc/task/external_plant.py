@@ -23,6 +23,7 @@ from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.parameter import check_parameters, with_exact_values
 from fpirhc.plant.plant import Parameter, Plant
 
+_SAME = 1e-9  # share of a period that is no difference
 _LONGEST = 60  # characters of an answer that are shown
 
 
@@ -66,6 +67,7 @@ class ExternalPlant(Checked):
             problem; the body has it already, so it is not simulated.
         lag: by input, in the model's unit of time: the time constant with which the body follows a command. As `dead_time`.
         make: function (parameters, seed) -> body, called before every reset with the exact values of `parameters` by name.
+        period: time that a step of the body takes, in the model's unit of time; problems of another one are refused. None: any.
         parameters: of the body. Scenarios draw their exact values as those of a plant; a controller knows none of them.
 
     Raises:
@@ -83,6 +85,7 @@ class ExternalPlant(Checked):
 
     make: Make | None = field(default=None, metadata={"setting": False})
     parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
+    period: Positive | None = field(default=None, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         if (self.body is None) == (self.make is None):
@@ -180,8 +183,12 @@ class ExternalPlant(Checked):
     def check_steps(self, model: Plant, mistakes: Mistakes, *, at_once: bool) -> None:
         """Nothing: what it has inside is not known."""
 
-    def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
-        """Nothing: what it has inside is not known."""
+    def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:  # noqa: ARG002
+        """Raise if a step of the body takes another time than a cycle; what it has inside is not known."""
+        if self.period is not None and abs(self.period - period) > _SAME * period:
+            raise InvalidProblem(
+                f"reality: one step of it takes {self.period:g}, and the problem's period is {period:g}; write both alike"
+            )
 
     def check(self, model: Plant, needed: Collection[str], measured: Collection[str]) -> None:  # noqa: ARG002
         """Raise if it does not measure what the model's sensing needs.

@@ -81,3 +81,16 @@ def test_set_points_are_those_of_a_run():
 def test_a_wrong_seed_is_named_with_what_was_expected(seed):
     with pytest.raises(fp.FpirhcError, match=r"reset\.seed: expected a whole number of at least 0 or None, got"):
         as_env(task("two_link_arm")[0]).reset(seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("reward", "words"),
+    [
+        (lambda signals: signals["errr"], "KeyError: 'errr'"),
+        (lambda _: None, "it returned [None], expected one number"),
+    ],
+)
+def test_a_wrong_reward_is_told_when_the_environment_is_made(reward, words):
+    with pytest.raises(fp.FpirhcError, match=r"as_env\(reward=...\)") as caught:
+        as_env(fp.load_problem("two_mass").problem, reward=reward)
+    assert words in str(caught.value)

@@ -8,10 +8,15 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+from tank import TANK
 
 import fpirhc as fp
+from fpirhc.adapters.can_bus import Field, can_body
 from fpirhc.adapters.control import plant_of
+from fpirhc.adapters.gymnasium import gymnasium_body
+from fpirhc.adapters.modbus import Register
 from fpirhc.adapters.names import finite_numbers
+from fpirhc.adapters.real_time import Setup, device
 from fpirhc.errors import InvalidField, InvalidProblem, InvalidValue
 from fpirhc.members import within
 
@@ -38,6 +43,37 @@ def test_a_wrong_argument_is_named(adapter):
     named = dict.fromkeys([*(one.name for one in needed), checked[0].name], task)
     with pytest.raises(InvalidField, match=rf"{adapter.__name__}\.{checked[0].name}: expected "):
         adapter(**named)
+
+
+@pytest.mark.parametrize(
+    ("use", "words"),
+    [
+        (
+            lambda: can_body("can0", TANK, period=0.1, measures={"h": Field(0x181)}, inputs={"q": Field(0x201)}),
+            'can_body(bus=...): expected an object such as can.Bus(interface="socketcan", channel="can0"), got the text \'can0\'',
+        ),
+        (
+            lambda: gymnasium_body("Pendulum-v1", TANK, measures={"h": 0}),
+            "gymnasium_body(env=...): expected an object such as gymnasium.make(\"Pendulum-v1\"), got the text 'Pendulum-v1'",
+        ),
+        (lambda: Register(30, "int16"), "or 'FLOAT64', got the text 'int16'"),  # type: ignore[arg-type]
+        (lambda: Register(30, scale=0.0), "Register.scale: expected a finite number other than zero, got 0.0"),
+        (lambda: Field(-1), "Field.identifier: expected a whole number of at least 0, got -1"),
+    ],
+)
+def test_a_wrong_object_or_address_is_told_at_once(use, words):
+    """Before a package is asked for, and not when a run begins."""
+    with pytest.raises(InvalidValue, match=re.escape(words)):
+        use()
+
+
+def test_a_device_has_the_period_that_it_was_made_with():
+    """Commands would else be held for another time than the problem's cycle, and nobody would see it."""
+    setup = Setup("mine", 0.1, None, 0, None, "1")
+    body = device(setup, TANK, {"h": 1}, {"q": 2}, lambda _sent, _read: None)  # type: ignore[arg-type,return-value]
+    with pytest.raises(InvalidProblem, match=re.escape("one step of it takes 0.1, and the problem's period is 0.2")):
+        body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.2)
+    body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.1)
 
 
 def test_what_a_package_raises_has_the_adapters_name():

@@ -86,6 +86,10 @@ WRONG: dict[str, tuple[Any, str]] = {
         lambda: outside(parameters={"b": fp.Parameter(1.0, 1.0, "1")}),
         "ExternalPlant: a body that stands cannot take parameters; write make=lambda parameters, seed: body",
     ),
+    "a body of another period": (
+        lambda: outside(period=2e-2),
+        "reality: one step of it takes 0.02, and the problem's period is 0.01; write both alike",
+    ),
     "a dead time without its input": (
         lambda: outside(dead_time=0.02),
         "ExternalPlant.dead_time: expected {name: a finite number of at least 0}, got 0.02; give it a name: "
