@@ -27,7 +27,8 @@ def describe(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(k): describe(v) for k, v in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        return [describe(v) for v in value]
+        numbers = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+        return value.tolist() if numbers else [describe(v) for v in value]
     if isinstance(value, np.generic):
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):

@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.adapters.names import adapter
 from fpirhc.adapters.real_time import RealTime, Setup, device
-from fpirhc.errors import InvalidProblem, package
+from fpirhc.errors import InvalidProblem, InvalidValue, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
@@ -47,8 +47,11 @@ def opcua_body(
 
     Raises:
         NotSupported: asyncua is not installed.
+        InvalidValue: another kind of address.
         InvalidProblem: a quantity that the model does not have, or an input without node.
     """
+    if not address.startswith("opc.tcp://"):
+        raise InvalidValue(f"opcua_body: expected an address such as 'opc.tcp://10.0.0.5:4840', got {address!r}")
     sync = package("asyncua.sync", "outside")
     setup = Setup("opcua_body", period, oldest, holds, clock, "'ns=2;s=...'")
     return device(setup, model, measures, inputs, lambda sent, read: _Session(sync, address, sent, read))

@@ -16,7 +16,7 @@ from typing import NoReturn, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
+from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, NotNegative, Positive, finite_number
 from fpirhc.plant.integrators import Integrator
@@ -104,7 +104,7 @@ class ExternalPlant(Checked):
     @property
     def name(self) -> str:
         """What messages and tables call the body."""
-        return type(self._present[0]).__name__ if self._present else "the body that make returns"
+        return type(self._present[0]).__name__.lstrip("_") if self._present else "the body that make returns"
 
     @property
     def remedy(self) -> str:
@@ -271,8 +271,11 @@ class ExternalPlant(Checked):
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001  # whatever else a stranger's object raises is a bad answer
-            raised = f"{who} raised {type(error).__name__}{_words(error)}"
-            return Reading(None, str(error) if isinstance(error, _NoBody) else raised)
+            words = f"{who} raised {type(error).__name__}{_words(error)}"
+            words = (
+                f"{who}{_words(error)}" if isinstance(error, FpirhcError) else words
+            )  # those of an adapter say it all
+            return Reading(None, str(error) if isinstance(error, _NoBody) else words)
         elapsed = self._now() - begin
         answer = _real_numbers(returned)
         expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"

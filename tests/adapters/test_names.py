@@ -16,6 +16,7 @@ from fpirhc.adapters.control import plant_of
 from fpirhc.adapters.gymnasium import gymnasium_body
 from fpirhc.adapters.modbus import Register
 from fpirhc.adapters.names import finite_numbers
+from fpirhc.adapters.opcua import opcua_body
 from fpirhc.adapters.real_time import Setup, device
 from fpirhc.errors import InvalidField, InvalidProblem, InvalidValue
 from fpirhc.members import within
@@ -55,6 +56,10 @@ def test_a_wrong_argument_is_named(adapter):
         (
             lambda: gymnasium_body("Pendulum-v1", TANK, measures={"h": 0}),
             "gymnasium_body(env=...): expected an object such as gymnasium.make(\"Pendulum-v1\"), got the text 'Pendulum-v1'",
+        ),
+        (
+            lambda: opcua_body("10.0.0.7", TANK, period=0.1, measures={"h": "ns=2;s=h"}, inputs={"q": "ns=2;s=q"}),
+            "opcua_body: expected an address such as 'opc.tcp://10.0.0.5:4840', got '10.0.0.7'",
         ),
         (lambda: Register(30, "int16"), "or 'FLOAT64', got the text 'int16'"),  # type: ignore[arg-type]
         (lambda: Register(30, scale=0.0), "Register.scale: expected a finite number other than zero, got 0.0"),
