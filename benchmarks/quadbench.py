@@ -192,14 +192,13 @@ def circle(task: Task) -> None:
     print("circle in 3 m/s wind, mean distance 3 to 8 s, m: " + CIRCLE)
     late = [("", {}), *((f"thrust {t} ms", {"late_thrust": t / 1e3}) for t in (10, 20, 30, 40, 50))]
     late += [(f"motors {t} ms", {"late_motors": t / 1e3}) for t in (10, 20, 30)]
-    law = fp.Exponential(rate=3.0, integral=False)
-    map_ = task.controllers["CTC+FPI"].deformation.inner
-    slow = fp.ComputedTorque(law, fp.ModelReferenced(replace(map_, gain=map_.gain / 2)))
+    adapted = {name: one for name, one in task.controllers.items() if one.deformation.adapts}
+    halves = {f"{name}, half the gain": halved(one) for name, one in adapted.items()}
     predicted = {
         f"CTC+FPI, 30 ms ahead {name}": fp.Predicted(task.controllers["CTC+FPI"], inputs=AHEAD, by=by)
         for name, by in PREDICTIONS.items()
     }
-    controllers = {**task.controllers, "CTC+FPI, half the gain": slow, **predicted}
+    controllers = {**task.controllers, **halves, **predicted}
     print(f"{'':34s}" + "".join(f"{title or 'no latency':>14s}" for title, _ in late))
     rows = {
         name: [_circled(task, name, controllers.get(name), told) for _, told in late]
@@ -207,6 +206,13 @@ def circle(task: Task) -> None:
     }
     for name, cells in rows.items():
         print(f"{name:34s}" + "".join(f"{cell:14.4f}" for cell in cells), flush=True)
+
+
+def halved(controller: Controller) -> Controller:
+    """Return the controller with half the gain of its deformation."""
+    return controller.with_deformation(
+        controller.deformation.with_effective_gain(controller.deformation.effective_gain() / 2)
+    )
 
 
 def _circled(task: Task, name: str, controller: Controller | None, told: Mapping[str, float]) -> float:

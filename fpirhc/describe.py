@@ -27,8 +27,9 @@ def describe(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(k): describe(v) for k, v in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        numbers = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
-        return value.tolist() if numbers else [describe(v) for v in value]
+        return (
+            value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "biuf" else [*map(describe, value)]
+        )
     if isinstance(value, np.generic):
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):
