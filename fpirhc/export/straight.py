@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 
-from fpirhc.export.choices import CHOICE, COMPARED, DIGITS, EVERY, NUMBER, POINTER, ROW, Forms, Graph, Way
+from fpirhc.export.choices import AND, CHOICE, COMPARED, DIGITS, EVERY, NOT, NUMBER, OR, POINTER, ROW, Forms, Graph, Way
 
 _BODY = re.compile(
     r"(^static int \w+\([^{]*\{[^\n]*\n)((?:  casadi_real a\d[^;]*;\n)+)((?:  (?:a\d+=|if \(res\[)[^\n]*;\n)+)(?=  return 0;\n\})",
@@ -26,9 +26,9 @@ _READ = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0\Z")
 _OLD = re.compile(r"\ba\d+\b")
 _COPY = re.compile(r"( *)(\w+)\[(\d+)\] = (\w+)\[(\d+)\];\n\Z")
 _ELEMENTARY = re.compile(r"(?:exp|log|pow|sin|cos|tan|tanh|atanh|asin|acos|atan|sinh|cosh)\(")
-_DIVIDED = "({}/{})"
+_DIVIDED, _MINUS = "({}/{})", ("({}-{})", "(-{})")
 _ORDERED = ("({}<{})", "({}<={})")  # a byte is below 2.5 where it is below 3; none is 2.5
-_LARGEST_WHOLE = 32767  # in an int of the smallest processors
+_LARGEST_WHOLE = 126  # some bytes are above it, and some below its opposite
 _COSTS = {"/": 2, "*": 1}  # operations that are worth a branch, by what stands between their operands
 _Names = dict[int, tuple[str, ...]]  # where a value can be read, the best place first
 _Sure = Mapping[int, bool]  # flags, and what they are in a block
@@ -233,7 +233,7 @@ class _Writer:
                 self._lines.append(f"{indent}const casadi_real v{node} = {texts[0]};\n")
                 left = (f"v{node}",)
             names[node] = left
-        flag = self._read(group.flag, names, sure)
+        flag = self._asked(group.flag, self._read(group.flag, names, sure))
         yes = [(place, one) for place, one, _ in group.stored if one is not None]
         no = [(place, other) for place, _, other in group.stored]
         self._lines.append(f"{indent}if ({flag}) {{\n" if yes else f"{indent}if (!{flag}) {{\n")
@@ -296,11 +296,15 @@ class _Writer:
         if graph.operands[node] and not kept and self._forms.uses[node] > 1 and not names.get(node):
             self._lines_of([node], names, indent, sure)
         self._lines.append(f"{indent}{place} = {self._read(node, names, sure)};\n")
-        if graph.operands[node] and kept and not names.get(node, ("",))[0].startswith("v"):
+        if graph.operands[node] and kept and not (names.get(node) or ("",))[0].startswith("v"):
             names[node] = (place, *names.get(node, ()))
 
     def _read(self, node: int, names: _Names, sure: _Sure) -> str:
         return names[node][0] if names.get(node) else self._value(self._known(node, sure), names, sure)
+
+    def _asked(self, node: int, text: str) -> str:
+        """The text of a truth: a number says whether it is not 0."""
+        return f"({text}!=0)" if self._graph.kind(node) == NUMBER else text
 
     def _value(self, node: int, names: _Names, sure: _Sure) -> str:
         graph = self._graph
@@ -312,8 +316,13 @@ class _Writer:
             texts = [_whole(text, template, k) for k, text in enumerate(texts)]
         elif graph.is_whole(node):
             texts = [str(int(float(text))) if DIGITS.match(text) else text for text in texts]
-        if template == _DIVIDED and NUMBER not in map(graph.kind, operands):
-            texts[0] = f"(casadi_real){texts[0]}"
+        if template == _DIVIDED:
+            texts[0] = texts[0] if NUMBER in map(graph.kind, operands) else f"(casadi_real){texts[0]}"
+            texts[1] = "(casadi_real)0" if texts[1] == "0" else texts[1]
+        if template in _MINUS:
+            texts = [f"({text})" if text.startswith("-") else text for text in texts]
+        asked = {AND: 2, OR: 2, NOT: 1, CHOICE: 1}.get(template, 0)
+        texts[:asked] = [self._asked(one, text) for one, text in zip(operands, texts[:asked], strict=False)]
         if template.startswith(EVERY):
             return f"EVERY({_bits(texts)}, {template.removeprefix(EVERY).format(*texts)})"
         text = template.format(*texts)

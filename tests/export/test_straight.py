@@ -24,7 +24,10 @@ def random_function(seed: int) -> ca.Function:
     """Scalar code of steps: sums, products, choices by flags that others share, checks, restored rows, numbers of a status."""
     random = np.random.default_rng(seed)
     rows = [ca.SX.sym("memory", 9), ca.SX.sym("sample", 4)]
-    numbers, flags = [*ca.vertsplit(rows[0]), *ca.vertsplit(rows[1]), ca.SX(0), ca.SX(1), ca.SX(2.5)], list[ca.SX]()
+    numbers, flags = (
+        [*ca.vertsplit(rows[0]), *ca.vertsplit(rows[1]), ca.SX(0), ca.SX(1), ca.SX(2.5), ca.SX(-7)],
+        list[ca.SX](),
+    )
 
     def one(of):
         return of[random.integers(len(of))]
@@ -46,6 +49,11 @@ def random_function(seed: int) -> ca.Function:
         lambda: numbers.append(one(numbers) + one(flags)),
         lambda: numbers.append(4 * (1 - one(flags))),
         lambda: numbers.append(ca.if_else(one(flags), 12, ca.if_else(one(flags), 5, ca.if_else(one(flags), 4, 0)))),
+        lambda: numbers.append(ca.if_else(one(flags), 200, ca.if_else(one(flags), -130, one(flags) / one(flags)))),
+        lambda: numbers.append(ca.floor(one(numbers)) - ca.fmod(one(numbers), one(numbers))),
+        lambda: numbers.append(ca.atan2(one(numbers), one(numbers)) * one(numbers) ** one(numbers)),
+        lambda: flags.append(ca.logic_and(one(numbers), one(numbers))),
+        lambda: flags.append(one(numbers) <= random.integers(-140, 260)),
         lambda: flags.append(one(numbers) == random.integers(6)),
         lambda: flags.append(one(numbers) < one(numbers)),
         lambda: flags.append(one(numbers) <= 1.5),
@@ -80,7 +88,7 @@ def results(library: ctypes.CDLL, values: list[np.ndarray], sizes: list[int]) ->
 
 
 @needs_compiler
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [*range(12), 164])
 def test_condensed_code_is_what_was_written(seed, tmp_path):
     """Random steps on numbers, zeros, infinities and NaN: the bits of CasADi's virtual machine, but for the sign of 0."""
     function = random_function(seed)
@@ -109,6 +117,28 @@ def test_whole_numbers_are_compared_with_every_other_number(tmp_path):
     library = compiled(text, "whole", tmp_path)
     for values in ([-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]):
         (found,) = results(library, [np.array(values)], [len(answers)])
+        np.testing.assert_array_equal(found, function(values).full().ravel())
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda x, whole: ca.if_else(whole == 2, x, -7.0) - ca.if_else(whole == 2, -7.0, -7.5) - ca.SX(-7.0),
+        lambda x, whole: ca.logic_and(x * (whole == 2), x),
+        lambda x, whole: ca.vertcat(*(ca.if_else(ca.SX(n) <= whole, x, 2 * x) for n in (-129, -128, 127, 128, 40000))),
+    ],
+    ids=["choice", "truth", "bytes"],
+)
+def test_what_a_compiler_would_read_otherwise(made, tmp_path):
+    """`x--7` is no difference, a byte never above 128, and a product a number before a truth."""
+    x = ca.SX.sym("x", 2)
+    whole = ca.if_else(x[0] < 0, 12, ca.if_else(x[1] < 0, 2, -3))
+    function = ca.Function("f", [x], [ca.densify(made(x[0], whole))])
+    (text,), _ = c_of(function, "arm")
+    library = compiled(text, "read", tmp_path)
+    for values in ([-1.0, 1.0], [1.0, -1.0], [1.0, 1.0], [0.0, -1.0], [np.nan, -1.0]):
+        (found,) = results(library, [np.array(values)], [function.numel_out(0)])
         np.testing.assert_array_equal(found, function(values).full().ravel())
 
 
