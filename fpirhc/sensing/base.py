@@ -16,6 +16,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Deviation
 from fpirhc.plant.chain import response_names as response_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
@@ -292,23 +293,44 @@ def require_named(owner: str, **named: Mapping[str, float]) -> None:
             raise InvalidValue(f"{owner}({name}={{}}): name at least one")
 
 
-def name_mistakes(
-    owner: str,
-    plant: Plant,
-    shown: tuple[str, ...],
-    measured: Mapping[str, float],
-    noise: Mapping[str, float],
-    start: Mapping[str, float],
-) -> Mistakes:
-    """Return the mistakes in the names of an observer's noises. `owner`: the observer's class."""
-    mistakes, every = Mistakes(owner), quantities(plant)
-    mistakes.unknown("measured: quantity", measured, every)
-    for name in measured:
-        if name in every and name not in shown:
-            mistakes.add(f"measured: no sensor shows '{name}'; those of Sensing(measured=...) are {', '.join(shown)}")
-    mistakes.unknown("noise: coordinate", noise, plant.coordinates)
-    mistakes.unknown("start: state", start, plant.state.elements)
-    return mistakes
+class WeighingObserver(StateObserver):
+    """What observers share that weigh the model against the sensors, by the deviations of both."""
+
+    measured: Mapping[str, Deviation]  # quantity -> deviation of the noise of its sensor
+    noise: Mapping[str, Deviation]  # coordinate -> deviation of what its response has beyond the model
+    start: Mapping[str, Deviation]  # state -> deviation of its first value
+    needs_detectability = True
+
+    def __post_init__(self) -> None:
+        require_named(type(self).__name__, measured=self.measured, noise=self.noise)
+
+    def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
+        self._mistakes(plant, measured).raise_if_any()
+
+    def _mistakes(self, plant: Plant, shown: tuple[str, ...]) -> Mistakes:
+        """The mistakes in its names."""
+        mistakes, every = Mistakes(type(self).__name__), quantities(plant)
+        mistakes.unknown("measured: quantity", self.measured, every)
+        for name in self.measured:
+            if name in every and name not in shown:
+                mistakes.add(
+                    f"measured: no sensor shows '{name}'; those of Sensing(measured=...) are {', '.join(shown)}"
+                )
+        mistakes.unknown("noise: coordinate", self.noise, plant.coordinates)
+        mistakes.unknown("start: state", self.start, plant.state.elements)
+        return mistakes
+
+    def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
+        del known
+        return plant.state.elements
+
+    def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
+        del measured
+        return tuple(self.measured)
+
+    def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
+        del known
+        return unobservable(slopes, shown)
 
 
 def first_covariance(plant: Plant, start: Mapping[str, float]) -> np.ndarray:

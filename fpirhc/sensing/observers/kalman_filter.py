@@ -5,26 +5,22 @@ Theory: docs/theory-estimation.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.fields.kinds import Deviation
-from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import (
     Correct,
     Evidence,
     Model,
     Predict,
     Remembered,
-    StateObserver,
+    WeighingObserver,
     covariance_entries,
     first_covariance,
-    name_mistakes,
-    require_named,
-    unobservable,
     values_of,
 )
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -34,7 +30,7 @@ _STATE, _COVARIANCE, _VARIANCES = "observer_state", "observer_covariance", "obse
 
 
 @dataclass(frozen=True, eq=False)
-class KalmanFilter(StateObserver):
+class KalmanFilter(WeighingObserver):
     """The whole state from noisy measurements of a part of it.
 
     Args:
@@ -51,25 +47,6 @@ class KalmanFilter(StateObserver):
     measured: Mapping[str, Deviation]
     noise: Mapping[str, Deviation]
     start: Mapping[str, Deviation] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        require_named("KalmanFilter", measured=self.measured, noise=self.noise)
-
-    def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
-        """Raise if a name is unknown or not measured.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
-        name_mistakes("KalmanFilter", plant, measured, self.measured, self.noise, self.start).raise_if_any()
-
-    def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
-        del known
-        return plant.state.elements
-
-    def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
-        del measured
-        return tuple(self.measured)
 
     def memory(self, model: Model) -> Layout:
         """The believed state, its covariance column by column, and the variances of the noises.
@@ -113,12 +90,6 @@ class KalmanFilter(StateObserver):
             return state, {_STATE: state, _COVARIANCE: covariance, _VARIANCES: memory[_VARIANCES]}
 
         return corrected
-
-    def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
-        del known
-        return unobservable(slopes, shown)
-
-    needs_detectability = True
 
     @property
     def _deviations(self) -> list[float]:

@@ -8,7 +8,7 @@ Theory: docs/theory-estimation.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated
@@ -16,7 +16,7 @@ from typing import Annotated
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, InvalidValue
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.kinds import Deviation, Positive, whole
 from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
@@ -26,12 +26,9 @@ from fpirhc.sensing.base import (
     Model,
     Predict,
     Remembered,
-    StateObserver,
+    WeighingObserver,
     covariance_entries,
     first_covariance,
-    name_mistakes,
-    require_named,
-    unobservable,
     values_of,
 )
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -249,7 +246,7 @@ _MEAN, _COVARIANCE = "observer_arrival", "observer_covariance"
 
 
 @dataclass(frozen=True, eq=False)
-class MovingHorizonStates(StateObserver):
+class MovingHorizonStates(WeighingObserver):
     """The whole state from a window of noisy measurements of a part of it.
 
     Args:
@@ -274,30 +271,17 @@ class MovingHorizonStates(StateObserver):
     barrier: Positive = 1e-2
 
     def __post_init__(self) -> None:
-        require_named("MovingHorizonStates", measured=self.measured, noise=self.noise)
+        super().__post_init__()
         for name, (lower, upper) in self.bounds.items():
             if not lower < upper:
                 raise InvalidValue(
                     f"MovingHorizonStates: bounds of '{name}' are ({lower!r}, {upper!r}); write lower < upper"
                 )
 
-    def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
-        """Raise if a name is unknown or not measured.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
-        mistakes = name_mistakes("MovingHorizonStates", plant, measured, self.measured, self.noise, self.start)
+    def _mistakes(self, plant: Plant, shown: tuple[str, ...]) -> Mistakes:
+        mistakes = super()._mistakes(plant, shown)
         mistakes.unknown("bounds: state", self.bounds, plant.state.elements)
-        mistakes.raise_if_any()
-
-    def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
-        del known
-        return plant.state.elements
-
-    def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
-        del measured
-        return tuple(self.measured)
+        return mistakes
 
     opaque = True
 
@@ -363,12 +347,6 @@ class MovingHorizonStates(StateObserver):
             return states[:, -1], {**remembered, _MEAN: mean, _COVARIANCE: covariance}
 
         return corrected
-
-    def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
-        del known
-        return unobservable(slopes, shown)
-
-    needs_detectability = True
 
     def _smoother(self, model: Model) -> Smoother:
         interior = Interior(model.plant.state.elements, self.bounds, self.barrier)
