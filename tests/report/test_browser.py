@@ -145,6 +145,10 @@ def test_a_page_lies_well_at_first_load(name, width, scheme, reports, visit, pic
     assert boxes["overlaps"] == []
     assert boxes["outside"] == []
     assert one.page.evaluate("document.documentElement.scrollWidth") <= width
+    sizes = one.page.evaluate("[...document.querySelectorAll('figure img')].map((e) => e.clientWidth)")
+    assert (
+        all(size == 640 for size in sizes) or width > 560
+    )  # pictures scroll in their boxes, and their words stay readable
     assert one.complaints == []
 
 
