@@ -342,6 +342,19 @@ def test_the_iteration_spends_more_time() -> None:
             assert (run["plant_state.w2"][[17, 19, 21, 22]] > 100).all()
 
 
+@pytest.mark.slow
+def test_a_price_of_the_queue_leaves_a_plan_in_every_minute() -> None:
+    """The last table of the description; the hard limit leaves minutes in which the last plan is held."""
+    economic = task("freeway_economic")
+    rows = economic.description.split("    with a price ")[1].splitlines()[1:4]
+    priced = replace(economic.problem, limits=replace(economic.problem.limits, prices={"w2": 5.0}))
+    for name, time, queue in (line.strip().rsplit(maxsplit=2) for line in rows):
+        run = fp.simulate(priced, economic.controllers[name], seed=0, compiled=False)
+        assert (run["status"] == 0).all(), name
+        assert run["plant_state.spent"].max() == pytest.approx(float(time), abs=0.06), name
+        assert run["plant_state.w2"].max() == pytest.approx(float(queue), abs=0.06), name
+
+
 # Emission
 
 
