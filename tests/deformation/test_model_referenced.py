@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from exchange import told, with_exact_model
+from kinds import shipped
 from plants import linear
 from test_adaptation import stepping
 from test_anti_windup import overshoot, request_kept, settled, step_of_two_metres
@@ -18,23 +19,11 @@ from test_dead_time import affine
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
-from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.questions.right_model import Tried, recommended_form, right_form
 from fpirhc.symbolic.block import Block
 
 LAW = fp.Exponential(rate=6.0)
 TWO_MASS = fp.load_problem("two_mass")
-# Others of their kind are quicker; each plan of the economic freeways takes seconds to build.
-LONG = (
-    "building",
-    "chain_of_masses",
-    "diabetes_order_five",
-    "freeway_coordinated",
-    "freeway_economic",
-    "hodgkin_huxley_silent",
-    "puma560",
-    "three_link_arm",
-)
 
 
 def short(problem: fp.Problem, cycles: int) -> fp.Problem:
@@ -114,9 +103,7 @@ def test_all_forms_have_the_same_edge(form):
 AMPLIFIED = {"freeway_economic": 1e-6, "freeway_coordinated": 1e-4}
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in sorted(shipped_problems())]
-)
+@pytest.mark.parametrize("name", shipped("building", "chain_of_masses"))
 def test_exact_model_is_left_alone(name):
     """On every shipped problem, behind its sensors and dead time, quanta included: no state changes beyond rounding."""
     task: Any = fp.load_problem(name)

@@ -3,8 +3,9 @@
 A form is a way to say a plant (coordinates of any order, outputs of states, a static map, a map of steps) or what lies between
 plant and controller (dead time, estimators, beliefs, another plant, a body outside). The law of a pair: the run with a wrong
 model stays near its reference, and a Stepper that is given the run's measurements has the run's commands. A controller decides
-what a Stepper is composed of, so each is replayed on all forms; its parts are blocks in it, and are replayed on two forms each,
-in turn. Examples of one member share the forms, each with those of its turn. A pair that is not served stands below with the
+what a Stepper is composed of, so each is tried and replayed on all forms; its parts are blocks in it, and are replayed on two
+forms each, in turn. Parts are tried on every second form, in turn, and on the others in the slow lane. Examples of one member
+share the forms, each with those of its turn. A pair that is not served stands below with the
 sentence that its user reads; every other refusal is a defect. Members are found by search, so a new one is tried on all forms, and
 a new form with all members.
 """
@@ -173,10 +174,15 @@ def replayed(problem: fp.Problem, controller: Controller, run: fp.Run) -> np.nda
     return np.array(commands)
 
 
-def pairs() -> list[tuple[str, str]]:
+def pairs() -> list[Any]:
     """Every member on every form, its examples in turn, and every pair of the tables."""
-    turns = [(group[k % len(group)], form) for group in OF_CLASS.values() for k, form in enumerate(FORMS)]
-    return [*dict.fromkeys((*turns, *REFUSED, *FARTHER))]
+    turns = [
+        pytest.param(group[k // 2 % len(group)], form, marks=[pytest.mark.slow] * (name not in CONTROLLERS and (j + k) % 2))
+        for j, (name, group) in enumerate(OF_CLASS.items())
+        for k, form in enumerate(FORMS)
+    ]
+    tried = {one.values for one in turns}
+    return turns + [pytest.param(*pair) for pair in (*REFUSED, *FARTHER) if pair not in tried]
 
 
 @pytest.mark.parametrize(("member", "form"), pairs())

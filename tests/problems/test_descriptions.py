@@ -1,7 +1,7 @@
 """Numbers in the descriptions of problems: every measured one stands in a table, and every table is read here.
 
 A table gives rms errors in two digits; `fpirhc check` compares those of the baselines with fresh runs, and problems without a
-baseline run here.
+baseline run in the slow lane.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from fpirhc.studies.comparison.entry import plan_every
 
 ROOT = Path(__file__).parents[2] / "problems"
 FILES = sorted([*ROOT.glob("*.py"), *(ROOT / "gallery").glob("*.py"), *(ROOT / "outside").glob("*.py")])
-LONG = ("diabetes", "diabetes_announced")  # runs without a baseline that take some seconds each
 HEAD = "rms error, seed 0"
 
 
@@ -48,7 +47,7 @@ def loaded(path: Path) -> Task:
 
 def errors(task: Task, path: Path, controller: str) -> dict[str, float]:
     """The rms errors of the baseline, or of a run where there is none."""
-    baseline = path.parent / "baselines" / f"{path.stem}.json"
+    baseline = baseline_path(path)
     if baseline.exists():
         metrics = json.loads(baseline.read_text(encoding="utf-8"))["controllers"][controller]["metrics"]
         prefix = "rms_error."
@@ -79,7 +78,7 @@ def test_a_description_is_what_runs_give(path):
     pair plan or neither does, and as often, so that no rate of plans is taken for an effect of adaptation.
     """
     task = loaded(path)
-    if path.stem not in LONG:
+    if baseline_path(path).exists():
         has_the_numbers_of_its_runs(task, path)
     assert task.headline
     pair = [task.controllers[name] for name in task.headline]
@@ -91,8 +90,8 @@ def test_a_description_is_what_runs_give(path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", [p for p in FILES if p.stem in LONG], ids=lambda p: p.stem)
-def test_a_table_of_long_runs_is_what_they_give(path):
+@pytest.mark.parametrize("path", [p for p in FILES if not baseline_path(p).exists()], ids=lambda p: p.stem)
+def test_a_table_without_a_baseline_is_what_runs_give(path):
     has_the_numbers_of_its_runs(loaded(path), path)
 
 

@@ -111,8 +111,11 @@ def stays_inside(name: str, count: int) -> None:
     assert np.abs(run["command"] - commands[:, :, 0]).max() < 1e-11
 
 
-@pytest.mark.parametrize("plants", [300, pytest.param(10_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", DURATIONS)
+@pytest.mark.parametrize(
+    ("name", "plants"),
+    [(name, 300) for name in ("body", "tanks")]
+    + [pytest.param(name, 10_000, marks=pytest.mark.slow) for name in DURATIONS],
+)
 def test_no_plant_of_the_box_leaves_its_certificate(name, plants):
     stays_inside(name, plants)
 

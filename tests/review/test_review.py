@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from kinds import shipped
 from random_plants import dies_out, random_case
 from reviewed import PERIOD, about, answer, answers, mass, torque
 
@@ -17,7 +18,6 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.controllers import check
 from fpirhc.plant.motion import with_exact_parameters
-from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along, own_loops
 from fpirhc.review.questions.horizon import plan_gain
@@ -258,19 +258,11 @@ def test_values_that_make_no_sense_are_refused():
             fp.review(mass(), {}, mismatch=wrong, seed=0)
 
 
-_LONG = (
-    *("chain_of_masses", "puma560", "three_link_arm", "planar_arm", "two_link_arm", "van_der_pol", "leaking_tanks"),
-    *("delayed_mass", "delayed_tanks"),  # the journey below reviews dead time
-    *("noisy_motor", "anaesthesia", "freeway", "diabetes", "diabetes_announced"),  # others of their kind are quicker
-    # They differentiate plans of 10 ms and more; anaesthesia_stimulated has signals and plans too.
-    *("freeway_economic", "freeway_coordinated", "building"),
-    *("hodgkin_huxley_silent", "tumour_daily", "turbojet_slow"),  # the plants of others with another task
-)
+# They differentiate plans of 10 ms and more; the journey below reviews dead time, and others of their kind are quicker.
+LONG = "anaesthesia building chain_of_masses delayed_mass diabetes freeway leaking_tanks noisy_motor two_link_arm".split()
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in _LONG else n for n in shipped_problems()]
-)
+@pytest.mark.parametrize("name", shipped(*LONG))
 def test_every_shipped_problem_can_be_reviewed(name, capsys):
     """Through the command line: one JSON object, every answer with its facts, and the exit code that its verdicts ask for."""
     task = fp.load_problem(name)

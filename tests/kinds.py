@@ -1,0 +1,29 @@
+"""The shipped problems as parameters of a law: in the slow lane are those that repeat another's kind of plant, sensors and plan."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fpirhc.problem_files.shipped import shipped_problems
+
+ALIKE = {  # a problem of the same kind: the problems that repeat it
+    "anaesthesia": ("anaesthesia_drawn", "anaesthesia_monitor", "anaesthesia_people", "anaesthesia_stimulated"),
+    "cart_pole_slots": ("crane_slots", "mass_spring_slots", "two_tanks_slots"),
+    "delayed_mass": ("delayed_tanks",),
+    "diabetes": ("diabetes_announced", "diabetes_order_five"),
+    "freeway_metering": ("freeway_coordinated", "freeway_economic"),
+    "hodgkin_huxley": ("hodgkin_huxley_silent",),
+    "tumour": ("tumour_daily", "tumour_portions", "tumour_vessels"),
+    "turbojet": ("turbojet_slow",),
+    "two_link_arm": ("planar_arm", "puma560", "three_link_arm"),
+    "van_der_pol": ("van_der_pol_duffing",),
+}
+
+
+def shipped(*long: str) -> list[Any]:
+    """All names; those that repeat another, and those that take long here, with the mark of the slow lane."""
+    slow = {*long, *(name for names in ALIKE.values() for name in names)}
+    assert slow | {*ALIKE} <= {*shipped_problems()}
+    return [pytest.param(n, marks=[pytest.mark.slow] if n in slow else ()) for n in sorted(shipped_problems())]
