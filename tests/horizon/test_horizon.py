@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import casadi as ca
-import control
 import numpy as np
 import pytest
 from plants import chain, pendulum
@@ -116,6 +115,8 @@ def test_lqr_terminal_makes_a_short_horizon_endless():
     data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
     plan = fp.solve(ocp, fp.ReducedGradient(iterations=100, tolerance=1e-9), np.array([1.0, -0.3]), data)
     a, b = np.array([[1, 0.1], [0, 1]]), np.array([[0.005], [0.1]])
+    import control  # takes a second, which every process would pay
+
     gain, _, _ = control.dlqr(a, b, np.diag([3.0, 0.5]), np.array([[0.2]]))
     assert plan.status == fp.Status.OK
     np.testing.assert_allclose(plan.inputs[:, 0], -np.asarray(gain) @ [1.0, -0.3], rtol=1e-6)

@@ -26,8 +26,9 @@ import fpirhc.controllers
 import fpirhc.optimisers
 import fpirhc.tracking
 from fpirhc.conformance import check_controller, check_optimiser, check_plant, check_tracking
-from fpirhc.conformance.laws import within
-from fpirhc.conformance.loops import two_masses
+from fpirhc.conformance.horizons import Trial as OptimiserTrial
+from fpirhc.conformance.laws import keep, within
+from fpirhc.conformance.loops import Trial, two_masses
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import Planner
 from fpirhc.errors import InvalidProblem, InvalidValue
@@ -250,8 +251,9 @@ class Dishonest(Optimiser):
     ids=lambda v: getattr(v, "change", None),
 )
 def test_wrong_optimisers_are_caught(wrong, law):
+    assert law in optimiser_laws.LAWS
     with pytest.raises(AssertionError, match=f"Dishonest {breaks(law)}"):
-        check_optimiser(wrong, tolerance=FINE, seed=1)
+        keep(wrong, OptimiserTrial(wrong, FINE, 50), [law], seed=1)
 
 
 def test_the_tolerance_must_tell_a_solution():
@@ -380,8 +382,10 @@ class Faulty(fp.ComputedTorque):
 )
 def test_wrong_controllers_are_caught(wrong, law):
     """Also the clamp that turns a NaN into a full command."""
+    assert law in controller_laws.LAWS
+    trial = Trial(wrong, two_masses(), 1, 0.05, compiled=False)
     with pytest.raises(AssertionError, match=f"Faulty {breaks(law)}"):
-        check_controller(wrong, seed=1, compiled=False)
+        keep(wrong, trial, [law], seed=1)
 
 
 # Plants

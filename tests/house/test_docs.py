@@ -210,6 +210,7 @@ def test_page_of_all_problems_is_that_of_baselines_and_tables():
     assert (rows["three_link_arm"][6], rows["turbojet_slow"][6], rows["freeway"][6]) == ("rival", "FPI", "draw")
 
 
+@pytest.mark.slow
 def test_a_rival_that_was_tried_is_that_of_its_command(monkeypatch):
     """One cheap problem tried again: the same controller and the same error, which stand on the page."""
     monkeypatch.syspath_prepend(str(DOCS))

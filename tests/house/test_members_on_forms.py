@@ -177,7 +177,9 @@ def replayed(problem: fp.Problem, controller: Controller, run: fp.Run) -> np.nda
 def pairs() -> list[Any]:
     """Every member on every form, its examples in turn, and every pair of the tables."""
     turns = [
-        pytest.param(group[k // 2 % len(group)], form, marks=[pytest.mark.slow] * (name not in CONTROLLERS and (j + k) % 2))
+        pytest.param(
+            group[k // 2 % len(group)], form, marks=[pytest.mark.slow] * (name not in CONTROLLERS and (j + k) % 2)
+        )
         for j, (name, group) in enumerate(OF_CLASS.items())
         for k, form in enumerate(FORMS)
     ]

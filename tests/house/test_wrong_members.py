@@ -18,7 +18,10 @@ from fpirhc import conformance
 from fpirhc.conformance import check_deformation, check_observer, deformation_facts
 from fpirhc.conformance import controller as controller_laws
 from fpirhc.conformance import deformation as deformation_laws
-from fpirhc.conformance.loops import two_masses
+from fpirhc.conformance import optimiser as optimiser_laws
+from fpirhc.conformance.horizons import Trial as OptimiserTrial
+from fpirhc.conformance.laws import keep
+from fpirhc.conformance.loops import Trial, two_masses
 from fpirhc.controllers.contract import Controller
 from fpirhc.deformation.base import Deformation
 
@@ -33,17 +36,21 @@ def caught(check, member, law, sentence):
         check(member)
 
 
+def by_its_law(laws, trial, member, law, sentence):
+    """Caught by this law of a family; the laws before it are tried on right members."""
+    [one] = [own for own in laws if own.__name__ == law.replace(" ", "_")]
+    caught(lambda m: keep(m, trial, [one], seed=1), member, law, sentence)
+
+
 def check_controller(member):
     conformance.check_controller(member, seed=1, compiled=False)
 
 
-def check_optimiser(member):
-    conformance.check_optimiser(member, tolerance=1e-6, seed=1)
-
-
 @pytest.mark.parametrize("wrong", CONTROLLERS, ids=lambda c: c.__name__)
 def test_a_wrong_controller_is_caught(wrong):
-    caught(check_controller, wrong(6.0, DEFORMATION), *CONTROLLERS[wrong])
+    member = wrong(6.0, DEFORMATION)
+    trial = Trial(member, two_masses(), 1, 0.05, compiled=False)
+    by_its_law(controller_laws.LAWS, trial, member, *CONTROLLERS[wrong])
 
 
 @pytest.mark.parametrize("wrong", MAPS, ids=lambda c: c.__name__)
@@ -54,7 +61,8 @@ def test_a_wrong_map_is_caught(wrong):
 @pytest.mark.parametrize("wrong", OPTIMISERS, ids=lambda c: c.__name__)
 def test_a_wrong_optimiser_is_caught(wrong):
     """Its plan, its numbers or its memory are not what they are said to be."""
-    caught(check_optimiser, wrong(100, 1e-6), *OPTIMISERS[wrong])
+    member = wrong(100, 1e-6)
+    by_its_law(optimiser_laws.LAWS, OptimiserTrial(member, 1e-6, 50), member, *OPTIMISERS[wrong])
 
 
 @pytest.mark.parametrize("wrong", OBSERVERS, ids=lambda c: c.__name__)
@@ -92,7 +100,7 @@ def test_the_right_members_are_not_refused():
     """Every wrong member is one change away from a right one."""
     check_controller(controllers.Gentle(6.0, DEFORMATION))
     check_deformation(maps.Softsign(0.3, 5.0), seed=1)
-    check_optimiser(optimisers.HeavyBall(100, 1e-6))
+    conformance.check_optimiser(optimisers.HeavyBall(100, 1e-6), tolerance=1e-6, seed=1)
     check_observer(observers.ConstantGain(0.4), seed=1)
 
 

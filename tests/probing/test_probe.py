@@ -119,7 +119,7 @@ def test_the_excitation_is_bounded_and_the_channels_independent():
 def test_the_choice_is_near_the_best_of_a_grid_by_hand(known):
     """At most 1.2 times the least error of 16 settings that are given the true gain, dead time and lag."""
     gain, dead, _, _ = known
-    problem = body_problem(*known)
+    problem = replace(body_problem(*known), duration=4.0)
     found = fp.probe(problem, RHC)
 
     def error(deformation: Deformation | None) -> float:
@@ -235,15 +235,15 @@ def test_other_seeds_are_tried_where_they_change_a_run(noise, runs):
 
 
 def test_no_neighbour_of_the_choice_is_better():
-    """On a plant with limits that the estimate lacks the best predicted share is four times too large; trials walk to the best."""
+    """On a plant with limits that the estimate lacks the best predicted share is too large; trials walk to the best."""
     task = fp.load_problem("van_der_pol")
-    controller = task.controllers["RHC"]
-    found = fp.probe(task.problem, controller, cycles=400)
+    problem, controller = replace(task.problem, duration=5.0), task.controllers["RHC"]
+    found = fp.probe(problem, controller, cycles=400)
     assert ", share " in found.why
     assert found.deformation is not None
     gain = found.deformation.effective_gain()
     others = {f"{f:g}": found.deformation.with_effective_gain(f * gain) for f in (0.6, 1.6)}
-    plant = OnPlant(task.problem, controller)
+    plant = OnPlant(problem, controller)
     outcomes = {name: plant.trial(one, 1) for name, one in {"chosen": found.deformation, **others}.items()}
     errors = {name: one.error for name, one in outcomes.items() if isinstance(one, Trial)}
     assert len(errors) == 3
@@ -252,7 +252,7 @@ def test_no_neighbour_of_the_choice_is_better():
 
 def test_what_a_record_does_not_bound_is_adapted_by_trials_alone():
     """Forty cycles are a tenth of what a lag of .3 s takes: nothing is proposed untried."""
-    problem = replace(body_problem(1.0, 0, 0.3, 0.05), duration=4.0)
+    problem = replace(body_problem(1.0, 0, 0.3, 0.05), duration=2.0)
     untried, found = (fp.probe(problem, RHC, cycles=60, trials=trials) for trials in (False, True))
     assert untried.why == "the record is too short for the lag: take more cycles"
     assert untried.deformation is None
@@ -366,14 +366,14 @@ def test_a_sign_that_is_not_certain_is_asked_again_louder(monkeypatch):
 
 def test_coupled_bodies_are_offered_a_gain_matrix():
     """Directions with gains of 1.3 and .2: the matrix is the inverse of the gains, and not behind the best single number."""
-    problem = replace(body_problem([[0.8, 0.6], [0.5, 0.7]], 0, 0.0, 0.02), duration=4.0)
-    found = fp.probe(problem, RHC, cycles=200)
+    problem = replace(body_problem([[0.8, 0.6], [0.5, 0.7]], 0, 0.0, 0.02), duration=2.0)
+    found = fp.probe(problem, RHC, cycles=150)
     weighted = {n: one for n, one in found.candidates.items() if one.iteration.weights is not None}
     assert weighted
     for one in weighted.values():
         product = np.array(one.iteration.weights) @ np.array([[0.8, 0.6], [0.5, 0.7]])
         assert product == pytest.approx(np.eye(2), abs=0.15)
-    hand = [fp.ModelReferenced(fp.Affine(gain=-2 * g / 1.3)) for g in (0.15, 0.3, 0.6, 0.9)]
+    hand = [fp.ModelReferenced(fp.Affine(gain=-2 * g / 1.3)) for g in (0.3, 0.6)]
     plant = OnPlant(problem, RHC)
     single = [one.error for one in (plant.trial(h, 1) for h in hand) if isinstance(one, Trial)]
     assert min(found.trials[name].error for name in weighted) <= min(single)
@@ -383,7 +383,7 @@ def test_a_model_that_is_not_affine_in_its_input_has_a_choice():
     """The model is 20 tan(u / 20): no inverse in symbols is needed where all coordinates are controlled."""
     problem = body_problem(1.6, 0, 0.0, 0.02)
     bent = replace(problem.plant, response=lambda q, v, u, p: {"q": p.b * 20 * ca.tan(u.u / 20)})
-    task = replace(problem, plant=bent, limits=fp.Limits(inputs={"u": (-15.0, 15.0)}), duration=4.0)
-    found = fp.probe(task, RHC, cycles=150)
+    task = replace(problem, plant=bent, limits=fp.Limits(inputs={"u": (-15.0, 15.0)}), duration=2.0)
+    found = fp.probe(task, RHC, cycles=100)
     assert found.deformation is not None
     assert min(one.error for one in found.trials.values()) < 0.3

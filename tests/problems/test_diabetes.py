@@ -102,6 +102,7 @@ def of_people(of: Task, names: list[str], controllers: list[str], folder: Path) 
     }
 
 
+@pytest.mark.slow
 def test_the_lowest_of_all_keeps_the_rule(tmp_path):
     """A child whom unfinished plans take lowest is never below 70 mg/dl, and longer in the range than with PID."""
     shares = of_people(task(), ["child#001"], ["PID", "RHC"], tmp_path)

@@ -105,12 +105,10 @@ def test_plans_with_another_dead_time_are_those_that_are_built_with_it():
 def test_what_survives_is_ready_and_what_grows_is_not():
     """The plant's dead time is one cycle longer than believed: no with certainty, and ready with an uncertainty of five."""
     for form in (fp.Increment, fp.Paired):
-        sure = told(form(MAP, cycles=20, uncertainty=0))
-        assert answer(mass(21), sure, "Does the deformation converge").verdict == "no"
+        sure, unsure = (told(form(MAP, cycles=20, uncertainty=cycles)) for cycles in (0, 5))
         assert answer(mass(21), sure, "gain admissible").verdict == "no"
-        unsure = answers(mass(21), told(form(MAP, cycles=20, uncertainty=5)))
-        assert {q: a for q, a in unsure.items() if a.verdict == "no"} == {}
-        assert about(unsure, "Does the deformation converge").verdict == "yes"
+        assert (predict(mass(21), sure).verdict, predict(mass(21), unsure).verdict) == ("no", "yes")
+    assert "no" not in {a.verdict for a in answers(mass(21), unsure).values()}
 
 
 def test_the_box_contains_the_dead_time():
@@ -199,7 +197,7 @@ def test_the_loop_is_asked_and_not_the_iteration_alone(weight, verdict):
     answer = pays_when_late(case(problem, controller))
     assert answer is not None
     assert answer.verdict == verdict
-    for name, cycles in (("longer", 66), ("shorter", 54)):
+    for name, cycles in (("longer", 66), ("shorter", 54)) if verdict == "no" else ():
         late = replace(problem, dead_time=fp.DeadTime(inputs={"u": cycles * PERIOD}))
         for which, one in (("without", without_deformation(controller)), ("with", controller)):
             run = fp.simulate(late, one, seed=0, compiled=False)

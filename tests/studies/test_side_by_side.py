@@ -239,12 +239,12 @@ def test_a_map_over_starts_has_one_loop(tmp_path: Path, monkeypatch: pytest.Monk
         return native(*given, **named)
 
     monkeypatch.setattr("fpirhc.simulation.simulate.native", counted)
-    axes = [Axis.parsed("start.q1=1:3.4:8"), Axis.parsed("start.q1'=-4:4:8")]
+    axes = [Axis.parsed("start.q1=1:3.4:4"), Axis.parsed("start.q1'=-4:4:4")]
     task = short(TWO_MASS)
     found = sweep(task, axes, folder=tmp_path, controllers=["RHC"]).maps[0]
     assert len(compiled) == 1
     assert not found.apart
-    for place in ((0, 0), (3, 7), (7, 2)):
+    for place in ((0, 0), (1, 3), (3, 1)):
         start = {"q1": axes[0].values[place[0]], "q1'": axes[1].values[place[1]]}
         problem = replace(task.problem, start={**task.problem.start, **start})
         run = fp.simulate(problem, task.controllers["RHC"], seed=0)
