@@ -225,7 +225,11 @@ _WAIT = 10  # s for an answer of the scheduler
 _LOCAL = {
     # Dask's own settings give every log back to the system and fetch it anew: half as much time again for a scenario.
     "distributed.nanny.pre-spawn-environ": {f"{name}_NUM_THREADS": 1 for name in ("OMP", "MKL", "OPENBLAS")},
-    "distributed.worker.profile.enabled": False,  # it looks at every thread a hundred times a second
+    # What looks at workers and threads many times a second has the same cores as the runs.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.scheduler.work-stealing": False,
 }
 _ONE_AT_A_TIME = threading.Lock()  # a worker may have several threads, and a loop serves one
 
@@ -256,7 +260,7 @@ class Cluster:
         where: Any = address
         if address == LOCAL:
             with package("dask.config", "cluster", "--cluster").set(_LOCAL):
-                facts = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
+                facts = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL, "memory_limit": None}
                 local = self._dask.LocalCluster(n_workers=count, threads_per_worker=1, **facts)
             where = self._stack.enter_context(local)
         try:
