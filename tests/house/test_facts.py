@@ -427,6 +427,7 @@ def contracts() -> tuple[type, ...]:
     return tuple(collected)
 
 
+@cache
 def names_in(path: Path) -> dict[str, Any]:
     """What a file imports or defines by name, imports inside of functions included."""
     module = importlib.import_module(".".join(["fpirhc", *path.relative_to(PACKAGE).with_suffix("").parts]))
