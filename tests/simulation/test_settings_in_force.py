@@ -73,3 +73,13 @@ def test_pictures_mark_the_changes(comparison):
 def test_changes_of_unknown_controllers_are_refused():
     with pytest.raises(InvalidProblem, match=r"changes.*eq 6"):
         compare(TASK, seed=0, controllers=["CTC", NAME], changes={"CTC+FPI (eq6)": CHANGES})
+
+
+def test_limits_count_from_when_they_are_in_force():
+    """The share of cycles at a limit is that of cycles that were clipped, also where the limit comes during the run."""
+    problem = replace(TASK.problem, duration=0.2, measure_from=0.05)
+    ready = fp.simulator(problem, TASK.controllers["CTC"], live=["limits.inputs.Q1"], compiled=False)
+    free = ready.run(seed=0)["command.Q1"]
+    run = ready.run(seed=0, changes={0.1: {"limits.inputs.Q1": (-200.0, float(free[len(free) // 2 :].min()))}})
+    counts = run["clipped"][np.round(run.time / problem.period) >= round(0.05 / problem.period)]
+    assert fp.measure(problem, run).at_limit == counts.mean() > 0.2

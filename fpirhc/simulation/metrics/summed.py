@@ -104,7 +104,8 @@ class Summed:
         of_whole_runs: whether a run that ended early has NaN.
         before: signals that the term reads of the cycle before.
         first: signals that it reads of the first cycle.
-        constants: of a run, which the term needs; None where nobody knows them before it.
+        constants: of a run, which the term needs; a column for each cycle where a log has changes; None where nobody knows
+            them before it.
     """
 
     reads: tuple[str, ...]
@@ -143,10 +144,9 @@ class Summed:
         number = np.arange(begin, run.cycles)
         constants = self.constants(about)
         assert constants is not None
+        held = constants[:, begin:] if constants.ndim > 1 else constants[:, None]
         some = {name: values[:, begin:] for name, values in rows.items()}
-        cycle = cast(Callable[..., Cycle], Cycle)(
-            some, number, 1, before, first, number > about.first, constants[:, None]
-        )
+        cycle = cast(Callable[..., Cycle], Cycle)(some, number, 1, before, first, number > about.first, held)
         entries = np.broadcast_to(self.term(cycle), (terms, len(number)))
         return np.asarray(entries.max(axis=1, initial=0.0) if self.largest else entries.sum(axis=1))[None]
 

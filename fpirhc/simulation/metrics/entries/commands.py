@@ -6,21 +6,36 @@ import numpy as np
 
 from fpirhc.plant.motion import derivative_unit
 from fpirhc.simulation.metrics.base import Metric, input_unit
-from fpirhc.simulation.metrics.summed import Cycle, Summed, Term, some
+from fpirhc.simulation.metrics.summed import Cycle, Measured, Summed, Term, some
 from fpirhc.summary import in_percent
 from fpirhc.symbolic.live import nominal
-from fpirhc.task.problem import Problem
 
 _AT = 1e-9  # of the range between the limits: nearer is at the limit
 
 
-def _ends(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Commands from which on an input is at a limit, shape (inputs,) each."""
-    lower, upper = nominal(problem.limits).input_bounds(problem.plant)
+def _ends(run: Measured) -> np.ndarray:
+    """Commands from which on an input is at a limit, lower ones first, a column for the run or for each of its cycles."""
+    lower, upper = _limits(run)
     span = upper - lower
     near = _AT * np.where(np.isfinite(span), span, np.fmax(1.0, np.fmin(np.abs(lower), np.abs(upper))))
     near = np.where(np.isfinite(near), near, 0.0)
-    return lower + near, upper - near
+    return np.concatenate([lower + near, upper - near])
+
+
+def _limits(run: Measured) -> np.ndarray:
+    """The limits of the inputs that were in force, shape (2, inputs) or (2, inputs, cycles)."""
+    inputs = run.problem.plant.input.elements
+    limits = np.array(nominal(run.problem.limits).input_bounds(run.problem.plant))
+    changes = () if run.run is None else run.run.in_force
+    live = {f"limits.inputs.{name}.{end}": (end, k) for k, name in enumerate(inputs) for end in (0, 1)}
+    if not any(path in live for _, numbers in changes for path in numbers):
+        return limits
+    limits = np.repeat(limits[:, :, None], run.cycles, axis=2)
+    for time, numbers in changes:
+        since = round(time / run.problem.period)
+        for path in live.keys() & numbers.keys():
+            limits[(*live[path], slice(since, None))] = numbers[path]
+    return limits
 
 
 def _at_end(cycle: Cycle) -> Term:
@@ -41,13 +56,7 @@ total_variation = Summed(
     before=_COMMAND,
 )
 # The share of the cycles in which a command stands at a limit, clipped or planned there.
-at_limit = Summed(
-    _COMMAND,
-    ("",),
-    _at_end,
-    lambda sums, run: sums / max(run.count, 1),
-    constants=lambda run: np.concatenate(_ends(run.problem)),
-)
+at_limit = Summed(_COMMAND, ("",), _at_end, lambda sums, run: sums / max(run.count, 1), constants=_ends)
 
 
 METRICS = (
