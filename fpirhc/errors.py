@@ -7,10 +7,10 @@ so that a user sees them together.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, Never
 
 
 class FpirhcError(Exception):
@@ -153,6 +153,19 @@ def nearest(name: object, valid: Iterable[str]) -> str:
         return f"{hint} Valid: {listed(names)}."
     shown = get_close_matches(str(name), names, n=_SHOWN, cutoff=0)
     return f"{hint} Valid: {listed(shown)} and {len(names) - len(shown)} more."
+
+
+def without(module: str, valid: Sequence[str]) -> Callable[[str], Never]:
+    """Return the `__getattr__` of a module of public names: it raises InvalidName with the nearest one."""
+
+    def missing(name: str) -> Never:
+        if name.startswith(
+            "_"
+        ):  # tools look for such names in whatever they meet, and nobody means a public one by them
+            raise AttributeError(f"module '{module}' has no attribute '{name}'")
+        raise InvalidName(f"{module} has no name '{name}'.{nearest(name, valid)}")
+
+    return missing
 
 
 def listed(names: Sequence[str]) -> str:

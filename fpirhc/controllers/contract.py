@@ -309,11 +309,27 @@ def late_deformation(deformation: Deformation, problem: Problem, least: float = 
 
 
 def resolved(problem: Problem, controller: Controller) -> Controller:
-    """Return the controller with every automatic setting replaced by its value for this problem."""
+    """Return the controller with every automatic setting replaced by its value for this problem.
+
+    Raises:
+        NotSupported: a wrapper stands around another one of its kind; both would have the same signals.
+    """
     if controller.inner is not None:
+        _require_once(controller)
         inner = resolved(controller.inner_problem(problem), controller.inner)
         controller = controller if inner is controller.inner else with_inner(controller, inner)
     return controller.with_defaults(problem)
+
+
+def _require_once(wrapper: Controller) -> None:
+    inside = wrapper.inner
+    while inside is not None:
+        if type(inside) is type(wrapper):
+            name = type(wrapper).__name__
+            raise NotSupported(
+                f"{name} stands around another {name}; one is enough: leave one out, and give the other the settings of both"
+            )
+        inside = inside.inner
 
 
 def tracking_law(controller: Controller) -> Tracking | None:

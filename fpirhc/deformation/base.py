@@ -287,9 +287,15 @@ def automatic(deformation: Deformation) -> tuple[str, ...]:
 
 def innermost(deformation: Deformation) -> Deformation:
     """The map inside all others."""
-    while deformation.inner is not None:
+    *_, own = _chain(deformation)
+    return own
+
+
+def _chain(deformation: Deformation | None) -> Iterator[Deformation]:
+    """Yield a deformation and those inside it, the outermost first."""
+    while deformation is not None:
+        yield deformation
         deformation = deformation.inner
-    return deformation
 
 
 def smooth_norm(column: Expression, floor: float) -> Expression:
@@ -325,6 +331,9 @@ class Wrapper(Deformation, ABC):
     """
 
     passes_pair: ClassVar[bool] = False  # whether a model-referenced form inside is given what it compares
+    chooses_pair: ClassVar[bool] = (
+        False  # whether it says what a response is compared with, in place of the last request
+    )
 
     map: Deformation
 
@@ -355,10 +364,18 @@ class Wrapper(Deformation, ABC):
 
 
 def against_wrappers(deformation: Deformation) -> Iterator[str]:
-    """Yield a sentence for every wrapper that changes what a model-referenced form inside it compares, the outermost first."""
+    """Yield a sentence for every wrapper that does not fit what it is around, the outermost first."""
     while deformation.inner is not None:
-        name = type(deformation).__name__
-        if not getattr(deformation, "passes_pair", False):
+        name, inside = type(deformation).__name__, list(_chain(deformation.inner))
+        pairing = [one for one in inside if getattr(one, "chooses_pair", False)]
+        if any(type(one) is type(deformation) for one in inside):
+            yield f"{name} stands around another {name}; one is enough, so leave one of them out"
+        elif pairing and getattr(deformation, "chooses_pair", False):
+            yield (
+                f"{name} around {type(pairing[0]).__name__}: each of them says which request a response belongs to; use one of "
+                "them around the map, and state the dead time there"
+            )
+        elif not getattr(deformation, "passes_pair", False):
             yield from deformation.inner.mirror.against_last_request(
                 f"{name} around a model-referenced form changes what the form compares, the model's response with the measured "
                 f"one; put it inside: ModelReferenced({name}(map, ...))"

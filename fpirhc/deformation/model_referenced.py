@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import ClassVar, Self
 
 import casadi as ca
 
@@ -38,6 +38,8 @@ class ModelReferenced(Wrapper):
     Raises:
         InvalidValue: a dead time, lag, uncertainty or pole out of range.
     """
+
+    chooses_pair: ClassVar[bool] = True
 
     cycles: Cycles | None = field(default=None, metadata={"of_problem": True})
     measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle

@@ -28,10 +28,10 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
         InvalidProblem: an unknown name, no name, a parameter that already has the name, or a response that has a disturbance
             already.
     """
-    mistakes = Mistakes("disturbed")
+    mistakes = Mistakes("disturbances of the model")
     responses = dict(zip(response_names(plant), plant.controlled_names, strict=True)) if plant.outputs else {}
     what = "coordinate, output or response of an output" if plant.outputs else "coordinate"
-    mistakes.unknown(what, names, [*plant.names, *plant.chains, *responses])
+    mistakes.unknown(what, names, list(dict.fromkeys([*plant.names, *plant.chains, *responses])))
     if not names:
         mistakes.add("name at least one coordinate whose response is disturbed")
     for name in (disturbance_name(c) for c in names):
@@ -118,7 +118,7 @@ def _output(plant: Plant, name: str, one: Output, names: Sequence[str]) -> Outpu
     vars(expression)["__signature__"] = inspect.signature(one.expression)
     if own and one.response_disturbance:
         raise InvalidProblem(
-            f"disturbed: the response of '{name}' has the disturbance {one.response_disturbance} already"
+            f"disturbances of the model: the response of '{name}' has the disturbance {one.response_disturbance} already"
         )
     return replace(
         one, expression=expression, response_disturbance=disturbance_name(own[0]) if own else one.response_disturbance

@@ -15,7 +15,7 @@ from statistics import NormalDist
 from typing import Annotated
 
 from fpirhc.errors import InvalidValue, Mistakes
-from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import JudgedByOwner, Range, finite_number, real_number
 from fpirhc.symbolic.live import copied
 
@@ -42,6 +42,7 @@ class Parameter(Checked):
     outside: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
 
+@checked_call
 def outside(nominal: float, unit: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> Parameter:
     """Return a signal from outside, which is declared among the parameters of a plant.
 
@@ -52,6 +53,9 @@ def outside(nominal: float, unit: str, bounds: tuple[float, float] = (-math.inf,
         nominal: value at which the plant is reviewed, and which the model has where it is told nothing.
         unit: of the signal.
         bounds: least and largest physically possible value.
+
+    Raises:
+        InvalidField: wrong arguments, all together.
     """
     return Parameter(nominal, nominal, unit, bounds, outside=True)
 

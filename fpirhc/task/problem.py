@@ -121,10 +121,10 @@ class Problem(Checked):
             )
         names = [*self.disturbable, *shared]
         mistakes.unknown(f"disturbances: {disturbed(plant)}", self.disturbances, names)
-        instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
+        instants = np.array([0.0, self.period])
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         checks = (
-            *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
+            lambda: self._check_disturbances(instants),
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
             lambda: _check_reference(self),
@@ -308,6 +308,14 @@ class Problem(Checked):
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
         plant = self.real_plant
         return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+
+    def _check_disturbances(self, instants: np.ndarray) -> None:
+        """Raise if a disturbance has no values."""
+        for name, one in self.disturbances.items():
+            try:
+                one.values(instants, np.random.default_rng(0))
+            except FpirhcError as error:
+                raise InvalidProblem(f"disturbances: '{name}': {error}") from error
 
     def _check_derivatives(self, instants: np.ndarray) -> None:
         """Raise if the disturbance of an output does not have the derivatives that are needed."""

@@ -281,7 +281,13 @@ CASES = (
         r"Filtered around a model-referenced form.*ModelReferenced\(Filtered",
     ),
     (fp.Tuned(fp.ModelReferenced(affine(0.5)), largest_gain=0.9), "put it inside"),
-    (fp.Paired(fp.ModelReferenced(affine(0.5)), cycles=2), "Paired around a model-referenced form"),
+    (fp.Paired(fp.ModelReferenced(affine(0.5)), cycles=2), "Paired around ModelReferenced: each of them says which"),
+    (fp.ModelReferenced(fp.Paired(affine(0.5), cycles=2)), "ModelReferenced around Paired: each of them says which"),
+    (
+        fp.ModelReferenced(fp.Filtered(fp.Increment(affine(0.5), cycles=0), pole=0.5)),
+        "ModelReferenced around Increment",
+    ),
+    (fp.Filtered(fp.Filtered(affine(0.5), pole=0.5), pole=0.5), "Filtered stands around another Filtered"),
     (fp.ModelReferenced(affine(0.5), lag=(0.1, 0.1, 0.1)), r"the plant has 2 inputs \(Q1, Q2\)"),
     (fp.ModelReferenced(affine(0.5), cycles=(1, 2, 3)), "3 dead times are given, but the plant has 2"),
 )

@@ -127,3 +127,30 @@ def test_a_name_with_a_comma_stands_in_quotes():
     """Else "RHC, stiff" reads as two names; where no name has a comma the list is plain."""
     assert nearest("RHCC", ["RHC", "RHC, stiff"]) == " Did you mean 'RHC'? Valid: 'RHC', 'RHC, stiff'."
     assert nearest("x", ["CTC", "RHC"]) == " Valid: CTC, RHC."
+
+
+def test_names_of_the_inner_modules_are_offered_as_those_of_the_package():
+    """A misspelt rival or figure has the error of a misspelt name of the package; tools may ask for private names."""
+    for module, name, meant in ((fp.rivals, "SldingMode", "SlidingMode"), (fp.figures, "overshot", "Overshoot")):
+        with pytest.raises(InvalidName, match=f"Did you mean '{meant}'"):
+            getattr(module, name)
+        assert not hasattr(module, "_no_such_name")
+
+
+def test_mistakes_name_what_was_written():
+    """The call, the disturbance, the wrapper; each name once."""
+    with pytest.raises(InvalidField, match=r"outside\.nominal: expected a number"):
+        fp.outside(nominal="warm", unit="K")
+    with pytest.raises(fp.FpirhcError, match="disturbances: 'Q2': disturbance must be one scalar expression, got None"):
+        replace(PROBLEM, disturbances={"Q1": fp.Step(1.0, 2.0), "Q2": fp.Formula(lambda t: None)})
+    late, drift = fp.ComputedTorque(fp.Exponential(rate=6.0)), dict.fromkeys(("q1", "q2"), 1.0)
+    twice: list[Any] = [
+        fp.Predicted(fp.Predicted(late, inputs=1e-2), inputs=1e-2),
+        fp.Estimating(fp.Estimating(late, fp.DisturbanceKalman(drift, drift)), fp.DisturbanceKalman(drift, drift)),
+    ]
+    for one in twice:
+        with pytest.raises(fp.FpirhcError, match=f"{type(one).__name__} stands around another {type(one).__name__}"):
+            fp.simulate(PROBLEM, one, seed=0, compiled=False)
+    unknown = fp.Estimating(late, fp.DisturbanceKalman({"q": 1.0}, drift))
+    with pytest.raises(fp.FpirhcError, match=r"coordinate 'q' is unknown.* Valid: q1, q2\."):
+        fp.simulate(PROBLEM, unknown, seed=0, compiled=False)

@@ -238,3 +238,22 @@ def test_chatter_is_that_of_a_run(noise, sensor, controller):
 def test_chatter_is_not_asked_without_noise():
     """A quiet sensor."""
     assert answer(moving(), fp.Affine(gain=-1.0), "chatter") is None
+
+
+@pytest.mark.parametrize(("stiffness", "verdict"), [(30.0, "yes"), (20.0, "no")])
+def test_an_inverse_of_another_response_is_told(stiffness, verdict):
+    """M y'' = u - 30 y with the inverse u = M r + k y: the response to it is off by 10 y of 23.5 y where k is 20."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.5, 1.0, "kg")},
+        response=lambda q, v, u, p: {"y": (u.u - 30.0 * q.y) / p.m},
+        inverse=lambda q, v, r, p: {"u": p.m * r.y + stiffness * q.y},
+    )
+    one = answer(replace(moving(), plant=plant), fp.Identity(), "inverse exist")
+    assert one.verdict == verdict
+    if verdict == "no":
+        responses = (
+            abs(10.0 + 9.0 * 1.5) / 1.5
+        )  # those that the wrong command has along y = sin(3 t), whose y'' is -9 y
+        assert one.numbers["missed"] == pytest.approx(10.0 / 1.5 / responses, rel=0.02)

@@ -6,4 +6,11 @@ the filter it is the periodic one.
 
 import lazy_loader as _lazy
 
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
+from fpirhc.errors import without as _without
+
+_import, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
+_missing = _without("fpirhc.rivals", __all__)
+
+
+def __getattr__(name: str) -> object:
+    return _import(name) if name in __all__ else _missing(name)

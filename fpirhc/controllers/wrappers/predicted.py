@@ -145,6 +145,9 @@ class ByDesired(Predictor):
 class Predicted(ControllerWrapper):
     """The wrapped controller on the predicted state.
 
+    The prediction uses the parameters that are given from outside: a learner belongs around it, `Estimating(Predicted(...), ...)`;
+    one inside corrects the model of its controller alone.
+
     Args:
         controller: any controller.
         inputs: dead time of the inputs, s; the sum of both dead times is rounded to control cycles.

@@ -9,7 +9,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import casadi as ca
 
@@ -43,6 +43,8 @@ class _Queued(Wrapper):
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
     """
+
+    chooses_pair: ClassVar[bool] = True
 
     cycles: Cycles
     longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})

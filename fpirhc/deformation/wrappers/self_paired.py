@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import casadi as ca
 
@@ -62,6 +62,8 @@ class SelfPaired(Wrapper):
         most: longest dead time that is searched, cycles.
         confidence: least confidence of an estimate that is used, in (0, 1).
     """
+
+    chooses_pair: ClassVar[bool] = True
 
     most: Annotated[int, whole(1, _MOST)]
     confidence: Accuracy = 0.6

@@ -242,10 +242,32 @@ _VANISHING = 0.01  # share of its largest size below which a gain is doubtful
 
 
 def inverse_exists(grid: ReviewGrid) -> Answer:
-    """Return the conditioning of B along the reference and over the box.
+    """Return the conditioning of B along the reference and over the box, and whether the plant's inverse inverts its response.
 
     Between two points at which det B has different signs it is zero somewhere.
     """
+    answer, missed = _conditioning(grid), _missed(grid)
+    if answer.verdict is Verdict.NO or missed is None or missed <= _INVERTED:
+        return answer
+    text = f"the response to the command that the inverse finds is off by up to {missed:.2g} of the largest response of the model"
+    return Answer(INVERSE, Verdict.NO, text, _MENDED, {**answer.numbers, "missed": missed})
+
+
+_INVERTED = 1e-4
+_MENDED = "Mend Plant(inverse=...), or leave it out: it is then derived, or found by Newton's method."
+
+
+def _missed(grid: ReviewGrid) -> float | None:
+    """How far the model's response to inverse(x, r) is from r, as a share of the largest r, for responses r that it can have."""
+    plant = grid.problem.plant
+    own, response = np.tile(plant.approximate, (len(grid.times), 1)), plant.equations.controlled_response
+    wanted = each(response, grid.states, grid.needed(plant.approximate), own)
+    got = each(response, grid.states, each(plant.equations.inverse, grid.states, wanted, own), own)
+    size = np.abs(wanted).max()
+    return float(np.abs(got - wanted).max() / size) if np.isfinite(got).all() and size > 0 else None
+
+
+def _conditioning(grid: ReviewGrid) -> Answer:
     gains = _gains(grid)
     bad = ~np.isfinite(gains).all(axis=(2, 3))
     if bad[0].any():

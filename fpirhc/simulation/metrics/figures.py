@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import InvalidValue, without
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import followed_units
 from fpirhc.simulation.metrics.base import Better, Metric, measured_cycles
@@ -20,6 +20,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
 __all__ = ["Energy", "InBand", "Largest", "Nadir", "Norm", "Overshoot", "TimeOver", "Total"]
+__getattr__ = without("fpirhc.figures", __all__)
 What = str | Quantity
 
 
