@@ -18,11 +18,11 @@ from functools import cache, wraps
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
 
 import casadi as ca
 
-from fpirhc.errors import InvalidField, InvalidName, nearest
+from fpirhc.errors import InvalidField, InvalidName, NotSupported, nearest
 from fpirhc.fields.kinds import (
     Anything,
     Choice,
@@ -381,7 +381,7 @@ class ByName(dict[str, Value]):
         self._where = where
         for name, value in self.items():
             if type(value) is dict:  # not a subclass, which may have an order or a default of its own
-                super().__setitem__(name, cast(Value, ByName(cast(dict[str, object], value), f"{where}[{name!r}]")))
+                super().__setitem__(name, cast(Value, type(self)(cast(Any, value), f"{where}[{name!r}]")))
 
     def __getitem__(self, name: str) -> Value:
         try:
@@ -391,6 +391,27 @@ class ByName(dict[str, Value]):
 
     def __missing__(self, name: object) -> NoReturn:
         raise InvalidName(f"{self._where} has no '{name}'.{nearest(name, self)}")
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), (dict(self), self._where)
+
+
+class Fixed(ByName[Value]):
+    """A dictionary in a field of a frozen value.
+
+    What follows from the value is computed once, so a change in place would be shown and have no effect.
+
+    Raises:
+        NotSupported: a change in place.
+    """
+
+    def _stays(self, *_: object, **__: object) -> NoReturn:
+        raise NotSupported(
+            f"{self._where} cannot be changed in place, where it would have no effect; make another value with "
+            f"dataclasses.replace(...) and a copy, {{**{self._where.rpartition('.')[2]}, name: value}}"
+        )
+
+    __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _stays
 
 
 class FoundByName:
@@ -402,7 +423,8 @@ class FoundByName:
 
 
 def find_by_name(value: object) -> None:
-    """Let every dictionary in a public attribute of a value be found by name."""
+    """Let every dictionary in a public attribute of a value be found by name; those of a frozen value stay as they are."""
+    kind = Fixed if is_dataclass(value) and getattr(value, "__dataclass_params__").frozen else ByName  # noqa: B009
     for name, content in list(getattr(value, "__dict__", {}).items()):
         if type(content) is dict and not name.startswith("_") and all(isinstance(key, str) for key in content):
-            object.__setattr__(value, name, ByName(content, f"{type(value).__name__}.{name}"))
+            object.__setattr__(value, name, kind(content, f"{type(value).__name__}.{name}"))

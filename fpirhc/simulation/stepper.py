@@ -132,7 +132,7 @@ class Stepper(NumbersNow, Checked):
         self.signals: Layout = composite.trace
         self.measures = measures(problem, ready)  # names of the raw measurements
         self.why_failed = ""
-        self._title = f"{problem.name}, {name_in_task(controller)}"
+        self._title = f"{problem.name or 'problem'}, {name_in_task(controller)}"
         self._may_fail = composite.opaque  # scalar code cannot fail
         function = backend.function if backend else self.function
         model = ready.plant_model(problem)

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName
-from fpirhc.fields.checked import ByName
+from fpirhc.errors import InvalidName, NotSupported
+from fpirhc.fields.checked import ByName, Fixed
 from fpirhc.problem_files.problem_file import load_problem
 
 TASK = load_problem("two_mass")
@@ -132,9 +132,13 @@ def test_what_is_found_by_name_is_a_dictionary():
         entries: Mapping[str, Any]
 
     plain = {"a": 1.0, "b": {"c": 2.0}}
-    named = ByName(plain, "here")
+    named, fixed = ByName(plain, "here"), Fixed(plain, "here")
     forms: tuple[Any, ...] = (
         named,
+        fixed,
+        deepcopy(fixed),
+        pickle.loads(pickle.dumps(fixed)),
+        asdict(Holder(fixed))["entries"],
         deepcopy(named),
         pickle.loads(pickle.dumps(named)),
         asdict(Holder(named))["entries"],
@@ -150,3 +154,20 @@ def test_what_is_found_by_name_is_a_dictionary():
     assert {**named, "d": 0} == named | {"d": 0} == {**plain, "d": 0}
     plain["a"] = 5.0
     assert named["a"] == 1.0
+
+
+def test_what_a_frozen_value_holds_stays():
+    """A start that was changed in place was shown, and the run began at the old one; the error says what to do."""
+    problem, body = TASK.problem, TASK.problem.plant.parameters
+    with pytest.raises(NotSupported, match=r"Problem\.start cannot be changed in place.*\{\*\*start, name: value\}"):
+        problem.start["q1"] = 1.0
+    for change in (
+        body.clear,
+        body.popitem,
+        lambda: body.pop("m1"),
+        lambda: body.update({}),
+        lambda: body.setdefault("a"),
+    ):
+        with pytest.raises(NotSupported, match=r"Plant\.parameters cannot be changed"):
+            change()
+    assert replace(problem, start={**problem.start, "q1": 1.0}).start_state[0] == 1.0

@@ -17,6 +17,7 @@ from fpirhc.report.html import chart_data
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
 from fpirhc.review.prediction import NominalRuns
+from fpirhc.review.questions.margins import MARGINS
 from fpirhc.review.questions.reality import LAG, LOOP, RESONANCE, extra_modes, real_loops, real_points
 
 TAU, FREQUENCY = 0.02, 300.0  # s, rad/s
@@ -88,6 +89,23 @@ def test_lag_rule_at_its_edge(order):
     assert below.numbers["lag"] == pytest.approx(TAU, rel=1e-9)
     assert below.numbers["room"] == pytest.approx(0.99, rel=1e-9)
     assert (below.verdict, above.verdict) == ("caution", "no")
+
+
+def test_margins_of_the_real_pair():
+    """With the plant as its own reality they are those of the model; a lag that the model lacks takes phase, 70 to 18 degrees."""
+    controller = adapted(6.0, 0.3)
+    own, own_plant, late = (
+        answer(problem, controller, question).numbers
+        for problem, question in (
+            (task(), MARGINS),
+            (task(reality=fp.Reality(task().plant)), LOOP),
+            (task(reality=fp.Reality(lagged())), LOOP),
+        )
+    )
+    for name in ("gain_margin", "phase_margin", "delay_margin"):
+        assert own_plant[name] == pytest.approx(own[name], rel=1e-6)
+    assert late["phase_margin"] < 0.5 * own["phase_margin"]
+    assert late["delay_margin"] < 0.9 * own["delay_margin"]
 
 
 @pytest.mark.parametrize("damping", [0.2, 0.3])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -388,3 +389,13 @@ def test_figures_of_a_problem_file_stand_in_its_table(tmp_path, monkeypatch, cap
     results = json.loads((tmp_path / "out" / "results.json").read_text())["controllers"]
     assert results["CTC"]["time_over"] == pytest.approx(3.93, abs=0.01)
     assert results["CTC+FPI (eq 3)"]["largest_force"] == pytest.approx(86.63, abs=0.01)
+
+
+def test_metrics_come_from_other_processes():
+    """Pickled and read again they are the same numbers of the same metrics."""
+    task = fp.load_problem("two_mass")
+    problem = replace(task.problem, duration=0.05, measure_from=0.0)
+    metrics = fp.measure(problem, fp.simulate(problem, task.controllers["CTC"], seed=0, compiled=False))
+    again = pickle.loads(pickle.dumps(metrics))
+    assert [(m.name, e, repr(v)) for m, e, v in again] == [(m.name, e, repr(v)) for m, e, v in metrics]
+    assert all(again.entries[name] is metric for name, metric in metrics.entries.items())

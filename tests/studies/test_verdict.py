@@ -19,7 +19,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import asset, css_class
 from fpirhc.report.terminal import STYLES
 from fpirhc.simulation.metrics import Metrics, known_metrics
-from fpirhc.studies.comparison.changes import Outcome
+from fpirhc.studies.comparison.changes import Finding, Outcome
 from fpirhc.studies.comparison.compare import _pair, compare
 from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.pairwise import partners
@@ -332,3 +332,29 @@ def test_green_is_for_better_alone():
     assert [o for o in Outcome if "green" in STYLES[o]] == [Outcome.BETTER]
     assert css_class(None) == "remark"
     assert STYLES[None] == ""
+
+
+def with_errors(pair, plain, adaptive) -> Finding:
+    """The verdict on runs with these errors, of which the first is the larger one."""
+    entries = []
+    for source, error in zip(pair, (plain, adaptive), strict=True):
+        columns = [source.run.layout.slice("true_error")]
+        log = source.run.log.copy()
+        log[:, columns[0]] = np.resize(error, (len(log), 1))
+        entries.append(entry(replace(source, run=replace(source.run, log=log)), y=float(np.sqrt(np.mean(error**2)))))
+    return findings(entries, {}, None)[0]
+
+
+def test_a_loop_that_only_has_not_failed_yet_is_no_clear_success(pair):
+    """An error that grows as an exponential is doubtful; one that grows as a power of time, or jumps once, is not."""
+    t = np.linspace(0.0, 1.0, pair[0].run.cycles)
+    swings = np.sin(60 * t)
+    unstable, steady = 1e-3 * np.exp(5 * t) * swings, 0.1 * swings
+    both = with_errors(pair, 10 * unstable, unstable)
+    assert both.outcome is Outcome.DOUBTFUL
+    assert both.text.startswith("The error of plain and adaptive grows from quarter to quarter of the run, ")
+    alone = with_errors(pair, 10 * unstable, 1e-3 * steady)
+    assert alone.outcome is Outcome.BETTER
+    assert "The error of plain grows from quarter to quarter" in alone.text
+    for calm in (1e-3 * steady, 1e-2 * t**4 * swings, 1e-2 * (1 + 30 * (t > 0.6)) * swings, 1e-2 * t * swings):
+        assert "quarter" not in with_errors(pair, steady, calm).text

@@ -6,7 +6,7 @@ Theory: docs/theory-questions.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,12 +61,11 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         return replace(_outside(loops.radii, text, {"radius": radius}, learns=loops.learns), change=change)
     # Loops of plans are few, and differ more.
     places = range(len(loops.loops)) if len(first.cycles) > 1 else sorted({0, int(np.argmax(loops.radii))})
-    sizes = [margins(loops.loops[k], i) for k in places for i in range(len(problem.plant.inputs))]
-    gain, phase, delay = (min(column) for column in zip(*sizes, strict=True))
     if len(first.cycles) > 1:
         text += f" per cycle, over the {len(first.cycles)} cycles from plan to plan"
-    numbers = {"radius": radius, "gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
-    text += f"; {_sizes(gain, phase, delay, problem)}"
+    said, sizes = smallest_margins([loops.loops[k] for k in places], problem)
+    numbers, text = {"radius": radius, **sizes}, f"{text}; {said}"
+    gain, phase = sizes["gain_margin"], sizes["phase_margin"]
     if loops.learns:
         text += ", before the controller has learned anything"
     if any(one.hidden.any() for one in loops.loops):
@@ -75,6 +74,15 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
     gentler = "weigh the inputs more" if planned else "lower the rate"
     change = SLOWER if learner else f"{_LOWER}, or {gentler}." if adapts else f"{gentler.capitalize()}."
     return Answer(MARGINS, Verdict.YES if good else Verdict.CAUTION, text, "" if good else change, numbers)
+
+
+def smallest_margins(loops: Sequence[LinearLoop], problem: Problem) -> tuple[str, dict[str, float]]:
+    """Return the smallest margins of the inputs of some loops, in words and as numbers; nothing of loops that are too large."""
+    if max(one.cycles[0].dynamics.shape[1] for one in loops) > _LARGEST:
+        return "", {}
+    sizes = [margins(one, i) for one in loops for i in range(len(problem.plant.inputs))]
+    gain, phase, delay = (float(min(column)) for column in zip(*sizes, strict=True))
+    return _sizes(gain, phase, delay, problem), {"gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
 
 
 def _poles_advice(loops: Loops, adapts: bool) -> str:
@@ -244,6 +252,8 @@ def _first(poles: Callable[[np.ndarray], np.ndarray], most: float, enough: float
 def _asked(case: Case) -> Answer:
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
     answer = margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
+    if case.grid.real is not None:
+        answer = replace(answer, evidence=f"{answer.evidence}; of the model by itself, without the reality")
     late = adapts and case.controller.deformation.iteration.slows_desired
     return replace(answer, change=answer.change.replace(_LOWER, _PASSING, 1)) if late else answer
 

@@ -7,7 +7,7 @@ The eigenvalues of the response Jacobian do not decide there: the poles of the w
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -26,6 +26,7 @@ from fpirhc.review.by_run import by_run
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Points, thinned, usable
 from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.questions.margins import smallest_margins
 from fpirhc.review.questions.speed import law_of
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
@@ -245,14 +246,15 @@ def real_pair_converges(case: Case) -> Answer | None:
     if case.grid.real is None:
         return None
     try:
-        adapted = max(one.radius for one in real_loops(case.grid, case.controller))
+        loops = real_loops(case.grid, case.controller)
+        adapted = max(one.radius for one in loops)
         bare = max(one.radius for one in real_loops(case.grid, without_deformation(case.controller)))
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return by_run(case, LOOP, f"no linear loop of the real pair: {error}")
     text = f"the slowest or fastest growing mode is multiplied by {adapted:.6g} per cycle, without adaptation by {bare:.6g}"
     numbers = {"radius": adapted, "bare_radius": bare}
     if adapted < 1:
-        return Answer(LOOP, Verdict.YES, text, "", numbers)
+        return _with_margins(Answer(LOOP, Verdict.YES, text, "", numbers), loops, case.problem)
     whole = case.controller.deformation.mirror.lags
     lag = "the whole lag of the reality." if whole else "the reality's lag: ModelReferenced(map, lag=...)."
     change = f"Lower the gain, or pair through {lag}"
@@ -266,14 +268,22 @@ def plain_pair_converges(case: Case) -> Answer | None:
     if case.grid.real is None or case.controller.deformation.adapts:
         return None
     try:
-        radius = max(one.radius for one in real_loops(case.grid, case.controller))
+        loops = real_loops(case.grid, case.controller)
+        radius = max(one.radius for one in loops)
     except (FpirhcError, np.linalg.LinAlgError):
         return None
     text, numbers = f"the slowest or fastest growing mode is multiplied by {radius:.6g} per cycle", {"radius": radius}
     if radius < 1:
-        return Answer(LOOP, Verdict.YES, text, "", numbers)
+        return _with_margins(Answer(LOOP, Verdict.YES, text, "", numbers), loops, case.problem)
     change = "Lower the rate of the tracking law, or the weights of the plan."
     return Answer(LOOP, Verdict.CAUTION if radius < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
+
+
+def _with_margins(answer: Answer, loops: list[LinearLoop], problem: Problem) -> Answer:
+    """The answer with the margins of the real pair where its slowest mode is, which are not those of the model by itself."""
+    said, sizes = smallest_margins([max(loops, key=lambda one: one.radius)], problem)
+    numbers = {**answer.numbers, **sizes}
+    return replace(answer, evidence=f"{answer.evidence}; {said}", numbers=numbers) if said else answer
 
 
 LAG = "Does the tracking law leave room for the lag of the reality?"

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Literal
+from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 
@@ -85,6 +85,12 @@ class Metric(Checked):
                 f"metric {self.name!r}: expected a name of small letters, digits and '_', such as 'rms_error' or "
                 "'solve.worst_iterations'"
             )
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        """A known metric is pickled by its name, so that metrics of runs can come from other processes."""
+        from fpirhc.simulation.metrics.measuring import known_metric
+
+        return (known_metric, (self.name,)) if known_metric(self.name) is self else super().__reduce_ex__(protocol)
 
     @property
     def summed(self) -> Summed | None:

@@ -34,6 +34,11 @@ def known_metrics() -> tuple[Metric, ...]:
     return _ordered([*shipped, *installed])
 
 
+def known_metric(name: str) -> Metric | None:
+    """Return the known metric of this name, None without one."""
+    return next((metric for metric in known_metrics() if metric.name == name), None)
+
+
 def with_own_metrics(own: Iterable[Metric]) -> tuple[Metric, ...]:
     """Return the known metrics and the own ones of a problem file, in the order of their columns.
 

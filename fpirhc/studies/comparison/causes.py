@@ -111,6 +111,7 @@ def caveats(plain: Entry, adaptive: Entry, names: list[str], yardstick: Yardstic
     """Return the reasons not to trust a smaller error, each a sentence; empty where there is none."""
     sentences = (
         left_alone_is_better(plain, adaptive, names, yardstick),
+        growth(plain, adaptive) if _growth(adaptive) else "",
         plan_cause(plain, adaptive),
         stuck_cause(adaptive),
         limit_cause(plain, adaptive),
@@ -128,6 +129,45 @@ def left_alone_is_better(plain: Entry, adaptive: Entry, names: list[str], yardst
     who = f"{plain.name} and {adaptive.name} do" if both else f"{adaptive.name} does"
     errors = ", ".join(f"{value:.3g}{_unit(adaptive, n)} in {n}" for n, value in alone.items())
     return f"{who} worse than the plant left alone, whose input stays as it was before the run: rms error {errors}."
+
+
+def growth(plain: Entry, adaptive: Entry) -> str:
+    """Return a sentence where an error grows all through a run, as that of an unstable loop does; else nothing.
+
+    An error that follows a faster and faster reference grows less and less in proportion.
+    """
+    growing = {entry.name: factor for entry in (plain, adaptive) if (factor := _growth(entry))}
+    if not growing:
+        return ""
+    names, factors = " and ".join(growing), " and ".join(map(times, growing.values()))
+    return (
+        f"The error of {names} grows from quarter to quarter of the run, {factors} from the first to the last, as in an unstable "
+        "loop: ratios are those of this duration, and the review says whether the loop is stable."
+    )
+
+
+_QUARTERS = 4
+_FEW = 40  # cycles of a run that says nothing about growth
+_GROWN = 8.0  # times, from the first quarter to the last
+_STEADY = 1.5  # times, in each of the last two
+_SLOWING = 0.6  # of the growth in the first step, below which the growth is that of a power of time
+
+
+def grows_alone(plain: Entry, adaptive: Entry) -> str:
+    """Return the sentence of `growth` where only the run without adaptation grows, which is no reason against the other."""
+    return "" if _growth(adaptive) else growth(plain, adaptive)
+
+
+def _growth(entry: Entry) -> float:
+    """By how much the error grows from the first quarter to the last, where it does so as an exponential; else 0."""
+    errors = np.abs(entry.run["true_error"])
+    if entry.run.stop is not None or len(errors) < _FEW:
+        return 0.0
+    largest = np.array([part.max(axis=0) for part in np.array_split(errors, _QUARTERS)])
+    steps = largest[1:] / np.maximum(largest[:-1], 1e-300)
+    exponential = (steps[0] > 1) & (steps[1:] >= _STEADY).all(axis=0) & (steps[-1] >= _SLOWING * steps[0])
+    grown = np.where(exponential, largest[-1] / np.maximum(largest[0], 1e-300), 0.0)
+    return float(grown.max()) if grown.max() >= _GROWN else 0.0
 
 
 def _unit(entry: Entry, name: str) -> str:

@@ -20,6 +20,7 @@ from fpirhc.studies.comparison.causes import (
     causes,
     caveats,
     effort_cause,
+    grows_alone,
     leaves_reference,
     left_alone_is_better,
     movement,
@@ -149,7 +150,8 @@ def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
         why = causes(plain, adaptive)
         return Finding(text + (f" {worse}{_of(adaptive, why)}" if worse else why), outcome, pair, ratios)
     against = caveats(plain, adaptive, list(counted), yardstick)
-    text += "".join(f" {s}" for s in (movement(plain, adaptive), effort_cause(adaptive)) if s)
+    more = movement(plain, adaptive), effort_cause(adaptive), grows_alone(plain, adaptive)
+    text += "".join(f" {sentence}" for sentence in more if sentence)
     against = _of(adaptive, against)
     return Finding(f"{against} {text}" if against else text, Outcome.DOUBTFUL if against else outcome, pair, ratios)
 
