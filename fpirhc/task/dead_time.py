@@ -25,7 +25,10 @@ MEASUREMENT = "measurement"  # the name beside those of the inputs
 
 @dataclass(frozen=True, eq=False)
 class DeadTime(Checked):
-    """Dead time in seconds.
+    """Dead time, in the plant's unit of time.
+
+    A part of a cycle is interpolated: over a cycle the plant has the mean of two commands, weighted by their parts of it, and not
+    one after the other; a measurement is that between two samples.
 
     Args:
         inputs: dead time by input; zero where not named.
