@@ -124,7 +124,6 @@ class Problem(Checked):
         instants = np.array([0.0, self.period])
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         checks = (
-            lambda: self._check_disturbances(instants),
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
             lambda: _check_reference(self),
@@ -133,6 +132,9 @@ class Problem(Checked):
             lambda: self.sensing.check(plant),
             lambda: self.reality.check(plant, *self._needed) if self.reality else None,
         )
+        for name, one in self.disturbances.items():
+            with mistakes.caught(f"disturbances: '{name}': "):
+                one.values(instants, np.random.default_rng(0))
         for check in checks:
             with mistakes.caught():
                 check()
@@ -308,14 +310,6 @@ class Problem(Checked):
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
         plant = self.real_plant
         return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
-
-    def _check_disturbances(self, instants: np.ndarray) -> None:
-        """Raise if a disturbance has no values."""
-        for name, one in self.disturbances.items():
-            try:
-                one.values(instants, np.random.default_rng(0))
-            except FpirhcError as error:
-                raise InvalidProblem(f"disturbances: '{name}': {error}") from error
 
     def _check_derivatives(self, instants: np.ndarray) -> None:
         """Raise if the disturbance of an output does not have the derivatives that are needed."""
