@@ -250,6 +250,10 @@ class Undeformed(Controller, ABC):
 class ControllerWrapper(Controller, ABC):
     """Contract: a controller around another one, with its deformation."""
 
+    once: ClassVar[bool] = (
+        False  # whether it cannot stand around another one of its kind, because its signals have fixed names
+    )
+
     controller: Controller
 
     @property
@@ -324,7 +328,7 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
 def _require_once(wrapper: Controller) -> None:
     inside = wrapper.inner
     while inside is not None:
-        if type(inside) is type(wrapper):
+        if getattr(wrapper, "once", False) and type(inside) is type(wrapper):
             name = type(wrapper).__name__
             raise NotSupported(
                 f"{name} stands around another {name}; one is enough: leave one out, and give the other the settings of both"

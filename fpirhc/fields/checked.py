@@ -406,6 +406,7 @@ class Fixed(ByName[Value]):
     """
 
     def _stays(self, *_: object, **__: object) -> NoReturn:
+        """Raise NotSupported: nothing changes in place."""
         raise NotSupported(
             f"{self._where} cannot be changed in place, where it would have no effect; make another value with "
             f"dataclasses.replace(...) and a copy, {{**{self._where.rpartition('.')[2]}, name: value}}"

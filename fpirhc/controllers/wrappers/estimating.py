@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import casadi as ca
 
@@ -46,6 +47,8 @@ class Estimating(ControllerWrapper):
         at_once: whether a new estimate changes the command in every cycle. A receding horizon otherwise holds the inputs of its
             plan, which uses the estimate of the cycle in which it was made.
     """
+
+    once: ClassVar[bool] = True
 
     estimator: ParameterEstimator
     dead_time: DeadTime | None = field(default=None, kw_only=True, metadata={"setting": "where given"})

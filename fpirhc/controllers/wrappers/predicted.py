@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import cast
+from typing import ClassVar, cast
 
 import casadi as ca
 import numpy as np
@@ -158,6 +158,8 @@ class Predicted(ControllerWrapper):
     Raises:
         InvalidValue: a dead time that is negative or not finite; a longest one that is shorter than their sum.
     """
+
+    once: ClassVar[bool] = True
 
     inputs: NotNegative
     measurement: NotNegative = 0.0

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Any, Literal, SupportsIndex
+from typing import Literal, SupportsIndex
 
 import numpy as np
 
@@ -86,7 +86,7 @@ class Metric(Checked):
                 "'solve.worst_iterations'"
             )
 
-    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[object, ...]:
         """A known metric is pickled by its name, so that metrics of runs can come from other processes."""
         from fpirhc.simulation.metrics.measuring import known_metric
 

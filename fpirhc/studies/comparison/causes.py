@@ -167,7 +167,8 @@ def _growth(entry: Entry) -> float:
     steps = largest[1:] / np.maximum(largest[:-1], 1e-300)
     exponential = (steps[0] > 1) & (steps[1:] >= _STEADY).all(axis=0) & (steps[-1] >= _SLOWING * steps[0])
     grown = np.where(exponential, largest[-1] / np.maximum(largest[0], 1e-300), 0.0)
-    return float(grown.max()) if grown.max() >= _GROWN else 0.0
+    most = float(grown.max(initial=0.0))
+    return most if most >= _GROWN else 0.0
 
 
 def _unit(entry: Entry, name: str) -> str:
