@@ -197,3 +197,12 @@ def test_white_noise_of_the_stated_deviation_is_averaged():
     """Of a normal detail 0.3 % pass three deviations, so the deviation is near that of the mean, a quarter for four levels."""
     noise = np.random.default_rng(2).normal(size=4000)
     assert 0.25 < np.std(denoised(noise, noise=1.0)[16:]) < 0.4
+
+
+def test_where_every_filter_makes_the_loop_grow_a_gain_without_one_is_suggested(monkeypatch):
+    """As behind an arm whose second eigenvalue is a third of the first: noise grew with every filter, and nothing was suggested."""
+    steps = Noisy.steps
+    monkeypatch.setattr(Noisy, "steps", lambda loops, gain, pole: steps(loops, gain, pole) + (np.inf if pole else 0.0))
+    found, without = (fp.suggest(noisy(), planning(), chatter=BUDGET, ringing=ringing) for ringing in (6.0, 0.0))
+    assert found.pole == 0
+    assert found.effective_gain == without.effective_gain != 0

@@ -93,7 +93,7 @@ def suggest(
 
     Parameters: `chatter`: rms step of the command per cycle that noise may cause, in the input's unit, by input or one for all;
     `noise`: standard deviation of the measured response by controlled coordinate, by default that of the problem's sensors;
-    `ringing` kappa = a lambda / (1 - p), 0 for no filter.
+    `ringing` kappa = a lambda / (1 - p), 0 for no filter; where no gain is within the budget with a filter, one without is sought.
 
     Raises:
         InvalidValue: a budget that is not positive, a negative noise or ringing, no noise, as of a response that is estimated,
@@ -123,10 +123,17 @@ def _within_budget(
         spectrum_near(grid, believed, grid.draws[:1], ready.deformation.iteration, near=False)
     )
 
-    def steps(size: float) -> np.ndarray:
-        return noisy.steps(sign * size, filter_pole(size * largest, ringing))
+    def sought(kappa: float) -> float:
+        return _largest_within(
+            lambda size: noisy.steps(sign * size, filter_pole(size * largest, kappa)), budget, 1 / largest
+        )
 
-    size = _largest_within(steps, budget, 1 / largest)
+    try:
+        size = sought(ringing)
+    except NotContractive:
+        if not ringing:
+            raise
+        size, ringing = sought(0.0), 0.0  # with small eigenvalues of coupled responses a filter makes the loop grow
     pole = filter_pole(size * largest, ringing)
     deformation = _with(ready.deformation, sign * size, pole)
     own = getattr(deformation, deformation.gain_name, None)
