@@ -37,6 +37,8 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
 from fpirhc.status import STOPPED, Status
 from fpirhc.symbolic.block import Block, Delay, every
+from fpirhc.symbolic.driver import plans_are_compiled
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
 from fpirhc.symbolic.live import (
@@ -178,13 +180,15 @@ class RecedingHorizon(Controller):
         self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        problem = self.planner.planned(problem)
+        task, problem = problem, self.planner.planned(problem)
         assert problem.horizon is not None
         plant = problem.plant
         cycles = cycles_per_plan(problem.horizon, problem.period)
         before, after, late, remembered = self.replanning.parts(problem)
         room = _room(problem, self.replanning)
-        plan = every(_plan_block(problem, self, room), cycles)
+        same = task, self.optimiser, self.on_failure, self.replanning, self.cost, self.margins
+        others = self.deformation.adapts, self.follows_model, plans_are_compiled()
+        plan = _PLANS.of(same, others, lambda: every(_plan_block(problem, self, room), cycles))
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
         if self.planner.starts_consistent(plant):
             before, after = (at_consistent_start(plant, some) for some in (before, after))
@@ -200,6 +204,9 @@ class RecedingHorizon(Controller):
         if room is not None:
             delays.append(Delay(replace(command_before(problem), name=_PLANNED_BEFORE), "planned"))
         return blocks, delays
+
+
+_PLANS: Latest[Block] = Latest(8)  # controllers that differ in their deformation alone plan alike
 
 
 def _optimal_control(

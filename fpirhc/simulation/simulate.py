@@ -348,7 +348,7 @@ def run_cycles(
     after, sent = evaluator.results[0], evaluator.results[2:]
     memory[:] = start
     talk.begin(read[len(tables) :])
-    for at, end in _pieces(cycles, count, [cycle for cycle, _, _ in patches]):
+    for at, end in pieces(cycles, count, [cycle for cycle, _, _ in patches]):
         for cycle, places, values in patches:
             if cycle == at:
                 memory[places] = values
@@ -383,14 +383,14 @@ def _padded(problem: Problem, patches: Sequence[Patch]) -> int:
     return (-(-problem.cycles // chunk) + (1 if patches else 0)) * chunk
 
 
-def _pieces(cycles: int, most: int, cuts: Sequence[int]) -> list[tuple[int, int]]:
-    """(first cycle, end) of the calls that make up a run: so many cycles at most, and none goes beyond a change."""
-    pieces, at, ends = [], 0, sorted({c for c in cuts if 0 < c < cycles} | {cycles})
+def pieces(cycles: int, most: int, cuts: Sequence[int]) -> list[tuple[int, int]]:
+    """Return (first cycle, end) of the calls that make up a run: so many cycles at most, and none goes beyond a cut."""
+    calls, at, ends = [], 0, sorted({c for c in cuts if 0 < c < cycles} | {cycles})
     for end in ends:
         while at < end:
-            pieces.append((at, min(at + most, end)))
-            at = pieces[-1][1]
-    return pieces
+            calls.append((at, min(at + most, end)))
+            at = calls[-1][1]
+    return calls
 
 
 def _failed(at: int, count: int, problem: Problem, why: str) -> str:

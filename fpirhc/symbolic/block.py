@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, groupby
 from typing import cast
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.expression import FINITE, Expression, Matrix, Signals, Value, expression, kind, total
 from fpirhc.symbolic.layout import Kind, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX as SETTING
@@ -179,8 +180,29 @@ class Composite:
     reads: Layout
     memory: Layout
     trace: Layout
-    graph: ca.Function
     outputs: tuple[str, ...] = ()
+    interpreted: bool = False  # whether the virtual machine runs it
+
+    @cached_property
+    def graph(self) -> ca.Function:
+        """The step as a graph of calls."""
+        inputs = {s.name: ca.MX.sym(s.name, s.size) for s in self.reads.signals}
+        remembered, next_memory = ca.MX.sym("memory", self.memory.size), dict[str, ca.MX]()
+        known: dict[str, ca.MX] = {**self.memory.split(remembered), **inputs}
+        # The virtual machine takes longer to enter a block than to run it.
+        inlines = self.interpreted and self.opaque
+        for block in _fewer(self.blocks) if inlines else self.blocks:
+            call(block, known, next_memory, inlines=inlines and block.opaque)
+        for delay in self.delays:
+            next_memory[delay.now.name] = known[delay.source]
+        returned = [self.memory.join(next_memory), self.trace.join(known), *[known[o] for o in self.outputs]]
+        return ca.Function(
+            PREFIX + self.name,
+            [remembered, *inputs.values()],
+            [ca.densify(ca.MX(r)) for r in returned],
+            ["memory", *_identifiers(inputs)],
+            ["memory_next", "trace", *self.outputs],
+        )
 
     @cached_property
     def function(self) -> ca.Function:
@@ -262,24 +284,53 @@ def compose(
     memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
     reads = reads + Layout(tuple([s for s in open_settings(blocks).signals if s.name not in held]))
-    inputs = {s.name: ca.MX.sym(s.name, s.size) for s in reads.signals}
-    remembered = ca.MX.sym("memory", memory.size)
-    known: dict[str, ca.MX] = {**memory.split(remembered), **inputs}
-    next_memory: dict[str, ca.MX] = {}
-    for block in blocks:
-        call(block, known, next_memory)
+    _require_wired(reads, memory, blocks, delays)
     trace = Layout(tuple([s for b in blocks for s in b.writes.signals if not s.name.startswith("_")]))
+    parts = name, tuple(blocks), tuple(delays), reads, memory, trace, tuple(outputs)
+    return Composite(*parts, interpreted=plans_are_compiled())
+
+
+def _require_wired(reads: Layout, memory: Layout, blocks: Sequence[Block], delays: Sequence[Delay]) -> None:
+    """Raise where a signal is read that is not there or has another size, or is written twice."""
+    sizes = {s.name: s.size for s in (*memory.signals, *reads.signals)}
+    for block in blocks:
+        for s in block.inputs.signals:
+            _require_size(f"block '{block.name}'", s, s.name, sizes)
+        for s in block.writes.signals:
+            if s.name in sizes:
+                raise InvalidName(f"block '{block.name}' writes '{s.name}', which is already written")
+            sizes[s.name] = s.size
     for delay in delays:
-        next_memory[delay.now.name] = _lookup(f"delay '{delay.now.name}'", delay.now, delay.source, known)
-    returned = [memory.join(next_memory), trace.join(known), *[known[o] for o in outputs]]
-    graph = ca.Function(
-        PREFIX + name,
-        [remembered, *inputs.values()],
-        [ca.densify(ca.MX(r)) for r in returned],
-        ["memory", *_identifiers(inputs)],
-        ["memory_next", "trace", *outputs],
-    )
-    return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, graph, tuple(outputs))
+        _require_size(f"delay '{delay.now.name}'", delay.now, delay.source, sizes)
+
+
+def _fewer(blocks: Sequence[Block]) -> list[Block]:
+    """The same steps with scalar blocks beside each other as one."""
+    result: list[Block] = []
+    for apart, some in groupby(blocks, key=lambda block: block.opaque or bool(open_settings([block]).names)):
+        group = list(some)
+        result += group if apart or len(group) == 1 else [_joined(group)]
+    return result
+
+
+def _joined(blocks: Sequence[Block]) -> Block:
+    """Blocks of scalar code, in order, as one block."""
+    memory, written = [s for b in blocks for s in b.memory.signals], list[Signal]()
+    reads: dict[str, Signal] = {}
+    for block in blocks:
+        held = {s.name for s in (*memory, *written)}
+        reads |= {s.name: s for s in block.reads.signals if s.name not in held}
+        written += block.writes.signals
+
+    def step(s: Signals) -> dict[str, Expression]:
+        known, following = dict(vars(s)), dict[str, Expression]()
+        for block in blocks:
+            call(block, known, following)
+        shared = ca.cse([known[w.name] for w in written] + [following[m.name] for m in memory])
+        return dict(zip([*(w.name for w in written), *(f"{m.name}_next" for m in memory)], shared, strict=True))
+
+    name = "_".join(block.name for block in blocks)
+    return Block(name, Layout(tuple(reads.values())), Layout(tuple(written)), step, Layout(tuple(memory)))
 
 
 def scalar_code(function: ca.Function) -> ca.Function:
@@ -289,24 +340,12 @@ def scalar_code(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
 
 
-def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix]) -> None:
+def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix], *, inlines: bool = False) -> None:
     """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory."""
     function, inputs = block._built
-    arguments = []
-    for s in inputs.signals:
-        value = known.get(s.name)
-        if value is None or value.numel() != s.size:
-            value = _lookup(f"block '{block.name}'", s, s.name, known)
-        arguments.append(value)
-    for m in block.memory.names:
-        arguments.append(known[m])
-    returned = function(*arguments)
-    # A Function returns a tuple of several results, one bare result, and None for none.
-    values = returned if isinstance(returned, tuple) else (returned,) * len(block._results)
+    values = function.call([known[name] for name in (*inputs.names, *block.memory.names)], inlines, False)
     results = cast(dict[str, Matrix], dict(zip(block._results, values, strict=True)))
     for name in block.writes.names:
-        if name in known:
-            raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
         known[name] = results[name]
     for m in block.memory.names:
         next_memory[m] = results[f"{m}_next"]
@@ -391,10 +430,8 @@ def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
     return run, hold
 
 
-def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, Matrix]) -> Matrix:
-    if source not in known:
-        raise InvalidName(f"{reader} reads '{source}', which no earlier block writes.{nearest(source, known)}")
-    value = known[source]
-    if value.numel() != signal.size:
-        raise InvalidShape(f"{reader} reads '{source}' with {signal.size} entries, but it has {value.numel()}")
-    return value
+def _require_size(reader: str, signal: Signal, source: str, sizes: Mapping[str, int]) -> None:
+    if source not in sizes:
+        raise InvalidName(f"{reader} reads '{source}', which no earlier block writes.{nearest(source, sizes)}")
+    if sizes[source] != signal.size:
+        raise InvalidShape(f"{reader} reads '{source}' with {signal.size} entries, but it has {sizes[source]}")

@@ -25,8 +25,9 @@ from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
 from fpirhc.optimisers.base import FEASIBLE
 from fpirhc.simulation.linearise.late_loop import Late, LateLoop
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
-from fpirhc.simulation.linearise.slopes import LARGEST, Directions, Step, Way, along, reached
+from fpirhc.simulation.linearise.slopes import CALL, LARGEST, STATE_BEFORE, Directions, Step, Way, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.simulation.simulate import pieces
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.driver import compiled_plans
@@ -142,7 +143,7 @@ class AskedLoop:
         self._statuses = [k for k, c in enumerate(self.loop.trace.columns) if c == "status"]
         self._violations = [k for k, c in enumerate(self.loop.trace.columns) if c.endswith("solve.feasibility")]
         self._errors = self.loop.trace.slice("true_error" if "true_error" in names else "error")
-        self._state = self.loop.memory.slice("_state_before")
+        self._state = self.loop.memory.slice(STATE_BEFORE)
         self._request = [k for k, c in enumerate(self.loop.memory.columns) if "_deformed_last." in c]
         self._phases = [k for k, kind in enumerate(self.loop.memory.kinds) if kind == Kind.PHASE]
         self._gains, self._poles, self._noises = (
@@ -201,7 +202,6 @@ class AskedLoop:
         changed[self._gains] = gain
         return changed
 
-    @np.errstate(over="ignore")  # a scalar product that is infinite is not below its bound
     def run(
         self, memory: np.ndarray, cycles: int, led: np.ndarray | None = None, request: np.ndarray | None = None
     ) -> Passage:
@@ -214,28 +214,28 @@ class AskedLoop:
                 iteration that does not converge is near its fixed point too; None: none is.
         """
         memories, traces = np.empty((cycles + 1, memory.size)), np.empty((cycles, self.loop.trace.size))
-        memories[0], end = memory, cycles
-        leads = None if led is None else np.isfinite(led)
-        some, still = leads is not None and not leads.all(), np.zeros(self._step.width)
-        asks = request is not None and len(self._request) == request.size
-        for k in range(cycles):
-            memory_next, trace = memories[k + 1], traces[k]
-            self._step.into(memories[k], still, memory_next, trace)
-            # A scalar product takes less time than a look at every entry.
-            if not (memory_next.dot(memory_next) < _AWAY**2 or (np.abs(memory_next) < _AWAY).all()):
-                end = k
+        memories[0], end, run = memory, cycles, self._step.led
+        (begin, put), (after, trace, states) = run.arguments, (one.reshape(CALL, -1) for one in run.results)
+        put = put.reshape(CALL, -1)
+        put[:] = np.nan
+        asked = self.warm + 1 if request is not None and len(self._request) == request.size else -1
+        looks = range(_LOOK, cycles + 1, _LOOK) if led is not None else ()
+        for at, until in pieces(cycles, CALL, [asked, *looks]):
+            begin[:] = memories[at]
+            if led is not None:
+                put[: until - at] = led[at:until]
+            run.evaluate()
+            sizes = np.maximum(np.abs(after).max(axis=1), np.abs(states).max(axis=1, initial=0.0))[: until - at]
+            memories[at + 1 : until + 1], traces[at:until] = after[: until - at], trace[: until - at]
+            if not (sizes < _AWAY).all():
+                end = at + int(np.argmin(sizes < _AWAY))
                 break
-            if led is not None and leads is not None and some:
-                np.copyto(memory_next[self._state], led[k], where=leads[k])
-            elif led is not None:
-                memory_next[self._state] = led[k]
-            if asks and k == self.warm:
-                memory_next[self._request] = request
-            if led is not None and k % _LOOK == _LOOK - 1:
-                at_rest = self._at_rest(traces[: k + 1])
-                if at_rest is not None:
-                    end = at_rest
-                    break
+            if until == asked:
+                memories[until, self._request] = request
+            at_rest = self._at_rest(traces[:until]) if until in looks else None
+            if at_rest is not None:
+                end = at_rest
+                break
         sent = np.isfinite(traces[:end, self._arriving]).all(axis=1)
         end = end if sent.all() else int(np.argmin(sent))
         return Passage(memories[: end + 1], traces[:end])

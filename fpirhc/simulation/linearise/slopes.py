@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import casadi as ca
@@ -16,11 +17,14 @@ import numpy as np
 from fpirhc.errors import NoAnswer, NotSupported
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.expression import FINITE, kind
 
 _STEP = 2.0**-19  # of a deviation, in scales: above rounding, and below what makes a line search choose another share
 _NEW = 1e-4  # what is new in a direction of length 1, below which it is left out
 _ROUNDING = 1e-9  # derivative in scales
 LARGEST = 400  # directions
+CALL = 10  # cycles of a run in one call
+STATE_BEFORE = "_state_before"  # in the memory: the state of the plant that moves
 
 Way: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -49,6 +53,14 @@ class Step:
         self._evaluator.evaluate()
         memory_next[:], trace[:] = self._evaluator.results
 
+    @cached_property
+    def led(self) -> Evaluator:
+        """Evaluator of `CALL` cycles: (memory, x (cycles, nx)) -> (memories, traces, states before they are put at x).
+
+        All but the first argument are tables with a row per cycle. A state whose x is NaN moves by itself.
+        """
+        return Evaluator(_led(self.loop).mapaccum("fpirhc_led_run", CALL, {"base": 5}))
+
     def way(self, memory: np.ndarray, scales: np.ndarray) -> Way:
         """Return the function (deviations in scales, w) -> (next deviations in scales, deviations of the trace), all by columns."""
         if not self.scalar:
@@ -68,24 +80,31 @@ class Step:
 
     def _evaluated(self, memory: np.ndarray, scales: np.ndarray) -> Way:
         def move(deviations: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            sizes = np.sqrt(np.maximum((deviations**2).sum(axis=0), (w**2).sum(axis=0)))
-            moved, traces = np.zeros_like(deviations), np.zeros((self.loop.trace.size, w.shape[1]))
-            some = np.flatnonzero(sizes)
-            h = _STEP / sizes[some, None]
-            by_memory, by_input = h * scales * deviations.T[some], h * w.T[some]
+            rows, inputs = deviations.T, w.T
+            sizes = np.sqrt(np.maximum((rows * rows).sum(axis=1), (inputs * inputs).sum(axis=1)))
+            lengths = np.where(sizes > 0, sizes, 1.0)[:, None]
+            h = _STEP / lengths
+            by_memory, by_input = h * scales * rows, h * inputs
             ahead, behind = self._each(memory + by_memory, by_input), self._each(memory - by_memory, -by_input)
-            moved[:, some] = ((ahead[0] - behind[0]) / (2 * h * scales)).T
-            traces[:, some] = ((ahead[1] - behind[1]) / (2 * h)).T
+            moved = (ahead[0] - behind[0]) / (2 * h * scales)
             _finite(moved)
-            return np.where(np.abs(moved) > _ROUNDING * sizes, moved, 0.0), traces
+            moved[np.abs(moved) <= _ROUNDING * lengths] = 0.0
+            return moved.T, ((ahead[1] - behind[1]) / (2 * h)).T
 
         return move
 
     def _each(self, memories: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The next memories and the traces of some memories and inputs, by rows."""
         memories_next, traces = np.empty_like(memories), np.empty((len(memories), self.loop.trace.size))
+        at, entering = self._evaluator.arguments[0], self._evaluator.arguments[self._entry]
+        (after, trace), evaluate, acts = self._evaluator.results, self._evaluator.evaluate, w.any()
+        entering[:] = 0.0
         for k in range(len(memories)):
-            self.into(memories[k], w[k], memories_next[k], traces[k])
+            at[:] = memories[k]
+            if acts:
+                entering[:] = w[k]
+            evaluate()
+            memories_next[k], traces[k] = after, trace
         return memories_next, traces
 
 
@@ -126,15 +145,17 @@ def reached(
         first: places of the plant's state.
         begun: those of each cycle's last way alone, from which the others go on; None: none are known.
     """
-    count, fixed = len(ways), ~free
+    count, fixed = len(ways), np.flatnonzero(~free)
     parts = [_Part(some, free.size, inputs, None if begun is None else begun[k]) for k, some in enumerate(ways)]
-    waiting = [list(np.eye(free.size)[list(always)]) for _ in ways]  # of each cycle, what is to be looked at
+    unit = np.eye(free.size)
+    waiting = [[unit[list(always)]] if always else [] for _ in ways]  # of each cycle, by rows, what is to be looked at
     if begun is None:
-        waiting[0].extend(np.eye(free.size)[first])
+        waiting[0].append(unit[first])
 
     def passed(place: int, moved: np.ndarray) -> None:
-        moved[fixed] = 0.0
-        waiting[(place + 1) % count].extend(moved.T)
+        if moved.size:
+            moved[fixed] = 0.0
+            waiting[(place + 1) % count].append(moved.T)
 
     for k, part in enumerate(parts):
         for kicked, _ in part.kicked if begun is None else part.kicked[:-1]:
@@ -144,7 +165,8 @@ def reached(
     while any(waiting):
         for place, part in enumerate(parts):
             some, waiting[place] = waiting[place], []
-            passed(place, part.moved(part.joined(some)))
+            if some:
+                passed(place, part.moved(part.joined(np.vstack(some))))
     return [part.directions for part in parts]
 
 
@@ -155,33 +177,34 @@ class _Part:
         self.ways, self.count, self._inputs, self._begun = ways, 0, inputs, begun
         others = ways if begun is None else ways[:-1]
         self.kicked = [_kicked(way, size, inputs) for way in others] + ([] if begun is None else begun.kicked)
-        self.basis = np.zeros((size, 0))
+        self._rows = np.zeros((0, size))  # of which the first ones are the directions
         self._images: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in ways]
 
     def caught_up(self) -> list[np.ndarray]:
         """Take over the directions that are known of the last way; return what the other ways make of them."""
         if self._begun is None:
             return []
-        self._append(self._begun.basis)
+        self._append(self._begun.basis.T)
         self._images[-1].append((self._begun.moved[0], self._begun.traces[0]))
         calm = np.zeros((self._inputs, self.count))
         for way, known in zip(self.ways[:-1], self._images, strict=False):
             known.append(way(self._begun.basis, calm))
         return [known[0][0].copy() for known in self._images[:-1]]
 
-    def joined(self, some: Sequence[np.ndarray]) -> np.ndarray:
-        """Add what is new in some deviations (n,); return these directions (n, m)."""
+    def joined(self, deviations: np.ndarray) -> np.ndarray:
+        """Add what is new in some deviations, by rows; return these directions (n, m)."""
         before = self.count
-        for one in _new(some, self.basis[:, :before]) if len(some) > 1 else some:
-            basis = self.basis[:, : self.count]
-            for _ in range(2):  # the second time for the rounding of the first
-                one = one - basis @ (one @ basis)
+        known = self._rows[:before]
+        rests = deviations - (deviations @ known.T) @ known
+        for one in rests[np.sqrt((rests * rests).sum(axis=1)) > _NEW]:
+            for rows in (self._rows[before : self.count], self._rows[: self.count]):  # the second time for rounding
+                one = one - (rows @ one) @ rows
             length = math.sqrt(one @ one)
             if length > _NEW:
                 if self.count >= LARGEST:
                     raise NotSupported(f"more than {LARGEST} entries of its memory move")
-                self._append((one / length)[:, None])
-        return self.basis[:, before : self.count].copy()
+                self._append(one[None, :] / length)
+        return self._rows[before : self.count].T.copy()
 
     def moved(self, directions: np.ndarray) -> np.ndarray:
         """Return what every way makes of directions (n, m) that were added, direction by direction."""
@@ -192,26 +215,31 @@ class _Part:
         return np.stack([known[-1][0] for known in self._images], axis=2).reshape(len(directions), -1)
 
     def _append(self, directions: np.ndarray) -> None:
-        rows, more = directions.shape
-        if self.count + more > self.basis.shape[1]:
-            wider = np.zeros((rows, 2 * (self.count + more) + 32), order="F")
-            wider[:, : self.count] = self.basis[:, : self.count]
-            self.basis = wider
-        self.basis[:, self.count : self.count + more] = directions
+        more = len(directions)
+        if self.count + more > len(self._rows):
+            known = self._rows[: self.count]
+            self._rows = np.zeros((2 * (self.count + more) + 32, known.shape[1]))
+            self._rows[: self.count] = known
+        self._rows[self.count : self.count + more] = directions
         self.count += more
 
     @property
     def directions(self) -> Directions:
         """Those that were found, and what each way makes of them."""
         moved, traces = ([np.hstack([one[k] for one in known]) for known in self._images] for k in (0, 1))
-        return Directions(self.basis[:, : self.count].copy(), moved, traces, self.kicked)
+        return Directions(self._rows[: self.count].T.copy(), moved, traces, self.kicked)
 
 
-def _new(some: Sequence[np.ndarray], basis: np.ndarray) -> Sequence[np.ndarray]:
-    """Those deviations (n,) of which orthonormal directions (n, m) leave more than rounding, looked at together."""
-    deviations = np.array(some)
-    rests = deviations - (deviations @ basis) @ basis.T
-    return deviations[np.linalg.norm(rests, axis=1) > _NEW]
+def _led(loop: Composite) -> ca.Function:
+    """Function (memory, x) -> (next memory with its state at x, trace, its state before that)."""
+    function, place = loop.function, loop.memory.slice(STATE_BEFORE)
+    own, x = (ca.SX.sym(n, place.stop - place.start) for n in ("own", "x"))
+    put = ca.Function("fpirhc_put", [own, x], [ca.if_else(ca.fabs(x) <= FINITE, x, own)])
+    matrix = kind(not function.is_a("SXFunction"))
+    z, x = matrix.sym("z", *function.size_in(0)), matrix.sym("x", place.stop - place.start)
+    memory, trace = function.call([z, *(matrix.zeros(*function.size_in(k)) for k in range(1, function.n_in()))])
+    before, own, behind = ca.vertsplit(memory, [0, place.start, place.stop, memory.numel()])
+    return ca.Function("fpirhc_led", [z, x], [ca.vertcat(before, put(own, x), behind), trace, own])
 
 
 def _derivative(function: ca.Function, entry: int) -> ca.Function:
