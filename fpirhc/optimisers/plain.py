@@ -259,8 +259,9 @@ def _converged(
     once = ca.Function("fpirhc_iterated", [*arguments, *symbols, *known], results)
     few = ca.Function("fpirhc_few", once.mx_in(), _iterated([once] * _FEW, once.mx_in()))
     times = divmod(settings.most + 1, _FEW)
-    *anchor, count, _ = _iterated([few] * times[0] + [once] * times[1], [*arguments, *anchor, 0, 0])
-    return Anchor(*anchor), count
+    begin = [*arguments, *anchor, ca.MX(0), ca.MX(0)]
+    *last, count, _ = _iterated([few] * times[0] + [once] * times[1], begin)
+    return Anchor(*last), count
 
 
 _FEW = 15  # iterations in one Function: a graph of all of them takes longer to build

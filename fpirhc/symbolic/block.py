@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, groupby
-from typing import cast
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -342,8 +342,8 @@ def scalar_code(function: ca.Function) -> ca.Function:
 
 def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix], *, inlines: bool = False) -> None:
     """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory."""
-    function, inputs = block._built
-    values = function.call([known[name] for name in (*inputs.names, *block.memory.names)], inlines, False)
+    arguments: list[Any] = [known[name] for name in (*block.inputs.names, *block.memory.names)]
+    values = block.function.call(arguments, inlines, False)
     results = cast(dict[str, Matrix], dict(zip(block._results, values, strict=True)))
     for name in block.writes.names:
         known[name] = results[name]
