@@ -5,9 +5,11 @@ Its Hessian is that of the cost alone, for every stage; `exact` adds that of the
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ import numpy as np
 from fpirhc.horizon.problem import OptimalControl
 
 _names = itertools.count()
+_generated = tempfile.TemporaryDirectory(prefix="acados")
 
 
 def again_with_acados() -> None:
@@ -95,4 +98,5 @@ def _built(ocp: OptimalControl, *, exact: bool, accuracy: float) -> Any:
     options.nlp_solver_tol_stat = options.nlp_solver_tol_eq = accuracy
     options.nlp_solver_tol_ineq = options.nlp_solver_tol_comp = accuracy
     options.globalization = "MERIT_BACKTRACKING"
-    return AcadosOcpSolver(made, json_file=f"{model.name}.json")
+    with contextlib.chdir(_generated.name):  # acados writes its C beside the caller otherwise
+        return AcadosOcpSolver(made, json_file=f"{model.name}.json")

@@ -158,9 +158,11 @@ def test_what_is_found_by_name_is_a_dictionary():
 
 def test_what_a_frozen_value_holds_stays():
     """A start that was changed in place was shown, and the run began at the old one; the error says what to do."""
-    problem, body = TASK.problem, TASK.problem.plant.parameters
+    problem = TASK.problem
+    start: Any = problem.start
+    body: Any = problem.plant.parameters
     with pytest.raises(NotSupported, match=r"Problem\.start cannot be changed in place.*\{\*\*start, name: value\}"):
-        problem.start["q1"] = 1.0
+        start["q1"] = 1.0
     for change in (
         body.clear,
         body.popitem,

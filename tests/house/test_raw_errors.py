@@ -139,10 +139,11 @@ def test_names_of_the_inner_modules_are_offered_as_those_of_the_package():
 
 def test_mistakes_name_what_was_written():
     """The call, the disturbance, the wrapper; each name once."""
+    mistaken: Any = {"nominal": "warm", "formula": lambda t: None}
     with pytest.raises(InvalidField, match=r"outside\.nominal: expected a number"):
-        fp.outside(nominal="warm", unit="K")
+        fp.outside(nominal=mistaken["nominal"], unit="K")
     with pytest.raises(fp.FpirhcError, match="disturbances: 'Q2': disturbance must be one scalar expression, got None"):
-        replace(PROBLEM, disturbances={"Q1": fp.Step(1.0, 2.0), "Q2": fp.Formula(lambda t: None)})
+        replace(PROBLEM, disturbances={"Q1": fp.Step(1.0, 2.0), "Q2": fp.Formula(mistaken["formula"])})
     late, drift = fp.ComputedTorque(fp.Exponential(rate=6.0)), dict.fromkeys(("q1", "q2"), 1.0)
     twice: list[Any] = [
         fp.Predicted(fp.Predicted(late, inputs=1e-2), inputs=1e-2),

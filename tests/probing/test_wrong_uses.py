@@ -34,6 +34,10 @@ def outside(**settings: Any) -> Any:
     return replace(PROBLEM, reality=fp.ExternalPlant(**given))
 
 
+def with_reality(reality: Any) -> Any:
+    return replace(PROBLEM, reality=reality)
+
+
 def case(changes: Any) -> Any:
     return fp.Cases({"heavy": changes}).problem("heavy", PROBLEM)
 
@@ -105,7 +109,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare without scenarios",
     ),
     "a body that is not in an external plant": (
-        lambda: replace(PROBLEM, reality=body()),
+        lambda: with_reality(body()),
         "Problem.reality: expected a Reality or an ExternalPlant or None, got a value of the class Body; "
         "write fp.Reality(plant=...) or fp.ExternalPlant(body=...)",
     ),
