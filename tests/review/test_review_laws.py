@@ -177,7 +177,7 @@ def test_benefit_is_told_from_harm():
         assert one_answer.numbers["with"] == pytest.approx(one_answer.numbers["null"], rel=1.0)
 
 
-@pytest.mark.parametrize(("eigenvalue", "verdict"), [(1.5, "yes"), (1.0, "caution")])
+@pytest.mark.parametrize(("eigenvalue", "verdict"), [(1.5, "yes"), (1.0, "unknown")])
 def test_runs_decide_on_the_benefit_under_dead_time(eigenvalue, verdict):
     """The recursion pairs a response with the last request, so nothing predicts it; the errors are those of two runs."""
     late = moving(eigenvalue, dead_time=fp.DeadTime(inputs={"u": PERIOD}))

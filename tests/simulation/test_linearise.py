@@ -141,7 +141,7 @@ def test_a_gain_that_a_run_refuses_has_poles_too():
         assert np.abs(poles - factor).min() < 2e-2
 
 
-@pytest.mark.parametrize(("factor", "verdict", "grows"), [(1.6, "unknown", False), (2.3, "no", True)])
+@pytest.mark.parametrize(("factor", "verdict", "grows"), [(1.6, "caution", False), (2.3, "no", True)])
 def test_an_observer_of_disturbances_is_part_of_the_loop_that_is_judged(factor: float, verdict: str, grows: bool):
     """With quick drift the observer takes on all of the response error in a cycle; a mass 2.3 times off is more than it bears."""
     plant = replace(
