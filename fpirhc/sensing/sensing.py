@@ -22,7 +22,7 @@ from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObser
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.symbolic.live import ceil, stays
+from fpirhc.symbolic.live import ceil, expressed, stays
 from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.disturbance import Disturbance
 
@@ -236,8 +236,11 @@ class Sensing(Checked):
         sensor = self.sensors.get(name)
         if sensor is None or sensor.quantum is None:
             return value
-        quantum = float(sensor.quantum)  # not live: CasADi folds products with numbers, and symbols round otherwise
-        return quantum * ca.floor(value / quantum + 0.5)
+        quantum = expressed(sensor.quantum, value)
+        quanta = quantum * ca.floor(value / quantum + 0.5)
+        # The same number, but CasADi would multiply a quantum that is a constant by the weights of the estimator behind it: that
+        # rounds otherwise than a live quantum does, and a last place of a sample is now and then a whole one of the next.
+        return ca.copysign(ca.fabs(quanta), quanta)
 
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]

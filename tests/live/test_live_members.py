@@ -166,11 +166,24 @@ def noisy() -> Problem:
 
 
 NOISES = [f"sensing.sensors.a.{name}" for name in ("noise.deviation", "dropout")] + ["disturbances.Fa.deviation"]
+QUANTUM = "sensing.sensors.a.quantum"
 
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["VM", "C"])
 def test_noises_and_sensors_are_live(compiled):
-    tried = check_live(noisy(), fp.ComputedTorque(TRACKING, SIGMOID), paths=NOISES, cycles=60, compiled=compiled)
+    paths = [*NOISES, QUANTUM]
+    tried = check_live(noisy(), fp.ComputedTorque(TRACKING, SIGMOID), paths=paths, cycles=60, compiled=compiled)
+    assert all(t.factor for t in tried), tried
+
+
+@pytest.mark.parametrize("estimator", examples("derivative estimators"), ids=lambda one: type(one).__name__)
+def test_a_quantum_is_live_behind_every_estimator(estimator):
+    """A constant must not be multiplied by the estimator's weights where a symbol is not: a sample would jump by a quantum."""
+    problem = two_masses()
+    quanta = {name: fp.Sensor(quantum=3e-5) for name in estimator.measures(problem.plant)}
+    problem = replace(problem, sensing=fp.Sensing(quanta, estimator))
+    paths = [f"sensing.sensors.{name}.quantum" for name in quanta]
+    tried = check_live(problem, fp.ComputedTorque(TRACKING, fp.Identity()), paths=paths, cycles=200)
     assert all(t.factor for t in tried), tried
 
 
