@@ -25,6 +25,7 @@ extensions = [
     "sphinxcontrib.katex",
     "sphinx_gallery.gen_gallery",
     "plain_docstrings",
+    "framed_pictures",
 ]
 exclude_patterns = ["_build", "gallery_src/README.rst"]
 html_theme = "furo"
