@@ -19,7 +19,7 @@ from unseen_bodies import BODIES, CONTROLLER
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
-from fpirhc.probing.trials import OnPlant, Trial
+from fpirhc.probing.probe import OnPlant, Trial
 from fpirhc.problem_files.shipped import missing, shipped_groups
 
 # The rule was changed where its choices on the first, on the last, on the late link and on the ship were poor.

@@ -10,7 +10,7 @@ from collections import Counter
 
 import fpirhc as fp
 from fpirhc.problem_files.shipped import missing, shipped_groups
-from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.question import Answer, Verdict
 
 REASONS = {
     "no linear loop": "no linear loop",

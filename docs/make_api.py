@@ -24,7 +24,7 @@ SECTIONS = {
     "Testing and errors": ("conformance", "errors"),
 }
 BESIDE = {  # for authors of members and for tools; imported from the module
-    "Certificate": "fpirhc.optimisers.certificate",
+    "Certificate": "fpirhc.studies.open_loop",
     "Combination": "fpirhc.plant.regressor",
     "Comparison": "fpirhc.studies.comparison.comparison",
     "Floquet": "fpirhc.controllers.slots.slotted",
@@ -34,7 +34,7 @@ BESIDE = {  # for authors of members and for tools; imported from the module
     "Prediction": "fpirhc.review.response_prediction",
     "Probe": "fpirhc.probing.probe",
     "Regressor": "fpirhc.plant.regressor",
-    "Review": "fpirhc.review.answer",
+    "Review": "fpirhc.review.question",
     "ScenarioComparison": "fpirhc.studies.scenarios.scenario_comparison",
     "Suggestion": "fpirhc.review.questions.noise",
     "Tuning": "fpirhc.studies.tuning.tune",

@@ -39,7 +39,6 @@ from .learning.estimators.recursive_least_squares import RecursiveLeastSquares
 from .learning.rules.lyapunov_rule import LyapunovRule
 from .learning.rules.projection import Projection
 from .optimisers.anderson import Anderson
-from .optimisers.certificate import certify
 from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
@@ -55,8 +54,8 @@ from .probing.probe import probe
 from .problem_files.problem_file import load_problem
 from .problem_files.settings import LogSpan, Span, with_settings
 from .report.html import write_report
-from .review.answer import Answer
 from .review.limits_certificate import certify_limits
+from .review.question import Answer
 from .review.questions.noise import suggest
 from .review.response_prediction import predict_response, tightened
 from .review.review import review
@@ -87,6 +86,7 @@ from .simulation.stepper import Stepper
 from .status import Status
 from .studies.comparison.compare import compare
 from .studies.information import compare_information
+from .studies.open_loop import certify
 from .studies.operating_limits import operating_limits
 from .studies.scenarios.scenario_study import compare_scenarios
 from .studies.tuning.tune import tune

@@ -176,7 +176,7 @@ FORMER_MEMBERS = {  # members and arguments of earlier versions
 }
 FORMER = {  # names of earlier versions, and names that have left the top level
     "BacksteppingMrac": "BacksteppingMRAC",
-    "Certificate": "optimisers.certificate.Certificate",
+    "Certificate": "studies.open_loop.Certificate",
     "Combination": "plant.regressor.Combination",
     "Comparison": "studies.comparison.comparison.Comparison",
     "Floquet": "controllers.slots.slotted.Floquet",
@@ -199,7 +199,7 @@ FORMER = {  # names of earlier versions, and names that have left the top level
     "Regressor": "plant.regressor.Regressor",
     "Restart": "FromMeasurement",
     "RestartAndTrack": "FromMeasurementTracked",
-    "Review": "review.answer.Review",
+    "Review": "review.question.Review",
     "Rfpt": "RFPT",
     "RfptVector": "RFPTVector",
     "ScenarioComparison": "studies.scenarios.scenario_comparison.ScenarioComparison",

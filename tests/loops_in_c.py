@@ -15,7 +15,7 @@ import fpirhc as fp
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.symbolic.lanes import lanes_library, written_in_lanes
+from fpirhc.simulation.lanes import lanes_library, written_in_lanes
 from fpirhc.symbolic.native import native
 
 REST = fp.Trajectory(lambda t: {"a": 0.3 * ca.sin(t), "b": 0 * t})

@@ -1,6 +1,7 @@
-"""A linear system of python-control as a plant.
+"""A linear system of python-control as a plant, and a controller as a system of that package.
 
 plant = plant_of(control.tf([2], [1, 3, 2, 0]), exact=control.tf([3], [1, 2, 2, 0]), inputs={"u": "V"}, outputs={"y": "rad"})
+system = controller_system(problem, controller)            to be connected with other systems of one sampling time
 """
 
 from __future__ import annotations
@@ -14,12 +15,15 @@ import casadi as ca
 import control
 import numpy as np
 
-from fpirhc.adapters.names import adapter
+from fpirhc.adapters.names import adapter, base_and_order
+from fpirhc.controllers.base import Controller
 from fpirhc.errors import Mistakes
 from fpirhc.plant.motion import Output
 from fpirhc.plant.parameter import Parameter
 from fpirhc.plant.plant import Plant
+from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.expression import Expression
+from fpirhc.task.problem import Problem
 
 
 @adapter
@@ -92,3 +96,41 @@ def _named(mistakes: Mistakes, what: str, given: Mapping[str, str] | None, label
     if len(given) != len(labels):
         mistakes.add(f"{what}: {len(given)} names for {len(labels)} {what} ({', '.join(labels)})")
     return given
+
+
+def controller_system(problem: Problem, controller: Controller, *, compiled: bool = False) -> Any:
+    """Return a controller as a `control.NonlinearIOSystem` that is sampled with the problem's period.
+
+    Its inputs are the measurements of `Stepper.measures`, in their units, its outputs the commands, its state what the controller
+    remembers, which starts at `Stepper(problem, controller).start()`: the system has it as `initial`.
+
+    Args:
+        problem: the task of the controller; its plant is the model alone.
+        controller: the controller.
+        compiled: whether the step is compiled to C.
+
+    Raises:
+        FpirhcError: the controller cannot be built for the problem.
+    """
+    stepper = Stepper(problem, controller, compiled=compiled)
+
+    def stepped(result: int, time: float, memory: np.ndarray, measured: np.ndarray, _: object) -> np.ndarray:
+        return stepper.step_measured(float(time), np.asarray(measured, float), np.asarray(memory, float))[result]
+
+    system = control.NonlinearIOSystem(
+        partial(stepped, 1),
+        partial(stepped, 0),
+        inputs=[_label(name) for name in stepper.measures],
+        outputs=list(problem.plant.inputs),
+        states=stepper.memory.size,
+        dt=problem.period,
+        name=type(controller).__name__,
+    )
+    system.initial = stepper.start()
+    return system
+
+
+def _label(quantity: str) -> str:
+    """A derivative as a label that python-control takes: "q1''" as "q1_2"."""
+    name, order = base_and_order(quantity)
+    return f"{name}_{order}" if order else name

@@ -22,6 +22,8 @@ from fpirhc.baselines.baseline import (
     Expected,
     Metric,
     Settings,
+    baseline_path,
+    check_inside,
     expected,
     fingerprint,
     settings_hash,
@@ -40,7 +42,6 @@ from fpirhc.baselines.measuring import (
     nominal,
     variants,
 )
-from fpirhc.baselines.places import baseline_path, check_inside
 from fpirhc.errors import BaselineError, FpirhcError, InvalidName, InvalidValue, OutputError
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Few, Range, Seed

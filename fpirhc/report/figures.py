@@ -24,10 +24,10 @@ from fpirhc.simulation.drawing import (
     new_figure,
     quantity_label,
     row_of_axes,
+    shown_motion,
     thinned,
     time_label,
 )
-from fpirhc.simulation.run import shown_motion
 from fpirhc.summary import number
 
 if TYPE_CHECKING:

@@ -30,10 +30,10 @@ from fpirhc.report.figures import (
     sweep_figure,
     sweep_panels,
 )
-from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure
+from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import readable
-from fpirhc.simulation.run import judged_motion, responses_of, shown_motion
+from fpirhc.simulation.run import judged_motion
 from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.summary import Column, Table
 from fpirhc.whole_file import write_whole

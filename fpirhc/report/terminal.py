@@ -23,7 +23,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table as Grid
 from rich.text import Text
 
-from fpirhc.simulation.metrics.measuring import columns
+from fpirhc.simulation.metrics.base import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
 from fpirhc.studies.comparison.changes import Outcome

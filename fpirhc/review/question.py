@@ -6,8 +6,10 @@ point of the group `fpirhc.questions`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import cache, cached_property
 from importlib.metadata import entry_points
 from typing import TypeVar, cast
@@ -18,14 +20,122 @@ from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError, InvalidValue
+from fpirhc.fields.checked import FoundByName
 from fpirhc.members import within
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops, LoopsByGain, loops_along, loops_by_gain, spectrum_near
-from fpirhc.review.prediction import NominalRun, NominalRuns
+from fpirhc.review.prediction import TRIED, NominalRun, NominalRuns
 from fpirhc.simulation.trials import ErrorPair, harm_in
+from fpirhc.summary import line, numbers_written_out, table
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
+
+
+class Verdict(StrEnum):
+    """The verdict of an answer; yes is good in every question.
+
+    Caution is known as well as yes and no: less than is wished for, and no reason to stop.
+    """
+
+    YES = "yes"
+    CAUTION = "caution"
+    NO = "no"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Answer(FoundByName):
+    """The answer to one question.
+
+    Args:
+        question: in the words of a reader.
+        verdict: yes, caution, no, unknown.
+        evidence: the facts in a sentence, with the deciding number and its unit.
+        change: what to change; empty after a yes.
+        numbers: the same facts by name.
+    """
+
+    question: str
+    verdict: Verdict
+    evidence: str
+    change: str = ""
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "evidence", numbers_written_out(self.evidence))
+        object.__setattr__(self, "change", numbers_written_out(self.change))
+        super().__post_init__()
+
+    @property
+    def advice(self) -> str:
+        """What to do, in one line; the facts before it where it points at them or at other answers."""
+        points = not self.change or self.change.startswith("See ")
+        return " ".join(f"{f'{self.evidence}. ' if points else ''}{self.change}".split())
+
+
+@dataclass(frozen=True)
+class Review(FoundByName):
+    """All answers about a problem and its controllers.
+
+    Args:
+        problem: answers about the problem.
+        controllers: answers about each controller, by name.
+        mismatch: range of the exact parameters, percent, see `fpirhc.plant.plant`.
+    """
+
+    problem: tuple[Answer, ...]
+    controllers: Mapping[str, tuple[Answer, ...]]
+    mismatch: float
+
+    def __repr__(self) -> str:
+        return line(self, "ready" if self.ready else "not ready", self._counts(), f"mismatch {self.mismatch:g} %")
+
+    def _repr_html_(self) -> str:
+        """All answers as a table, for notebooks; those that are no come first."""
+        groups = [("problem", self.problem), *self.controllers.items()]
+        rows = [(name, a.question, str(a.verdict), a.evidence, a.change) for name, group in groups for a in group]
+        rows.sort(key=lambda row: row[2] != Verdict.NO)
+        title = f"Review: {'ready' if self.ready else 'not ready'}"
+        return table(title, ("about", "question", "answer", "facts", "what to change"), rows, [self._counts()])
+
+    def _counts(self) -> str:
+        return ", ".join(f"{sum(a.verdict == v for a in self.answers)} {v}" for v in Verdict)
+
+    @property
+    def answers(self) -> tuple[Answer, ...]:
+        """All answers, the problem's first."""
+        return (*self.problem, *(a for group in self.controllers.values() for a in group))
+
+    @property
+    def to_do(self) -> tuple[tuple[str, Answer], ...]:
+        """The answers that are no, each with what it is about: 'problem', or the name of a controller."""
+        groups = [("problem", self.problem), *self.controllers.items()]
+        return tuple((about, a) for about, group in groups for a in group if a.verdict == Verdict.NO)
+
+    @property
+    def ready(self) -> bool:
+        """Whether no answer is no."""
+        return not self.to_do
+
+
+def decided(good: bool) -> Verdict:
+    """Return yes where the condition holds, else no."""
+    return Verdict.YES if good else Verdict.NO
+
+
+def per_cycle(pole: float, problem: Problem) -> str:
+    """Return 'is multiplied by 0.976 per cycle (time constant 41 ms)'; without the time where the mode does not decay."""
+    text = f"is multiplied by {pole:.6g} per cycle"
+    return f"{text} (time constant {duration(-problem.period / math.log(pole), problem)})" if 0 < pole < 1 else text
+
+
+def duration(time: float, problem: Problem) -> str:
+    """Return a time in the problem's unit; a time of less than a second in ms or us."""
+    unit = problem.time_unit
+    if unit != "s" or not 0 < time < 1:
+        return f"{time:.3g} {unit}"
+    return f"{1e3 * time:.3g} ms" if time >= 1e-3 else f"{1e6 * time:.3g} us"
+
 
 GROUP = "fpirhc.questions"  # of entry points
 
@@ -210,3 +320,48 @@ def known_questions(kind: type[Kind]) -> tuple[Kind, ...]:
     known = [question for module in within("fpirhc.review.questions") for question in module.QUESTIONS]
     known += [point.load() for point in entry_points(group=GROUP)]
     return tuple(sorted((q for q in known if type(q) is kind), key=lambda q: q.order))
+
+
+_LEAVE = "Lower the gain, use another form, or leave the deformation out."
+_FREE = "Run it where the commands are free."
+_ENDS = "Find out why the run ends early."
+
+
+def judged(good: bool, pairs: Iterable[ErrorPair], *, spared: bool) -> Verdict:
+    """Return the verdict that runs give: no where adaptation makes one clearly worse, unless that is no reason.
+
+    Args:
+        good: whether the answer is yes.
+        pairs: errors without adaptation and with it.
+        spared: whether a larger error is no reason for a no: the controller may still learn, or the error cures a larger one.
+    """
+    if good:
+        return Verdict.YES
+    return Verdict.NO if not spared and any(pair.fails for pair in pairs) else Verdict.CAUTION
+
+
+def by_run(case: Case, question: str, reason: str) -> Answer:
+    """Return the answer to a question whose yes is a smaller tracking error with adaptation.
+
+    A no is a clearly larger error. A controller that learns may still learn, so its short run is no reason for a no; that it does
+    not pay is one only where the run is the whole one.
+    """
+    trial = case.trial(case.controller.deformation)
+    pair = None if isinstance(trial, str) else trial[0]
+    if pair is None:
+        why = trial if isinstance(trial, str) else "the plant is outside"
+        return Answer(question, Verdict.UNKNOWN, f"{reason}; and no run, because {why}")
+    whole, learns = case.problem.cycles <= TRIED, case.controller.learns
+    numbers = {"without": pair.without[pair.worst], "with": pair.adapted[pair.worst]}
+    text = f"in {'the whole run' if whole else f'a run of at most {TRIED} cycles'} {pair.sentence} ({reason})"
+    if pair.stuck:
+        return Answer(question, Verdict.UNKNOWN, f"{text}; {pair.stuck}", _FREE, numbers)
+    verdict = judged(pair.lower, (pair,), spared=learns and not whole)
+    if verdict == Verdict.YES:
+        return Answer(question, verdict, text, "", numbers)
+    if verdict == Verdict.NO:
+        return Answer(question, verdict, text, SEE_CONVERGENCE if case.diverges else _LEAVE, numbers)
+    if not all(map(math.isfinite, pair.adapted.values())):
+        return Answer(question, Verdict.UNKNOWN, text, _ENDS, numbers)
+    change = "Compare it over several scenarios." if whole else "Run it for longer and compare."
+    return Answer(question, verdict if whole else Verdict.UNKNOWN, text, change, numbers)

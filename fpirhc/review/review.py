@@ -11,10 +11,19 @@ from fpirhc.controllers.contract import resolved, with_lateness
 from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.review.answer import Answer, Review, Verdict, decided
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.prediction import NominalRuns
-from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, asked, known_questions
+from fpirhc.review.question import (
+    Answer,
+    Case,
+    ControllerQuestion,
+    ProblemQuestion,
+    Review,
+    Verdict,
+    asked,
+    decided,
+    known_questions,
+)
 from fpirhc.review.questions.convergence import converges
 from fpirhc.simulation.model_as_plant import behind_stated_lag
 from fpirhc.symbolic.driver import compiled_plans

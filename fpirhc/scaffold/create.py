@@ -9,8 +9,8 @@ from importlib.machinery import PathFinder
 from importlib.resources import files
 from pathlib import Path
 
+from fpirhc.baselines.baseline import baseline_path
 from fpirhc.baselines.check import accept
-from fpirhc.baselines.places import baseline_path
 from fpirhc.errors import InvalidName, OutputError, not_writable
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.problem_files.shipped import shipped_problems

@@ -226,17 +226,6 @@ def judged_motion(layout: Layout) -> str:
     return next(name for name in _MOTION if name in layout)
 
 
-def shown_motion(layout: Layout) -> str:
-    """Return the name of the signal that the controller is given of what is judged: 'output' or 'state'."""
-    return "output" if "output" in layout else "state"
-
-
-def responses_of(layout: Layout) -> dict[str, str]:
-    """Return the columns of responses by what they are: time slots find their realised ones from what is measured."""
-    own = "realised_of_slots" in layout
-    return {n: n for n in ("nominal", "desired", "deformed")} | {"realised": "realised_of_slots" if own else "realised"}
-
-
 def _true_error(layout: Layout, log: np.ndarray) -> np.ndarray:
     state = layout[judged_motion(layout)]
     if "reference" not in layout:

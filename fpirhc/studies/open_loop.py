@@ -1,23 +1,247 @@
-"""Open-loop solves of a problem's first horizon with the optimisers that the command line names, and a certificate of each plan."""
+"""Open-loop solves of a problem's first horizon with the optimisers that the command line names, and a certificate of each plan.
+
+A certificate says what is known beyond the residual: how fast the iteration contracts there, and how far the optimum is. Its
+bounds, and where they hold, stand in docs/theory-optimisers.md.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import with_optimiser
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
+from fpirhc.fields.checked import checked_call
+from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
+from fpirhc.horizon.problem import OptimalControl, reduced_gradient
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.members import member_modules
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.optimisers.certificate import Certificate, certify
-from fpirhc.optimisers.plan import Plan, solve
+from fpirhc.optimisers.plan import Plan, sensitivity_of, solve
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.summary import line, number, table
 from fpirhc.task.exogenous import previewed_values
+
+_ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
+_REMEMBERED = 4  # horizons whose Functions are kept
+_AT_BOUND = 1e-9  # relative distance within which an input counts as at its bound
+_RANK = 1e-9  # relative singular value below which active limits depend on each other
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is known about a plan.
+
+    Args:
+        factor: K, infinite where it is not known.
+        error: bound of the distance to the optimum in the M-norm (square root of cost), NaN where K >= 1.
+        input_error: bound of the error of any input, in its unit.
+        suboptimality: bound of V(U) - V(U*).
+        curvature: least eigenvalue of M^-1 H; a plan where it is not positive is no strict minimum.
+        active: number of limits of states with a multiplier.
+        complementarity: largest product of a multiplier and the distance of its limit, in units of the cost.
+        broken: the worst violations of limits in words.
+    """
+
+    stationarity: float
+    feasibility: float
+    factor: float
+    error: float
+    input_error: float
+    suboptimality: float
+    free: int
+    curvature: float
+    active: int = 0
+    complementarity: float = 0.0
+    broken: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return line(self, *(f"{name} {value}" for name, value in self._facts()))
+
+    def _repr_html_(self) -> str:
+        """The bounds as a table, for notebooks."""
+        note = (
+            "" if self.factor < 1 else "Nothing is known about the distance to the optimum: the factor is not below 1."
+        )
+        return table("Certificate", ("", "value"), self._facts(), [note])
+
+    def _facts(self) -> list[tuple[str, str]]:
+        limits = [
+            ("active limits of states", str(self.active)),
+            ("complementarity", number(self.complementarity)),
+            *(("violated limit", text) for text in self.broken),
+        ]
+        return [
+            ("contraction factor", number(self.factor)),
+            ("error of any input at most", number(self.input_error)),
+            ("cost above the optimum at most", number(self.suboptimality)),
+            ("stationarity", number(self.stationarity)),
+            ("feasibility", number(self.feasibility)),
+            ("free directions" if self.active else "free inputs", str(self.free)),
+            ("least relative curvature", number(self.curvature)),
+            *(limits if self.active or self.broken else []),
+        ]
+
+
+@checked_call
+def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
+    """Return what is known about a plan.
+
+    Args:
+        plan: a solved horizon.
+        gain: effective gain of the iteration; 1: full Gauss-Newton steps.
+    """
+    _, stationarity, feasibility = plan.verify()
+    slope, hessian = _second_order(plan, plan.inputs)
+    free, held = _free(plan, plan.inputs, slope), _active_limits(plan)
+    about = held.count, held.complementarity, plan.violations()
+    basis = _directions(free, held)
+    if not basis.shape[1]:
+        return Certificate(stationarity, feasibility, 0.0, 0.0, 0.0, 0.0, 0, float("inf"), *about)
+    model, pull = basis.T @ _model(plan) @ basis, basis.T @ slope
+    root = np.linalg.cholesky(model + _ROUNDING * np.trace(model) * np.eye(model.shape[0]))
+    move = np.linalg.solve(model, pull)
+    values = _relative_eigenvalues(root, basis.T @ hessian @ basis)
+    further = (plan.inputs.ravel(order="F") - gain * basis @ move).reshape(plan.inputs.shape, order="F")
+    inputs = np.clip(further, *(b[:, None] for b in plan.bounds))
+    slope_there, hessian_there = _second_order(plan, inputs)
+    same = bool(np.all(_free(plan, inputs, slope_there) == free))
+    beyond = _relative_eigenvalues(root, basis.T @ hessian_there @ basis)
+    factor, unit = (_over_both(a, values, beyond) if same else float("inf") for a in (gain, 1.0))
+    length = float(np.sqrt(max(pull @ move, 0.0)))
+    error = gain * length / (1 - factor) if factor < 1 else float("nan")
+    spread = float(np.sqrt(np.einsum("ij,jk,ik->i", basis, np.linalg.inv(model), basis).max()))
+    suboptimality = length**2 / (2 * (1 - unit)) + held.complementarity * held.count if unit < 1 else float("nan")
+    least, back = float(values.min()), _largest_return(held, free)
+    return Certificate(
+        *(stationarity, feasibility, factor, error, spread * error + back, suboptimality, basis.shape[1], least), *about
+    )
+
+
+def _over_both(gain: float, here: np.ndarray, there: np.ndarray) -> float:
+    one, other = (float(np.abs(1 - gain * v).max()) for v in (here, there))
+    return max(one, other) + abs(one - other)
+
+
+def _relative_eigenvalues(root: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+    """Eigenvalues of M^-1 H with M = root root'."""
+    half = np.linalg.solve(root, hessian)
+    whole = np.linalg.solve(root, half.T)
+    return np.asarray(np.linalg.eigvalsh(0.5 * (whole + whole.T)))
+
+
+def _second_order(plan: Plan, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient (N nu) and exact Hessian (N nu, N nu) of the Lagrangian at these inputs, by Hessian-vector products."""
+    slope, product = _derivatives(plan.problem)
+    n, nu = plan.problem.stages, plan.problem.input.size
+    point = plan.states[:, 0], at, plan.data, plan.state_multipliers
+    directions_in_turn = np.eye(nu * n).reshape(-1, n, nu).transpose(2, 0, 1).reshape(nu, -1)
+    columns = product(*point, directions_in_turn)
+    return np.asarray(slope(*point).full()).ravel(), np.asarray(columns.full())
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _derivatives(ocp: OptimalControl) -> tuple[ca.Function, ca.Function]:
+    """Functions of (first state, U, data, multipliers): the gradient (N nu), and, for N nu directions, columns of the Hessian."""
+    gradient = reduced_gradient(ocp)
+    nu, n = ocp.input.size, ocp.stages
+    point = [ca.MX.sym(gradient.name_in(k), gradient.sparsity_in(k)) for k in range(4)]
+    direction = ca.MX.sym("d", nu, n)
+    slope = gradient(*point)[1]
+    along = ca.jtimes(slope, point[1], direction)
+    product = ca.Function("fpirhc_hessian_times", [*point, direction], [ca.vec(along)])
+    return (
+        ca.Function("fpirhc_slope", point, [ca.vec(slope)]),
+        product.map("fpirhc_hessian_columns", "serial", nu * n, [0, 1, 2, 3], []),
+    )
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _stages(ocp: OptimalControl) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Functions of a stage's linear model and Hessian, and of the end's."""
+    return linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp)
+
+
+def _free(plan: Plan, inputs: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Inputs that no active bound holds: not at a bound, or pushed away from it."""
+    lower, upper = (np.tile(b, plan.problem.stages) for b in plan.bounds)
+    values = inputs.ravel(order="F")
+    near = _AT_BOUND * (1 + np.abs(values))
+    held = ((values <= lower + near) & (slope > 0)) | ((values >= upper - near) & (slope < 0))
+    return ~held
+
+
+def _model(plan: Plan) -> np.ndarray:
+    """M (N nu, N nu) at the plan, by propagating the linearised model."""
+    ocp, data = plan.problem, plan.data
+    n, nu = ocp.stages, ocp.input.size
+    linear, hessians, end = _stages(ocp)
+    sensitivity, total = np.zeros((ocp.state.size, n * nu)), np.zeros((n * nu, n * nu))
+    for i in range(n):
+        s, u, theta = plan.states[:, i], plan.inputs[:, i], data[:, i]
+        _, _, a, b, _, _ = (np.asarray(v.full()) for v in linear(s, u, theta))
+        q, cross, r = (np.asarray(v.full()) for v in hessians(s, u, theta, np.zeros(ocp.state.size)))
+        own = slice(i * nu, (i + 1) * nu)
+        total += sensitivity.T @ q @ sensitivity
+        total[own] += cross @ sensitivity
+        total[:, own] += (cross @ sensitivity).T
+        total[own, own] += r
+        sensitivity = a @ sensitivity
+        sensitivity[:, own] += b
+    final = np.asarray(end(plan.states[:, n], data[:, n])[2].full())
+    return np.asarray(total + sensitivity.T @ final @ sensitivity)
+
+
+@dataclass(frozen=True, eq=False)
+class _Active:
+    """Active limits of states."""
+
+    rows: np.ndarray  # J, shape (count, N nu)
+    distances: np.ndarray  # of the states beyond their limits, positive where violated, shape (count,)
+    complementarity: float  # largest product of a multiplier and the distance of its limit
+
+    @property
+    def count(self) -> int:
+        """Number of active limits."""
+        return self.rows.shape[0]
+
+
+def _active_limits(plan: Plan) -> _Active:
+    ocp, multipliers = plan.problem, plan.state_multipliers
+    has_multiplier = multipliers.ravel(order="F") != 0
+    if not has_multiplier.any():
+        return _Active(np.zeros((0, plan.inputs.size)), np.zeros(0), 0.0)
+    _, _, sensitivity = sensitivity_of(ocp)(plan.states[:, 0], plan.inputs, plan.data)
+    limits = np.where(multipliers > 0, ocp.state_upper[:, None], ocp.state_lower[:, None]).ravel(order="F")[
+        has_multiplier
+    ]
+    active = multipliers.ravel(order="F")[has_multiplier]
+    beyond = np.sign(active) * (plan.states[:, 1:].ravel(order="F")[has_multiplier] - limits)
+    products = np.abs(beyond * active)
+    return _Active(np.asarray(sensitivity.full())[has_multiplier], beyond, float(products.max()))
+
+
+def _directions(free: np.ndarray, active: _Active) -> np.ndarray:
+    """Return an orthonormal basis (N nu, k) of the moves of free inputs along which no active limit changes."""
+    selected = np.eye(free.size)[:, free]
+    if not active.count or not free.any():
+        return selected
+    _, sizes, turned = np.linalg.svd(active.rows[:, free])
+    rank = int((sizes > _RANK * sizes.max()).sum())
+    return np.asarray(selected @ turned[rank:].T)
+
+
+def _largest_return(active: _Active, free: np.ndarray) -> float:
+    """Return the largest entry of the shortest move of free inputs that puts the active limits right, to first order."""
+    if not active.count or not free.any():
+        return 0.0
+    return float(np.abs(np.linalg.pinv(active.rows[:, free], rcond=_RANK) @ active.distances).max())
 
 
 @dataclass(frozen=True, eq=False)

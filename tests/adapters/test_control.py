@@ -87,7 +87,7 @@ def test_a_controller_is_a_system():
     task = fp.load_problem("two_link_arm").problem
     law = fp.ComputedTorque(fp.Exponential(rate=10.0), fp.ModelReferenced(fp.Affine(gain=-0.1)))
     run = fp.simulate(task, law, seed=0, compiled=False)
-    system = importlib.import_module("fpirhc.adapters.control_system").controller_system(task, law)
+    system = importlib.import_module("fpirhc.adapters.control").controller_system(task, law)
     measured = np.hstack([run["state"], run["realised"]])[:50].T
     assert system.input_labels == ["q1", "q2", "q1_1", "q2_1", "q1_2", "q2_2"]
     answer = library().input_output_response(system, np.arange(50) * task.period, measured, system.initial)

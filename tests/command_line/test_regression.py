@@ -23,6 +23,7 @@ from fpirhc.baselines.baseline import (
     Expected,
     expected,
     fingerprint,
+    problems_here,
     settings_of,
     to_text,
 )
@@ -40,7 +41,6 @@ from fpirhc.baselines.measuring import (
     metric_of,
     variants,
 )
-from fpirhc.baselines.places import problems_here
 from fpirhc.baselines.printing import to_markdown
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.question import Answer, Verdict
 from fpirhc.studies.comparison.changes import Finding, Outcome
 from fpirhc.studies.comparison.optimality import gap
 from fpirhc.studies.comparison.pairwise import NullTest

@@ -14,9 +14,9 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotContractive
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
+from fpirhc.review.question import Answer, Verdict
 from fpirhc.review.questions.slew import effect, slew_enough
 
 LEVEL = 3.0  # mg/l

@@ -15,9 +15,9 @@ from bodies import PERIOD, RHC, body_problem
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
 from fpirhc.probing.identification import Channel, Estimates, delayed, identify
+from fpirhc.probing.probe import OnPlant, Trial, best
 from fpirhc.probing.recording import excited, sequence
 from fpirhc.probing.rule import Predicted, Rule, _between
-from fpirhc.probing.trials import OnPlant, Trial, best
 
 KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (1.0, 0, 0.0, 0.05),

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import fpirhc as fp
-from fpirhc.baselines.places import baseline_path, problems_here
+from fpirhc.baselines.baseline import baseline_path, problems_here
 from fpirhc.controllers.contract import innermost
 from fpirhc.plant.motion import followed_units
 from fpirhc.problem_files.problem_file import Task

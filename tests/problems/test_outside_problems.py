@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.baselines.baseline import problems_here
 from fpirhc.baselines.check import check_file
-from fpirhc.baselines.places import problems_here
 from fpirhc.problem_files import shipped
 from fpirhc.problem_files.shipped import missing, needed
 

@@ -22,7 +22,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.report import terminal
 from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run
-from fpirhc.review.answer import Answer, Review, Verdict
+from fpirhc.review.question import Answer, Review, Verdict
 from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 from fpirhc.studies.tuning.objective import Objective
@@ -152,7 +152,7 @@ def test_inputs_show_what_they_hold(inputs):
         assert text in texts["problem"]
     for text in (printable(HOSTILE), "ComputedTorque", "Sigmoid", "with adaptation", "10 cycles"):
         assert text in texts["task"]
-    for text in ("not ready", "change it", "1 yes, 2 no, 0 unknown"):
+    for text in ("not ready", "change it", "1 yes, 0 caution, 2 no, 0 unknown"):
         assert text in texts["review"]
     study = inputs["scenarios"]
     for text in ("baseline", Objective().text(study.summaries[1].median), printable(study.verdict[0])):

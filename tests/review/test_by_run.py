@@ -6,9 +6,8 @@ from typing import Any, cast
 
 import pytest
 
-from fpirhc.review.by_run import by_run
 from fpirhc.review.prediction import TRIED
-from fpirhc.review.question import Case
+from fpirhc.review.question import Case, by_run
 from fpirhc.simulation.trials import ErrorPair
 
 

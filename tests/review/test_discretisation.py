@@ -9,8 +9,8 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
-from fpirhc.review.answer import Verdict
 from fpirhc.review.grid import review_grid
+from fpirhc.review.question import Verdict
 from fpirhc.review.questions.integration import discretisation_follows
 
 PLANT = fp.Plant(

@@ -13,8 +13,8 @@ from test_review_laws import moving
 
 import fpirhc as fp
 from fpirhc.deformation import Deformation
-from fpirhc.review.answer import Verdict
 from fpirhc.review.prediction import NominalRuns
+from fpirhc.review.question import Verdict
 from fpirhc.review.questions.right_model import forms_of, map_inside
 
 POLE = 86.7  # 1/s

@@ -17,9 +17,9 @@ from reviewed import linear
 import fpirhc as fp
 from fpirhc.contraction.spectrum import Spectrum, assess_gain
 from fpirhc.deformation.base import Deformation
-from fpirhc.review.answer import Verdict, duration, per_cycle
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
+from fpirhc.review.question import Verdict, duration, per_cycle
 from fpirhc.review.questions.convergence import _NEAR, _without, box_converges, converges
 from fpirhc.review.questions.gain import (
     FAR,

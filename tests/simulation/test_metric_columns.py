@@ -12,9 +12,9 @@ from plants import linear
 
 import fpirhc as fp
 from fpirhc.simulation.metrics import known_metrics
+from fpirhc.simulation.metrics.base import columns
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.metrics.entries.solve import iterations, residual
-from fpirhc.simulation.metrics.measuring import columns
 from fpirhc.simulation.trials import errors_of
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Signal

@@ -17,8 +17,8 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.errors import InvalidName, InvalidValue
-from fpirhc.simulation.metrics import known_metrics, measuring, with_own_metrics
-from fpirhc.simulation.metrics.measuring import columns
+from fpirhc.simulation.metrics import base, known_metrics, with_own_metrics
+from fpirhc.simulation.metrics.base import columns
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout, Signal
 
@@ -262,8 +262,8 @@ def test_a_metric_is_one_value():
         ({"name": "stop"}, "another meaning in results"),
         ({"name": "solve"}, "another meaning in results"),
         ({"name": "My metric"}, "small letters"),
-        ({"better": "smallest"}, "Did you mean 'smaller'"),
-        ({"compared": "exactly"}, "Did you mean 'exact'"),
+        ({"better": "smallest"}, "write 'smaller'"),
+        ({"compared": "exactly"}, "write 'exact'"),
     ],
 )
 def test_a_wrong_metric_is_refused(wrong, message):
@@ -285,8 +285,8 @@ def test_metrics_of_an_installed_package_are_found(monkeypatch):
         SimpleNamespace(load=lambda: OVERSHOOT),
         SimpleNamespace(load=lambda: (replace(OVERSHOOT, name="other"),)),
     ]
-    monkeypatch.setattr(measuring, "entry_points", lambda group: points if group == "fpirhc.metrics" else [])
-    names = [m.name for m in measuring.known_metrics.__wrapped__()]
+    monkeypatch.setattr(base, "entry_points", lambda group: points if group == "fpirhc.metrics" else [])
+    names = [m.name for m in base.known_metrics.__wrapped__()]
     assert {"overshoot", "other"} == set(names) - {m.name for m in known_metrics()}
 
 

@@ -13,7 +13,7 @@ from blessed import LINE
 import fpirhc as fp
 from fpirhc.baselines.check import accept
 from fpirhc.cli.main import main
-from fpirhc.simulation.metrics import entries, measuring
+from fpirhc.simulation.metrics import base, entries
 
 OWN = '''
 
@@ -115,4 +115,4 @@ def test_a_shipped_metric_is_one_file(tmp_path, monkeypatch):
         "from fpirhc.simulation.metrics.base import Metric\nMETRICS = (Metric('peak', lambda problem, run: 1.0),)\n"
     )
     monkeypatch.setattr(entries, "__path__", [*entries.__path__, str(tmp_path)])
-    assert "peak" in [metric.name for metric in measuring.known_metrics.__wrapped__()]
+    assert "peak" in [metric.name for metric in base.known_metrics.__wrapped__()]

@@ -10,8 +10,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.review import review as reviewing
-from fpirhc.review.answer import Verdict
-from fpirhc.review.question import known_questions
+from fpirhc.review.question import Verdict, known_questions
 from fpirhc.review.questions.gain import GAIN
 from fpirhc.review.questions.reference import COMMANDS
 from fpirhc.simulation import simulate as simulating

@@ -23,7 +23,7 @@ from reviewed import answer, case
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
-from fpirhc.review.answer import Verdict
+from fpirhc.review.question import Verdict
 from fpirhc.review.questions.convergence import box_converges
 from fpirhc.review.review import predict
 from fpirhc.studies.comparison.changes import Outcome

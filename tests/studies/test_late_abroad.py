@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField, InvalidValue
-from fpirhc.review.answer import Verdict
+from fpirhc.review.question import Verdict
 from fpirhc.review.questions.convergence import CONVERGES
 from fpirhc.review.questions.right_model import NULL_TEST
 from fpirhc.studies.comparison.changes import Outcome

@@ -35,8 +35,7 @@ from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, r
 from fpirhc.studies.scenarios.cluster import DEATHS, Workers
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger
-from fpirhc.studies.scenarios.paired import median_interval, middle, share_interval, verdict
-from fpirhc.studies.scenarios.quantiles import Quantiles
+from fpirhc.studies.scenarios.paired import Quantiles, median_interval, middle, share_interval, verdict
 from fpirhc.studies.scenarios.running import summarise
 
 LINE = line_text(

@@ -27,8 +27,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.baselines.baseline import problems_here
     from fpirhc.baselines.judging import ignoring
-    from fpirhc.baselines.places import problems_here
     from fpirhc.baselines.printing import MARK, check_replaceable, show_check, to_markdown
     from fpirhc.whole_file import write_whole
 

@@ -11,7 +11,7 @@ from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
     from fpirhc.controllers.base import Controller
-    from fpirhc.review.answer import Answer, Review
+    from fpirhc.review.question import Answer, Review
     from fpirhc.task.problem import Problem
 
 _COLOURS = {"yes": "green", "caution": "yellow", "no": "red", "unknown": "magenta"}

@@ -15,8 +15,6 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.maps import growth_of, quick_step_of
-from fpirhc.review.answer import Answer, Verdict, duration, per_cycle
-from fpirhc.review.by_run import by_run
 from fpirhc.review.grid import ReviewGrid, StateSlopes, is_late, state_slopes
 from fpirhc.review.loops import (
     LITTLE,
@@ -27,7 +25,7 @@ from fpirhc.review.loops import (
     largest_product,
     loops_over_box,
 )
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict, by_run, duration, per_cycle
 from fpirhc.review.questions.integration import stiff_advice
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
 from fpirhc.summary import in_percent

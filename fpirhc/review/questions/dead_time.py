@@ -14,11 +14,9 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.controllers.wrappers.predicted import other_predictions
 from fpirhc.errors import FpirhcError
-from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.by_run import judged
 from fpirhc.review.grid import is_late, scaled
 from fpirhc.review.prediction import CYCLES
-from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
+from fpirhc.review.question import SEE_CONVERGENCE, Answer, Case, ControllerQuestion, Verdict, judged
 from fpirhc.review.questions.margins import margins
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.simulate import simulate

@@ -18,11 +18,10 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, innermost
 from fpirhc.errors import FpirhcError
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import LoopsByGain, largest_product
 from fpirhc.review.prediction import NominalRuns
-from fpirhc.review.question import SEE_CONVERGENCE, Case, ControllerQuestion
+from fpirhc.review.question import SEE_CONVERGENCE, Answer, Case, ControllerQuestion, Verdict
 from fpirhc.review.questions.margins import keeps_margins
 from fpirhc.review.questions.right_model import RIGHT_MODEL, leaves_right_model_alone
 from fpirhc.review.questions.speed import fast_enough, gain_times, plan_keeps_up

@@ -22,9 +22,8 @@ from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.maps import growth_of, quick_step_of
 from fpirhc.plant.plant import Plant
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, state_slopes
-from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, ProblemQuestion, Verdict
 from fpirhc.review.questions.integration import stiff_advice
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.run import Run

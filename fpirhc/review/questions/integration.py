@@ -16,10 +16,9 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.integrators import Integrator, poles, stiffness
 from fpirhc.plant.maps import poles_over
 from fpirhc.plant.plant import Plant
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, state_slopes
 from fpirhc.review.loops import is_planned
-from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, ProblemQuestion, Verdict
 from fpirhc.review.questions.reality import real_points
 
 CLOSE = 0.05  # distance of a pole of the step from exp(pole of the plant x step)

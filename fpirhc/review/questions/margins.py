@@ -11,9 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fpirhc.review.answer import Answer, Verdict, duration
 from fpirhc.review.loops import Loops, is_planned
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict, duration
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
 from fpirhc.task.problem import Problem
 

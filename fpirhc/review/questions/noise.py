@@ -22,11 +22,10 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotContractive
 from fpirhc.fields.checked import FoundByName, checked_call
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.motion import with_space
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Points, points_of, spectrum_near, thinned, usable
 from fpirhc.review.prediction import TRIED
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.linearise.asked_loop import behind_noise
 from fpirhc.simulation.linearise.linear_loop import LinearLoop

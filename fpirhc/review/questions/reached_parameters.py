@@ -16,10 +16,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.plant.plant import Plant
-from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.by_run import by_run
 from fpirhc.review.grid import ReviewGrid, each, inner_places
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict, by_run
 from fpirhc.task.problem import Problem
 
 REACHED = "Does the deformation reach the wrong parameters?"

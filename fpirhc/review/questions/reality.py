@@ -21,11 +21,9 @@ from fpirhc.deformation.base import Iteration
 from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.plant import Plant
-from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.by_run import by_run
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Points, thinned, usable
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict, by_run
 from fpirhc.review.questions.margins import smallest_margins
 from fpirhc.review.questions.speed import law_of
 from fpirhc.sensing.base import response_names

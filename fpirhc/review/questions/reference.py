@@ -17,9 +17,8 @@ from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.motion import controlled_places, with_space
 from fpirhc.plant.plant import Plant
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, each
-from fpirhc.review.question import ProblemQuestion
+from fpirhc.review.question import Answer, ProblemQuestion, Verdict
 from fpirhc.task.problem import Problem
 
 JUMPS = "Is the reference free of jumps?"

@@ -23,8 +23,6 @@ from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.motion import with_space
-from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.by_run import by_run, judged
 from fpirhc.review.prediction import (
     TRIED,
     NominalRun,
@@ -33,7 +31,7 @@ from fpirhc.review.prediction import (
     null_errors,
     response_errors,
 )
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict, by_run, judged
 from fpirhc.simulation.model_as_plant import with_believed_way
 from fpirhc.simulation.trials import SLIGHT, ErrorPair
 from fpirhc.summary import beside

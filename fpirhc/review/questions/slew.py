@@ -16,11 +16,10 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.motion import controlled_places
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, below_responses, state_slopes
 from fpirhc.review.loops import is_planned
 from fpirhc.review.prediction import errors_without_adaptation, response_errors
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict
 from fpirhc.review.questions.speed import law_of
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.task.disturbance import disturbed_place

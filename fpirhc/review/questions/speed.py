@@ -9,10 +9,9 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.maps import response_age
-from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import is_planned
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict
 from fpirhc.review.questions.right_model import INCREMENT, REFERENCED, forms_of
 
 FAST = "Does the iteration keep up with its tracking law?"

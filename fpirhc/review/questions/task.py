@@ -8,9 +8,8 @@ from fpirhc.controllers.observed_state import UnobservableErrors, unobservable_e
 from fpirhc.errors import NotSupported
 from fpirhc.plant.chain import relative_order
 from fpirhc.plant.motion import outside_names
-from fpirhc.review.answer import Answer, Verdict, decided
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.question import ProblemQuestion
+from fpirhc.review.question import Answer, ProblemQuestion, Verdict, decided
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.exogenous import real_values, rows_of
 from fpirhc.task.problem import Problem

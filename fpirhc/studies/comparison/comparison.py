@@ -10,8 +10,8 @@ from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked import FoundByName
 from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.metrics import Metric, Metrics
-from fpirhc.simulation.metrics.measuring import Column as Number
-from fpirhc.simulation.metrics.measuring import columns, in_report
+from fpirhc.simulation.metrics.base import Column as Number
+from fpirhc.simulation.metrics.base import columns, in_report
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.comparison.changes import Finding, Outcome
 from fpirhc.studies.comparison.entry import Entry

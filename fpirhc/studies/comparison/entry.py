@@ -16,8 +16,8 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import innermost
 from fpirhc.errors import FpirhcError, listed
 from fpirhc.plant.chain import measured_signals
-from fpirhc.review.answer import Verdict
 from fpirhc.review.grid import review_grid
+from fpirhc.review.question import Verdict
 from fpirhc.review.questions.integration import discretisation_follows
 from fpirhc.review.response_prediction import Prediction
 from fpirhc.sensing.base import names_of_responses, response_names

@@ -10,8 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from fpirhc.simulation.metrics import Metric, known_metrics
-from fpirhc.studies.scenarios.paired import Record, Summary, median_interval
-from fpirhc.studies.scenarios.quantiles import Quantiles
+from fpirhc.studies.scenarios.paired import Quantiles, Record, Summary, median_interval
 from fpirhc.studies.tuning.objective import Objective
 
 _OF_METRICS = 2048  # numbers in a buffer of a metric, which has no interval beside it

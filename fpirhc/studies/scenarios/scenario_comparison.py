@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked import FoundByName
-from fpirhc.simulation.metrics.measuring import Column as Number
+from fpirhc.simulation.metrics.base import Column as Number
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.scenarios.paired import Record, Summary, noun
 from fpirhc.studies.tuning.objective import Objective

@@ -20,7 +20,7 @@ from fpirhc.fields.kinds import Few, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
-from fpirhc.simulation.metrics.measuring import Column
+from fpirhc.simulation.metrics.base import Column
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.scenarios.bench import (
     SIDE_BY_SIDE,
