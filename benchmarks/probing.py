@@ -2,6 +2,7 @@
 
 .venv/bin/python benchmarks/probing.py                        # all plants, late links, unseen bodies: six minutes
 .venv/bin/python benchmarks/probing.py two_mass quadrotor
+.venv/bin/python benchmarks/probing.py stage pendulum vessel  # the blind test: known answers beside the estimates
 Option: --late CYCLES, a link before the plant that nobody told; for plants of other packages.
 
 The grid: model-referenced and plain forms with gains from .05 to 1.25, no dead time, and lags of 0, 1 and 3 times the probe's.
@@ -15,11 +16,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from known_bodies import KNOWN, TRUTH
 from unseen_bodies import BODIES, CONTROLLER
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
-from fpirhc.probing.probe import OnPlant, Trial
+from fpirhc.probing.probe import OnPlant, Probe, Trial
 from fpirhc.problem_files.shipped import missing, shipped_groups
 
 # The rule was changed where its choices on the first, on the last, on the late link and on the ship were poor.
@@ -27,6 +29,7 @@ SHIPPED = ("two_mass", "two_link_arm", "van_der_pol")
 LATE = ("quadrotor", (1, 3, 5))  # cycles of its link
 SEEDS = (7, 8, 9)  # of the runs in which bodies with noise are compared; the first one for the others
 GAINS = (0.05, 0.15, 0.3, 0.6, 1.0, 1.25)
+OUTSIDE = {**BODIES, **KNOWN}
 
 
 class Late:
@@ -77,6 +80,17 @@ def rms(trials: list[Trial | str]) -> Trial:
     return Trial(float(np.sqrt(np.mean([one.error**2 for one in every]))), max(one.worst for one in every))
 
 
+def beside_truth(name: str, found: Probe) -> str:
+    """Return each estimate of a body with known answers beside its truth, such as "1.34 [1.27, 1.41] of 1.3"."""
+    truth, inputs = TRUTH[name], list(found.dead_time)
+    pairs = [(g, truth.gains[i, j]) for i, row in enumerate(found.gain.values()) for j, g in enumerate(row.values())]
+    pairs += [(found.dead_time[u], truth.dead[j]) for j, u in enumerate(inputs)]
+    pairs += [(found.lag[u], truth.lag[j]) for j, u in enumerate(inputs)]
+    missed = sum(not one.low <= value <= one.high for one, value in pairs)
+    told = ", ".join(f"{one.value:.3g} [{one.low:.3g}, {one.high:.3g}] of {value:.3g}" for one, value in pairs)
+    return f"gains, dead times in cycles, lags in s: {told}; {missed} of {len(pairs)} outside"
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -85,12 +99,12 @@ def main() -> None:
     parser.add_argument("--cycles", type=int, default=400)
     asked = parser.parse_args()
     outside = {name: path for name, path in shipped_groups()["plants of other packages"].items() if not missing(path)}
-    everything = [(name, 0) for name in (*outside, *SHIPPED, *BODIES)]
+    everything = [(name, 0) for name in (*outside, *SHIPPED, *OUTSIDE)]
     everything += [(LATE[0], k) for k in LATE[1] if LATE[0] in outside]
     for name, cycles in [(name, asked.late) for name in asked.problems] or everything:
         title = f"{name}, {cycles} late" if cycles else name
-        if name in BODIES:
-            problem, alone = BODIES[name](), CONTROLLER
+        if name in OUTSIDE:
+            problem, alone = OUTSIDE[name](), CONTROLLER
         else:
             task = fp.load_problem(name)
             problem = late(task.problem, cycles)
@@ -100,7 +114,7 @@ def main() -> None:
         took = time.process_time() - begun
         proposed = {} if found.deformation is None else {"probe": found.deformation}
         lags = tuple(one.value for one in found.lag.values())
-        seeds = SEEDS if name in BODIES else SEEDS[:1]
+        seeds = SEEDS if name in OUTSIDE else SEEDS[:1]
         plant, every = OnPlant(problem, alone), {**by_hand(lags), **proposed}
         runs = [{n: plant.trial(one, seed) for n, one in every.items()} for seed in seeds]
         trials = {n: rms([run[n] for run in runs]) for n, one in runs[0].items() if isinstance(one, Trial)}
@@ -111,6 +125,8 @@ def main() -> None:
             f"ratio {probe.error / trials[hand].error:.2f}; {took:.0f} s\n                  {found.lines} {found.why}",
             flush=True,
         )
+        if name in TRUTH:
+            print(f"                  {beside_truth(name, found)}", flush=True)
 
 
 if __name__ == "__main__":

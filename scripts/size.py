@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import ast
-import io
 import re
 import subprocess
 import sys
-import tokenize
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import grimp
 import numpy as np
+from code_lines import code_lines
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -29,7 +27,6 @@ FORM = re.compile(
     r"(?<!self)\.outputs\b|\.step is|instant_names|symbolic_reality|\.foreign\b|is_live\(|mirror\.referenced"
 )
 OWNERS = ("plant", "symbolic")  # folders that may ask for the form of a plant or a number
-SILENT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING}
 
 
 def main() -> None:
@@ -61,25 +58,6 @@ def main() -> None:
 def lines(folder: Path, pattern: str) -> int:
     """Lines of all files of a folder."""
     return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in folder.rglob(pattern))
-
-
-def code_lines(text: str) -> list[str]:
-    """Lines that hold a token of code: no comments, no blank lines, no docstrings."""
-    documented = {at for node in ast.walk(ast.parse(text)) for at in _docstring(node)}
-    kept: set[int] = set()
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type not in SILENT:
-            kept.update(range(token.start[0], token.end[0] + 1))
-    every = ["", *text.splitlines(), ""]
-    return [every[k] for k in sorted(kept - documented) if k < len(every)]
-
-
-def _docstring(node: ast.AST) -> Iterable[int]:
-    holds = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-    if not holds or ast.get_docstring(node, clean=False) is None:
-        return ()
-    first = node.body[0]
-    return range(first.lineno, (first.end_lineno or first.lineno) + 1)
 
 
 def importers(graph: grimp.ImportGraph, module: str) -> set[str]:

@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import struct
 import time as wall
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from fpirhc.adapters.names import adapter, require_methods
+from fpirhc.adapters.names import adapter, require, require_methods
 from fpirhc.adapters.real_time import RealTime, Setup, device
 from fpirhc.errors import InvalidProblem, package
 from fpirhc.fields.checked import Checked
@@ -80,26 +78,25 @@ class _Traffic:
         """Forget what came before the last message of every identifier that waits."""
         self._newest: dict[int, Any] = {}
 
-    def write(self, command: np.ndarray) -> None:
+    def write(self, command: Iterable[float]) -> None:
         """Send one message per identifier."""
         data: dict[tuple[int, bool], bytearray] = {}
         for at, value in zip(self._sent, command, strict=True):
-            number, whole = float(value) / at.scale, at.format[-1] not in "efd"
             content = data.setdefault((at.identifier, at.extended), bytearray())
             content.extend(bytes(max(at.byte + struct.calcsize(at.format) - len(content), 0)))
-            struct.pack_into(at.format, content, at.byte, round(number) if whole else number)
+            number = float(value) / at.scale
+            struct.pack_into(at.format, content, at.byte, number if at.format[-1] in "efd" else round(number))
         for (identifier, wide), content in data.items():
             self._bus.send(self._can.Message(arbitration_id=identifier, data=content, is_extended_id=wide))
 
     def read(self) -> Iterator[tuple[float, float]]:
         """Values of the newest messages, and their ages."""
         while (message := self._bus.recv(timeout=0)) is not None:
-            if message.is_error_frame:
-                raise InvalidProblem("the bus has an error frame")
+            require(not message.is_error_frame, "the bus has an error frame")
             self._newest[message.arbitration_id] = message
         for at in self._read:
             if (newest := self._newest.get(at.identifier)) is None:
                 raise InvalidProblem(f"no message 0x{at.identifier:X} has arrived")
-            if len(newest.data) < at.byte + struct.calcsize(at.format):
-                raise InvalidProblem(f"message 0x{at.identifier:X} has {len(newest.data)} bytes, too few for its field")
+            enough = len(newest.data) >= at.byte + struct.calcsize(at.format)
+            require(enough, f"message 0x{at.identifier:X} has {len(newest.data)} bytes, too few for its field")
             yield at.scale * struct.unpack_from(at.format, newest.data, at.byte)[0], wall.time() - newest.timestamp

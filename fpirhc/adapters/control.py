@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -83,10 +82,9 @@ def plant_of(
         return lambda x, p: product("C", p, x, states)[k]
 
     seen = {name: Output(unit, shown(k)) for k, (name, unit) in enumerate(outputs.items())}
-    make: Callable[..., Plant] = partial(Plant.of_states, rates=moved)
-    if model.dt:
-        make = partial(Plant.discrete, next=moved, step=float(model.dt))
-    return make(states=states, inputs=inputs, parameters=parameters, outputs=seen, time_unit=time_unit)
+    make: Any = Plant.discrete if model.dt else Plant.of_states
+    how = {"next": moved, "step": float(model.dt)} if model.dt else {"rates": moved}
+    return make(states=states, inputs=inputs, parameters=parameters, outputs=seen, time_unit=time_unit, **how)
 
 
 def _named(mistakes: Mistakes, what: str, given: Mapping[str, str] | None, labels: Sequence[str]) -> Mapping[str, str]:

@@ -6,12 +6,10 @@ problem = fp.Problem(plant=model, reality=fmu_body("tank.fmu", model, period=1.0
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
-
-import numpy as np
 
 from fpirhc.adapters.names import adapter, counterparts
 from fpirhc.errors import Mistakes, package
@@ -74,7 +72,7 @@ class _Body:
         self._made, self._third, self._period, self._sent, self._read = made, third, period, sent, read
         self._unit: Any = None
 
-    def reset(self, _seed: int) -> np.ndarray:
+    def reset(self, _seed: int) -> list[float]:
         """Begin anew at time 0."""
         if self._unit is not None:
             self._unit.terminate()
@@ -85,10 +83,10 @@ class _Body:
             unit.setupExperiment(startTime=0.0)
         unit.enterInitializationMode()
         unit.exitInitializationMode()
-        return np.array(self._get(self._read))
+        return list(self._get(self._read))
 
-    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+    def step(self, time: float, command: Iterable[float]) -> list[float]:
         """Hold the command for a communication step."""
         self._set(self._sent, list(map(float, command)))
         self._unit.doStep(currentCommunicationPoint=time, communicationStepSize=self._period)
-        return np.array(self._get(self._read))
+        return list(self._get(self._read))

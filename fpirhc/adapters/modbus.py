@@ -9,21 +9,17 @@ where it stands still for longer than `oldest`, the values are old.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
-
-from fpirhc.adapters.names import adapter
+from fpirhc.adapters.names import adapter, require
 from fpirhc.adapters.real_time import RealTime, Setup, device
-from fpirhc.errors import InvalidProblem, package
+from fpirhc.errors import package
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Nonzero
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
-
-_Types = Literal["INT16", "UINT16", "INT32", "UINT32", "INT64", "UINT64", "FLOAT32", "FLOAT64"]
 
 
 @dataclass(frozen=True)
@@ -34,7 +30,7 @@ class Register(Checked):
     """
 
     address: CountOrZero
-    type: _Types = "FLOAT32"
+    type: Literal["INT16", "UINT16", "INT32", "UINT32", "INT64", "UINT64", "FLOAT32", "FLOAT64"] = "FLOAT32"
     scale: Nonzero = 1.0
     readonly: bool = False
 
@@ -86,10 +82,9 @@ class _Unit:
     def open(self) -> None:
         """Connect anew."""
         self._client.close()
-        if not self._client.connect():
-            raise InvalidProblem(f"no device answers at {self._client.comm_params.host}")
+        require(self._client.connect(), f"no device answers at {self._client.comm_params.host}")
 
-    def write(self, command: np.ndarray) -> None:
+    def write(self, command: Iterable[float]) -> None:
         """Write the registers of every input."""
         for at, value in zip(self._sent, command, strict=True):
             kind, number = self._client.DATATYPE[at.type], float(value) / at.scale
@@ -98,15 +93,12 @@ class _Unit:
 
     def read(self) -> Iterator[tuple[float, float]]:
         """Values; their ages are not known."""
-        return ((self._value(at), 0.0) for at in self._read)
-
-    def _value(self, at: Register) -> float:
-        kind = self._client.DATATYPE[at.type]
-        ask = self._client.read_input_registers if at.readonly else self._client.read_holding_registers
-        words = self._good(ask(at.address, count=kind.value[1], device_id=self._unit), at).registers
-        return at.scale * float(self._client.convert_from_registers(words, kind))
+        for at in self._read:
+            kind = self._client.DATATYPE[at.type]
+            ask = self._client.read_input_registers if at.readonly else self._client.read_holding_registers
+            words = self._good(ask(at.address, count=kind.value[1], device_id=self._unit), at).registers
+            yield at.scale * float(self._client.convert_from_registers(words, kind)), 0.0
 
     def _good(self, answer: Any, at: Register) -> Any:
-        if answer.isError():
-            raise InvalidProblem(f"register {at.address} answers {answer}")
+        require(not answer.isError(), f"register {at.address} answers {answer}")
         return answer

@@ -57,6 +57,16 @@ def finite_numbers(where: str, values: object, names: Iterable[str]) -> np.ndarr
     return numbers
 
 
+def require(good: bool, words: str) -> None:
+    """Raise where an answer of a device is bad.
+
+    Raises:
+        InvalidProblem: in these words.
+    """
+    if not good:
+        raise InvalidProblem(words)
+
+
 def require_methods(where: str, value: object, methods: Iterable[str], example: str) -> None:
     """Raise where an object of a package is something else.
 

@@ -8,15 +8,13 @@ A value with a bad status, and one that is too old, are bad answers: they are he
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
-
-from fpirhc.adapters.names import adapter
+from fpirhc.adapters.names import adapter, require
 from fpirhc.adapters.real_time import RealTime, Setup, device
-from fpirhc.errors import InvalidProblem, InvalidValue, package
+from fpirhc.errors import InvalidValue, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
@@ -76,7 +74,7 @@ class _Session:
         self._sent, self._read = ([self._client.get_node(name) for name in names] for names in self._names)
         self._types = [node.read_data_type_as_variant_type() for node in self._sent]
 
-    def write(self, command: np.ndarray) -> None:
+    def write(self, command: Iterable[float]) -> None:
         """Write every node, as the type that it has."""
         for node, kind, value in zip(self._sent, self._types, command, strict=True):
             node.write_value(float(value), kind)
@@ -85,7 +83,6 @@ class _Session:
         """Values with a good status, and the ages of their source time stamps."""
         for node, name in zip(self._read, self._names[1], strict=True):
             value = node.read_data_value(raise_on_bad_status=False)
-            if not value.StatusCode.is_good():
-                raise InvalidProblem(f"{name} has the status {value.StatusCode.name}")
+            require(value.StatusCode.is_good(), f"{name} has the status {value.StatusCode.name}")
             age = (datetime.now(UTC) - value.SourceTimestamp).total_seconds() if value.SourceTimestamp else 0.0
             yield float(value.Value.Value), age

@@ -49,7 +49,7 @@ class Link(Protocol):
     def open(self) -> None:
         """Connect; an earlier connection is closed."""
 
-    def write(self, command: np.ndarray) -> None:
+    def write(self, command: Iterable[float]) -> None:
         """Send the values of the inputs."""
 
     def read(self) -> Iterable[tuple[float, float]]:

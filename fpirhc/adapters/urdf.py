@@ -66,10 +66,9 @@ def arm(urdf: str | Path, *, exact: Mapping[str, float] | None = None) -> Plant:
         return ca.jtimes(places, angles, forces, True) + robot.damping * rates
 
     def response(q: Named, v: Named, u: Named, p: Named) -> Mapping[str, Expression]:
-        wanted = ca.SX.sym("r", len(joints))
+        wanted, pushed = ca.SX.sym("r", len(joints)), ca.vertcat(*(u[name] for name in inputs))
         inertia, bias = ca.linear_coeff(efforts(q, v, Named(tuple(joints), wanted, "coordinate"), p), wanted)
-        forced = ca.solve(inertia, ca.vertcat(*(u[name] for name in inputs)) - bias)
-        return dict(zip(joints, ca.vertsplit(forced), strict=True))
+        return dict(zip(joints, ca.vertsplit(ca.solve(inertia, pushed - bias)), strict=True))
 
     def inverse(q: Named, v: Named, r: Named, p: Named) -> Mapping[str, Expression]:
         return dict(zip(inputs, ca.vertsplit(efforts(q, v, r, p)), strict=True))

@@ -6,6 +6,7 @@ import importlib
 import inspect
 import pkgutil
 import re
+import runpy
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -77,3 +78,12 @@ def test_what_overrides_nothing_documented_has_a_docstring_of_its_own():
     described = {name: inspect.isfunction(value) or isinstance(value, property) for name, value in public.items()}
     assert sum(described.values()) > 1000
     assert sorted(name for name in public if described[name] and not inspect.getdoc(public[name])) == []
+
+
+def test_an_adapter_has_at_most_sixty_lines_of_code():
+    """It is a translation (decision 0075): more would be a simulator or a bus of our own. What several need stands beside them."""
+    lines = runpy.run_path(str(ROOT / "scripts" / "code_lines.py"))["code_lines"]
+    adapters = sorted((ROOT / "fpirhc" / "adapters").glob("*.py"))
+    sizes = {one.name: len(lines(one.read_text(encoding="utf-8"))) for one in adapters}
+    assert {"fmu.py", "can_bus.py", "environment.py", "urdf.py"} <= set(sizes)
+    assert {name: n for name, n in sizes.items() if n > 60 and name not in ("names.py", "real_time.py")} == {}
