@@ -37,7 +37,7 @@ BESIDE = {  # for authors of members and for tools; imported from the module
     "Review": "fpirhc.review.question",
     "ScenarioComparison": "fpirhc.studies.scenarios.scenario_comparison",
     "Suggestion": "fpirhc.review.questions.noise",
-    "Tuning": "fpirhc.studies.tuning.tune",
+    "Tuning": "fpirhc.studies.tune",
     "assess_gain": "fpirhc.contraction.spectrum",
     "check_controller": "fpirhc.conformance",
     "check_deformation": "fpirhc.conformance",

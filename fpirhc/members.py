@@ -204,7 +204,7 @@ FORMER = {  # names of earlier versions, and names that have left the top level
     "RfptVector": "RFPTVector",
     "ScenarioComparison": "studies.scenarios.scenario_comparison.ScenarioComparison",
     "Suggestion": "review.questions.noise.Suggestion",
-    "Tuning": "studies.tuning.tune.Tuning",
+    "Tuning": "studies.tune.Tuning",
     "Watch": "RunMonitor",
     "accept": "baselines.check.accept",
     "assess_gain": "contraction.spectrum.assess_gain",

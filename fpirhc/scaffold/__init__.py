@@ -1,1 +1,101 @@
-"""The first files of a user's problem."""
+"""Writes a problem file and its test under a new name."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import sys
+from importlib.machinery import PathFinder
+from importlib.resources import files
+from pathlib import Path
+
+from fpirhc.baselines.baseline import baseline_path
+from fpirhc.baselines.check import accept
+from fpirhc.errors import InvalidName, OutputError, not_writable
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.problem_files.shipped import shipped_problems
+
+_LONGEST = 60  # characters of a name
+_FALLBACK = "my_plant"
+
+
+def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
+    """Write NAME.py and test_NAME.py into the folder, which is created where it is missing, and return their paths."""
+    check_name(name)
+    baseline = baseline_path(folder / f"{name}.py")
+    if baseline.exists() or baseline.is_symlink():
+        raise OutputError(f"'{baseline}' exists already and is kept; choose another name or --dir")
+    texts = {
+        folder / f"{name}.py": _template("problem.txt", name),
+        folder / f"test_{name}.py": _template("test.txt", name),
+    }
+    written: list[Path] = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, text in texts.items():
+            # Exclusive: a file or link that is there already is never written to.
+            with path.open("x", encoding="utf-8") as file:
+                written.append(path)
+                file.write(text)
+    except OSError as error:
+        for path in written:
+            path.unlink(missing_ok=True)
+        if isinstance(error, FileExistsError) and error.filename != str(folder):
+            raise OutputError(f"'{error.filename}' exists already and is kept; choose another name or --dir") from None
+        raise not_writable(folder, error, "--dir") from None
+    return tuple(written)
+
+
+def first_baseline(problem_file: Path) -> Path:
+    """Measure the first baseline of a new problem and return its path."""
+    task = load_problem(str(problem_file))
+    _, path = accept(task, "first numbers of a new problem", working=problem_file.parent)
+    return path
+
+
+def check_name(name: str) -> None:
+    """Raise unless a problem can have this name."""
+    usable = _usable(name)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise InvalidName(
+            f"{_shown(name)} is no name for a problem: it must begin with a letter and go on with letters, digits and "
+            f"underscores. Try '{usable}'; a folder is given by --dir"
+        )
+    if len(name) > _LONGEST:
+        raise InvalidName(f"a name of {len(name)} characters is too long: at most {_LONGEST}. Try '{usable}'")
+    reason = _taken(name)
+    if reason:
+        raise InvalidName(f"'{name}' cannot be the name of a problem: {reason}. Try '{usable}'")
+
+
+def _taken(name: str) -> str:
+    """Reason why a well-formed name cannot be used; empty for a usable name."""
+    if keyword.iskeyword(name) or keyword.issoftkeyword(name):
+        return "it is a word of Python"
+    if name.lower().startswith("test_") or name.lower() in ("test", "conftest"):
+        return "pytest would take the problem file for a test"
+    # Without the current folder: a problem file in it is not an installed module.
+    installed = [p for p in sys.path if p and Path(p).resolve() != Path.cwd()]
+    if name in sys.stdlib_module_names or PathFinder.find_spec(name, installed):
+        return "a module of that name is installed, which the file would hide from everything beside it"
+    if name in shipped_problems():
+        return "a shipped problem has it (see 'fpirhc list')"
+    return ""
+
+
+def _usable(name: str) -> str:
+    """A name like the given one that can be used."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", name.removesuffix(".py")).strip("_")[: _LONGEST - 8].lower()
+    if not plain:
+        return _FALLBACK
+    candidate = plain if plain[0].isalpha() else f"plant_{plain}"
+    return f"my_{candidate}" if _taken(candidate) else candidate
+
+
+def _shown(name: str) -> str:
+    """The name between quotes, at most a line long, with escapes for characters that cannot be printed."""
+    return ascii(name if len(name) <= _LONGEST else name[:_LONGEST] + "...")
+
+
+def _template(file: str, name: str) -> str:
+    return files("fpirhc.scaffold").joinpath(file).read_text(encoding="utf-8").replace("NAME", name)

@@ -14,7 +14,7 @@ import fpirhc as fp
 from fpirhc import doctor as machine
 from fpirhc.cli.main import main
 from fpirhc.doctor import Diagnosis, Finding, Outcome, ask
-from fpirhc.scaffold.create import create_problem
+from fpirhc.scaffold import create_problem
 from fpirhc.symbolic.native import Native, cache_folder, own_name
 
 pytest_plugins = ["pytester"]

@@ -388,7 +388,7 @@ def test_exit_codes_are_those_of_the_help(verb, folder, monkeypatch, capsys):
     from fpirhc.doctor import Diagnosis, Finding, Outcome
 
     # The baseline of a new problem is measured in a test of its own.
-    monkeypatch.setattr("fpirhc.scaffold.create.first_baseline", lambda path: path.with_suffix(".json"))
+    monkeypatch.setattr("fpirhc.scaffold.first_baseline", lambda path: path.with_suffix(".json"))
     monkeypatch.setattr(
         "fpirhc.doctor.examine",
         lambda: Diagnosis({}, [Finding("a check", Outcome.FAIL if FAULTY else Outcome.OK, "found")]),

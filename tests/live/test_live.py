@@ -23,7 +23,7 @@ from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import TUNING
-from fpirhc.studies.tuning.tune import tune
+from fpirhc.studies.tune import tune
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.live import live_number
 from fpirhc.symbolic.paths import content_at

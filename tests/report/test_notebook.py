@@ -24,8 +24,8 @@ from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run
 from fpirhc.review.question import Answer, Review, Verdict
 from fpirhc.studies.comparison.comparison import Comparison
+from fpirhc.studies.objective import Objective
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
-from fpirhc.studies.tuning.objective import Objective
 from fpirhc.summary import printable, table
 
 HOSTILE = "<img src=x onerror=alert(1)>[bold red]$\\frac$ \x1b[31m:bomb: `id` $(id) \"'&"

@@ -30,13 +30,12 @@ from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
 from fpirhc.plant.plant import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import is_late, scaled
-from fpirhc.studies.scenarios import paired, running
+from fpirhc.studies.scenarios import paired
 from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error
 from fpirhc.studies.scenarios.cluster import DEATHS, Workers
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger
-from fpirhc.studies.scenarios.paired import Quantiles, median_interval, middle, share_interval, verdict
-from fpirhc.studies.scenarios.running import summarise
+from fpirhc.studies.scenarios.paired import Quantiles, median_interval, middle, share_interval, summarise, verdict
 
 LINE = line_text(
     "period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}", bounds="(0.5, 2.4)", more=EXACT
@@ -651,8 +650,8 @@ def test_the_summary_of_many_scenarios_is_that_of_all(monkeypatch):
     after[17] = np.inf
     pair = [_records(name, [None if np.isinf(e) else e for e in some]) for name, some in (("A", before), ("B", after))]
     exact = summarise("B", pair[1], pair[0], seed=0)
-    monkeypatch.setattr(running, "Quantiles", lambda room=256: Quantiles(room=min(room, 256)))
-    monkeypatch.setattr(running, "_SHOWN", 100)
+    monkeypatch.setattr(paired, "Quantiles", lambda room=256: Quantiles(room=min(room, 256)))
+    monkeypatch.setattr(paired, "_SHOWN", 100)
     told = summarise("B", pair[1], pair[0], seed=0)
     assert (exact.median, exact.scenarios.size) == (np.median(after), 3000)
     for name in ("count", "worst_scenario", "first_ended", "outcomes", "statuses", "better", "equal", "worst_metrics"):

@@ -20,7 +20,7 @@ from fpirhc.studies.scenarios.bench import Bench, Conditions, ranges, relative_e
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
 from fpirhc.studies.sweep import Axis, sweep
-from fpirhc.studies.tuning.tune import tune
+from fpirhc.studies.tune import tune
 from fpirhc.symbolic.native import Native, native
 
 TWO_MASS = fp.load_problem("two_mass")

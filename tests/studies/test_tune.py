@@ -15,8 +15,8 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported, OutputError, ProblemFileError
 from fpirhc.problem_files.settings import current_setting, is_whole
-from fpirhc.studies.tuning.objective import PENALTY, objective
-from fpirhc.studies.tuning.tuned_file import read_tuned, with_tuned
+from fpirhc.studies.objective import PENALTY, objective
+from fpirhc.studies.tuned_file import read_tuned, with_tuned
 
 TUNING = """tuning = {
     "CTC": {"tracking.rate": fp.Span(2.0, 12.0)},

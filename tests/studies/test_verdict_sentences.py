@@ -20,7 +20,7 @@ from fpirhc.studies.comparison.entry import Entry, no_bound_because
 from fpirhc.studies.comparison.optimality import Optimality
 from fpirhc.studies.comparison.timing import CycleTime, Price
 from fpirhc.studies.comparison.verdict import findings
-from fpirhc.studies.tuning.objective import Objective
+from fpirhc.studies.objective import Objective
 from fpirhc.symbolic.layout import Layout, Signal
 
 STOP = "signal 'x' is not finite"

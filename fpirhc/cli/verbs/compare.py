@@ -91,7 +91,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.terminal import announce_backend, progress_bars
     from fpirhc.studies.comparison.compare import compare, select
     from fpirhc.studies.open_loop import with_optimisers
-    from fpirhc.studies.tuning.tuned_file import noted, read_tuned, with_tuned
+    from fpirhc.studies.tuned_file import noted, read_tuned, with_tuned
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     task = with_tuned(task, tuned.values) if tuned else task
@@ -198,7 +198,7 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
 def _compared(options: argparse.Namespace, task: Task, folder: Path) -> ScenarioComparison:
     from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
-    from fpirhc.studies.tuning.tuned_file import read_tuned
+    from fpirhc.studies.tuned_file import read_tuned
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:

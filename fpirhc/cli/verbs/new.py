@@ -17,7 +17,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> ExitCode:
     import shlex
 
-    from fpirhc.scaffold.create import create_problem, first_baseline
+    from fpirhc.scaffold import create_problem, first_baseline
 
     problem, test = create_problem(options.name, Path(options.dir))
     print(f"wrote {problem}\nwrote {test}")

@@ -21,7 +21,7 @@ from fpirhc.cli.output import results_folder, resumable
 from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
-    from fpirhc.studies.tuning.tune import Tuning
+    from fpirhc.studies.tune import Tuning
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -51,8 +51,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.terminal import progress_bars
-    from fpirhc.studies.tuning.tune import LEDGER, tune
-    from fpirhc.studies.tuning.tuned_file import write_tuned
+    from fpirhc.studies.tune import LEDGER, tune
+    from fpirhc.studies.tuned_file import write_tuned
 
     drawn = f"{options.scenarios}x{options.mismatch:g}percent"
     name = f"tuning_{'cases' if options.cases else drawn}_seed{options.seed}"

@@ -45,7 +45,7 @@ from fpirhc.studies.comparison.pairwise import (
 )
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
-from fpirhc.studies.tuning.objective import objective
+from fpirhc.studies.objective import objective
 from fpirhc.studies.view import Progress, circumstances
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem

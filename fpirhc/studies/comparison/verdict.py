@@ -28,7 +28,7 @@ from fpirhc.studies.comparison.causes import (
     stuck_cause,
 )
 from fpirhc.studies.comparison.changes import HELPS, HURTS, ROUNDING, Change, Finding, Outcome, major, outcome_of, times
-from fpirhc.studies.tuning.objective import Objective
+from fpirhc.studies.objective import Objective
 from fpirhc.summary import written_out
 
 if TYPE_CHECKING:

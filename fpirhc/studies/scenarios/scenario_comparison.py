@@ -13,8 +13,8 @@ from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked import FoundByName
 from fpirhc.simulation.metrics.base import Column as Number
 from fpirhc.simulation.pictures.base import Picture
+from fpirhc.studies.objective import Objective
 from fpirhc.studies.scenarios.paired import Record, Summary, noun
-from fpirhc.studies.tuning.objective import Objective
 from fpirhc.studies.view import Study, View, status_shares
 from fpirhc.summary import Column, Table, in_percent, line, written_out
 

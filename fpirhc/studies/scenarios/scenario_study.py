@@ -22,6 +22,7 @@ from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
 from fpirhc.simulation.metrics.base import Column
 from fpirhc.studies.comparison.compare import check_gains, select
+from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.scenarios.bench import (
     SIDE_BY_SIDE,
     Bench,
@@ -35,12 +36,10 @@ from fpirhc.studies.scenarios.bench import (
 from fpirhc.studies.scenarios.cluster import Cluster, Workers
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger, Records, begun_with, header_of
-from fpirhc.studies.scenarios.paired import Summary, noun, verdict
-from fpirhc.studies.scenarios.running import summarise
+from fpirhc.studies.scenarios.paired import Summary, noun, summarise, verdict
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 from fpirhc.studies.scenarios.worker import Job, answered
-from fpirhc.studies.tuning.objective import Objective, objective
-from fpirhc.studies.tuning.tuned_file import with_tuned
+from fpirhc.studies.tuned_file import with_tuned
 from fpirhc.studies.view import Progress, circumstances
 
 LEDGER = "scenarios.jsonl"

@@ -12,7 +12,7 @@ from fpirhc.errors import Mistakes, ProblemFileError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values, with_settings
 from fpirhc.studies.comparison.comparison import Comparison
-from fpirhc.studies.tuning.objective import RELATIVE_ERROR
+from fpirhc.studies.objective import RELATIVE_ERROR
 from fpirhc.whole_file import write_whole
 
 FORMAT = 1

@@ -22,6 +22,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.pairwise import harm_of_adaptation
+from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.scenarios.bench import (
     SIDE_BY_SIDE,
     Conditions,
@@ -32,8 +33,7 @@ from fpirhc.studies.scenarios.bench import (
 )
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger, begun_with
-from fpirhc.studies.tuning.objective import Objective, objective
-from fpirhc.studies.tuning.tuned_file import as_python
+from fpirhc.studies.tuned_file import as_python
 from fpirhc.studies.view import Progress
 from fpirhc.symbolic.paths import content_at, paths_to
 

@@ -1,1 +1,0 @@
-"""Settings found by search, with the same budget for every controller."""
