@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from acados_plans import acados_plans, again_with_acados
@@ -124,10 +124,12 @@ def ways(ocp: OptimalControl) -> dict[str, Callable[[], Solve]]:
     shape = ocp.input.size, ocp.stages
     own = {"FixedPoint": lambda: follow(fixed, ocp, native(fixed.converging(ocp)).function)}
     if ACADOS in sys.argv:
+        plain = replace(fixed, hessian=fp.GaussNewton())
         return {
             **own,
+            "the same, Gauss-Newton": lambda: follow(plain, ocp, native(plain.converging(ocp)).function),
             "acados, SQP with HPIPM": lambda: acados_plans(ocp, exact=False, accuracy=1e-6),
-            "the same, exact Hessian": lambda: acados_plans(ocp, exact=True, accuracy=1e-6),
+            "acados, exact Hessian": lambda: acados_plans(ocp, exact=True, accuracy=1e-6),
         }
     return {
         **own,

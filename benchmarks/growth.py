@@ -1,8 +1,10 @@
-"""How one iteration and its code grow with the horizon and with the states, and what a whole adaptive cycle costs.
+"""How one iteration and its code grow with the horizon and with the states, with and without limits of states, and what a whole
+adaptive cycle costs.
 
     python benchmarks/growth.py [--write]          --write puts the tables into docs/performance.md
 
-Compile times are measured with an empty cache of compiled libraries.
+Compile times are wall times with an empty cache of compiled libraries, whose files are compiled side by side. Without limits of
+states a row is one iteration; with limits it is a whole plan from nothing, because a call there ends where its plan is solved.
 """
 
 from __future__ import annotations
@@ -32,16 +34,22 @@ from table import write_table
 
 CALLS = 2000
 ITERATION = fp.FixedPoint(iterations=1, tolerance=1e-6)
+NOTHING = Evaluator(ca.Function("nothing", [ca.SX.sym("x")], [ca.SX(0)]))
 
 
 def median(evaluator: Evaluator) -> float:
-    """Microseconds of one evaluation, the median of many."""
+    """Microseconds of one evaluation, the median of many, less those of an evaluation of nothing: what a call from Python takes."""
+    return (_median(evaluator) - _median(NOTHING)) / 1e3
+
+
+def _median(evaluator: Evaluator) -> float:
+    """Nanoseconds."""
     taken = np.empty(CALLS)
     for k in range(CALLS):
         begin = time.perf_counter_ns()
         evaluator.evaluate()
         taken[k] = time.perf_counter_ns() - begin
-    return float(np.median(taken)) / 1e3
+    return float(np.median(taken))
 
 
 def compiled(function: ca.Function) -> tuple[Evaluator, float, float]:
@@ -72,6 +80,17 @@ def iteration(p: fp.Problem) -> tuple[str, ...]:
     )
 
 
+def limited(p: fp.Problem, size: float, *names: str) -> fp.Problem:
+    """The problem with states that stay within a size."""
+    return replace(p, limits=replace(p.limits, states=dict.fromkeys(names, (-size, size))))
+
+
+def staged(p: fp.Problem, stages: int) -> fp.Problem:
+    """The problem with so many stages."""
+    assert p.horizon is not None
+    return replace(p, horizon=replace(p.horizon, stages=stages))
+
+
 def cycle() -> tuple[str, ...]:
     """One adaptive RHC+FPI cycle, measurement to command, that plans anew with one iteration."""
     task = fp.load_problem("two_mass")
@@ -88,11 +107,11 @@ def main() -> None:
     """Measure and print."""
     two_mass = fp.load_problem("two_mass").problem
     chain = runpy.run_path(str(fp.load_problem("chain_of_masses").path))["chain"]
-    rows = [
-        ("two_mass, one iteration", *iteration(replace(two_mass, horizon=replace(two_mass.horizon, stages=n))))
-        for n in (10, 20, 50, 100, 200)
-    ]
+    rows = [("two_mass, one iteration", *iteration(staged(two_mass, n))) for n in (10, 20, 50, 100, 200)]
     rows += [(f"chain of {n}, one iteration", *iteration(chain(n))) for n in (3, 5, 7)]
+    slow = limited(two_mass, 8.0, "q1'", "q2'")
+    rows += [("two_mass, limits of states, a plan", *iteration(staged(slow, n))) for n in (20, 200)]
+    rows += [(f"chain of {n}, limits of states, a plan", *iteration(limited(chain(n), 0.1, "ye"))) for n in (3, 5)]
     rows.append(("two_mass, whole RHC+FPI cycle", *cycle()))
     heads = ("what", "stages", "states", "microseconds", "ns per stage", "kB of C", "s to compile")
     write_table("growth", heads, rows)

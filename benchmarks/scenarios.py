@@ -5,8 +5,9 @@
                                                                         --memory measures large studies alone, in minutes
 
 A record is one run of one controller in one scenario, with its metrics: processor time, the smallest of many, of single runs and of
-runs side by side; bytes of memory are those of a thousand more records that are read from a file. The memory of a study is the
-largest one that a command holds, in a process of its own.
+runs side by side, in rounds in which all rows take turns, so that other work falls on all of them. Bytes of memory are those of a
+thousand more records that are read from a file. The memory of a study is the largest one that a command holds, in a process of its
+own.
 
 Libraries are compiled before anything is timed. In every round the five ways take turns, so that whatever else the machine does
 falls on all: one process on one core; on both cores one process, two processes, two workers of a local Dask cluster, and, for what
@@ -24,6 +25,7 @@ import sys
 import tempfile
 import time
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +40,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table
 
 ROUNDS = 3
-RECORDS = 25  # that are timed
+RECORDS = 25  # that are timed, in as many rounds
 SOME, MORE = 40, 80  # times that they are read in the smaller and the larger file
-TURNS, BLOCK = 4, 64  # of scenarios side by side; the first one compiles
+BLOCK = 64  # scenarios side by side
 LARGE = "fishery", ("CTC", "CTC+FPI"), (1_000, 10_000, 100_000)  # studies whose memory is measured
 STUDIES = (
     ("two_mass", ("CTC", "CTC+FPI (eq 6)"), 20_000),
@@ -130,30 +132,47 @@ def memory(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ..
     )
 
 
-def record(name: str, controller: str) -> tuple[str, ...]:
-    """One row: what a record costs."""
-    task = fp.load_problem(name)
-    bench = Bench(task, Conditions(seed=0, use=COMPARING, percent=10.0, compiled=True))
-    made, taken = [bench.record(0, controller)], []
-    for number in range(1, RECORDS):
+class Records:
+    """One row: what a record costs, in rounds."""
+
+    def __init__(self, name: str, controller: str) -> None:
+        task = fp.load_problem(name)
+        self._name, self._controller = f"{name}: {controller}, {task.problem.cycles} cycles", controller
+        conditions = Conditions(seed=0, use=COMPARING, percent=10.0, compiled=True)
+        self._alone, self._together = Bench(task, conditions), Bench(task, replace(conditions, side_by_side=True))
+        self._made: list[dict[str, Any]] = []
+        self._taken: list[tuple[float, float]] = []  # alone and side by side, s
+
+    def round(self, number: int) -> None:
+        """Time one record alone, and some side by side."""
         begin = time.process_time()
-        made.append(bench.record(number, controller))
-        taken.append(time.process_time() - begin)
-    lanes, together = Bench(task, Conditions(seed=0, use=COMPARING, percent=10.0, compiled=True, side_by_side=True)), []
-    for turn in range(TURNS):
-        begin = time.process_time()
-        some = list(lanes.records(range(turn * BLOCK, (turn + 1) * BLOCK), controller))
-        together.append((time.process_time() - begin) / len(some))
-    memory = [held([{**one, "scenario": k} for k, one in enumerate(made * times)]) for times in (SOME, MORE)]
-    lines = [len(json.dumps(one, separators=(",", ":"))) for one in made]
-    return (
-        f"{name}: {controller}, {task.problem.cycles} cycles",
-        f"{1e3 * min(taken):.1f}",
-        f"{1e3 * min(together):.2f}",
-        f"{min(taken) / min(together):.1f}",
-        f"{(memory[1] - memory[0]) / (RECORDS * (MORE - SOME)):.0f}",
-        f"{np.mean(lines):.0f}",
-    )
+        self._made.append(self._alone.record(number, self._controller))
+        between = time.process_time()
+        some = list(self._together.records(range(number * BLOCK, (number + 1) * BLOCK), self._controller))
+        self._taken.append((between - begin, (time.process_time() - between) / len(some)))
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Its cells; the first round compiles."""
+        alone, together = np.min(self._taken[1:], axis=0)
+        some = [held([{**one, "scenario": k} for k, one in enumerate(self._made * times)]) for times in (SOME, MORE)]
+        return (
+            self._name,
+            f"{1e3 * alone:.1f}",
+            f"{1e3 * together:.2f}",
+            f"{alone / together:.1f}",
+            f"{(some[1] - some[0]) / (len(self._made) * (MORE - SOME)):.0f}",
+            f"{np.mean([len(json.dumps(one, separators=(',', ':'))) for one in self._made]):.0f}",
+        )
+
+
+def records() -> list[tuple[str, ...]]:
+    """Every row."""
+    some = [Records(name, one) for name, names, _ in STUDIES for one in names[:2]]
+    for number in range(RECORDS):
+        for one in some:
+            one.round(number)
+    return [one.row for one in some]
 
 
 def held(records: list[dict[str, Any]]) -> int:
@@ -185,7 +204,7 @@ def main() -> None:
         write_table("study memory", heads_of_studies, [memory(name, controllers, count) for count in counts])
         return
     heads = ("a record", "ms", "ms side by side", "times faster", "bytes of memory", "bytes in the file")
-    write_table("records", heads, [record(name, one) for name, names, _ in STUDIES for one in names[:2]])
+    write_table("records", heads, records())
     if "--records" in sys.argv:
         return
     rows = []
