@@ -67,7 +67,15 @@ def answered(folder: Path, name: str, rows: np.ndarray) -> tuple[np.ndarray, flo
     table = ",\n".join("{" + ", ".join(repr(float(np.float32(v))) for v in row) + "}" for row in rows)
     words = {"name": name, "inputs": str(rows.shape[1]), "rows": table}
     (folder / "main.c").write_text(re.sub(r"@(\w+)@", lambda m: words[m[1]], _MAIN))
-    flags = ["-mmcu=atmega328p", "-std=gnu99", "-Os", "-ffunction-sections", "-Wl,--gc-sections", f"-I{folder / 'src'}"]
+    flags = [
+        "-mmcu=atmega328p",
+        "-std=gnu99",
+        "-Os",
+        "-ffunction-sections",
+        "-Wl,--gc-sections",
+        "-Wl,--relax",
+        f"-I{folder / 'src'}",
+    ]
     sources = [*map(str, sorted((folder / "src").glob("*.c"))), str(folder / "main.c")]
     program = str(folder / "program.elf")
     subprocess.run(["avr-gcc", *flags, *sources, "-lm", "-o", program], check=True)

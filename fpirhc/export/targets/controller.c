@@ -13,20 +13,19 @@ enum { BEFORE = @before@, HELD = @held@, SKIPPED = @skipped@ };                /
 enum { STATUS = @status@, SKIPPED_NOW = @skipped_now@, COMMAND = @command@ };  /* in the trace */
 enum { FAILS = @fails@, CHANGES = @changes@ }; /* whether a loop in it can fail, and whether limits may be changed */
 
-static int run(@name@_controller* c, const @name@_inputs* in, casadi_real* command) {
+/* One cycle; returns whether a solver failed, and then the memory stays. Numbers are copied one by one: small processors copy bytes
+   in more time. */
+static int cycle(@name@_controller* c, const @name@_inputs* in, casadi_real* command) {
+  casadi_real* to = (casadi_real*)&c->memory;
+  const casadi_real* from = (const casadi_real*)&c->next;
+  const casadi_real* end = from + @NAME@_MEMORY;
 @bind@
   c->res[0] = (casadi_real*)&c->next;
   c->res[1] = (casadi_real*)&c->trace;
   c->res[2] = command;
-  return @name@_raw(c->arg, c->res, c->iw, c->w, 0);
-}
-
-/* The next memory is in force. Number by number: small processors copy bytes in more time. */
-static void take(@name@_controller* c) {
-  casadi_real* to = (casadi_real*)&c->memory;
-  const casadi_real* from = (const casadi_real*)&c->next;
-  const casadi_real* end = from + @NAME@_MEMORY;
+  if (@name@_raw(c->arg, c->res, c->iw, c->w, 0)) return 1;
   while (from != end) *to++ = *from++;
+  return 0;
 }
 
 /* Cycles between two steps, whose samples are missing; 0 where the later step is the next cycle, or cannot follow the other. */
@@ -75,20 +74,15 @@ void @name@_reset(@name@_controller* c) {
 @name@_status @name@_step(@name@_controller* c, const @name@_inputs* in, @name@_command* out) {
   casadi_real *memory = (casadi_real*)&c->memory, *command = (casadi_real*)out, before = memory[BEFORE];
   long missed = in->time - before > (casadi_real)1.5 * PERIOD ? missed_cycles(in->time, before) : 0;
-  long k = missed > MISSED ? missed - MISSED : 0, dropped = k;
-  @name@_inputs lost;
-  for (;; ++k) {
-    const @name@_inputs* now = in;
-    if (k < missed) {
-      lost = *in, now = &lost;
-      ((casadi_real*)&lost)[@first@] = (casadi_real)NAN;
-      lost.time = before + (casadi_real)(k + 1) * PERIOD;
-    }
-    if (k == missed && dropped) memory[SKIPPED] += (casadi_real)dropped;
-    if (run(c, now, command) && FAILS) return hold(c, in->time, command);
-    take(c);
-    if (k == missed) break;
+  long dropped = missed > MISSED ? missed - MISSED : 0, k;
+  @name@_inputs lost = *in;
+  ((casadi_real*)&lost)[@first@] = (casadi_real)NAN;
+  for (k = dropped; k < missed; ++k) {
+    lost.time = before + (casadi_real)(k + 1) * PERIOD;
+    if (cycle(c, &lost, command) && FAILS) return hold(c, in->time, command);
   }
+  if (dropped) memory[SKIPPED] += (casadi_real)dropped;
+  if (cycle(c, in, command) && FAILS) return hold(c, in->time, command);
   if (CHANGES) clip(c, command);
   return (@name@_status)((casadi_real*)&c->trace)[STATUS];
 }

@@ -1,0 +1,218 @@
+"""Random settings, samples, faults and instances: what leaves Python answers as the stepper, in double bit by bit."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.export.device import Device
+from fpirhc.export.target import device_of
+from fpirhc.export.targets.c import filled, sources
+from fpirhc.status import Status
+from fpirhc.symbolic.native import find_compiler
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+# Controllers of states, of outputs, of a map and of sensors, a plan, and what of each may be live.
+CASES = {
+    "torque": (
+        "two_mass",
+        "CTC+FPI (eq 6)",
+        ("deformation.gain", "tracking.rate", "limits.inputs.Q1", "limits.inputs.Q2"),
+    ),
+    "vector": ("two_mass", "CTC+FPI (eq 3)", ("deformation.gain", "limits.inputs.Q2")),
+    "outputs": ("anaesthesia", "CTC+FPI", ("deformation.gain", "limits.inputs.infusion")),
+    "map": ("fishery", "CTC+FPI", ("deformation.map.gain", "limits.inputs.effort")),
+    "plan": ("leaking_tanks", "RHC+FPI", ("deformation.gain", "limits.inputs.u")),
+}
+INSTANCES, CYCLES = 3, 160
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+
+
+@cache
+def samples(of: str, title: str) -> np.ndarray:
+    """Samples of a run of a controller, its time first, without the time."""
+    task = fp.load_problem(of)
+    device = device_of(task.problem, task.controllers[title], title, cycles=1)
+    run = fp.simulate(task.problem.of_equations, task.controllers[title], seed=0)
+    parts = [np.reshape(run[name], (len(run.time), -1)) for name in device.inputs.names if name != "time"]
+    return np.resize(np.hstack(parts), (CYCLES, sum(part.shape[1] for part in parts)))
+
+
+def device(name: str, *, live: bool = True, bare: bool = False) -> Device:
+    of, title, paths = CASES[name]
+    task = fp.load_problem(of)
+    given = paths if live else ()
+    return device_of(task.problem, task.controllers[title], title, name="arm", live=given, cycles=1, bare=bare)
+
+
+def random_rows(name: str, device: Device, random: np.random.Generator, bad: Sequence[float]) -> np.ndarray:
+    """Samples of a run with noise; one in eight has a number of `bad`, one in twenty comes after missed cycles, or once more."""
+    of, title, _ = CASES[name]
+    rows = samples(of, title) * (1 + 1e-3 * random.standard_normal((CYCLES, 1)))
+    time = np.cumsum(np.where(random.random(CYCLES) < 0.05 * bool(bad), random.integers(0, 70, CYCLES), 1))
+    rows = np.hstack([device.problem.period * time[:, None], rows])
+    for k in range(CYCLES):
+        if bad and random.random() < 0.125:
+            rows[k, random.integers(rows.shape[1])] = random.choice(bad)
+    return rows
+
+
+class Library:
+    """A controller in C, called with arrays."""
+
+    def __init__(self, device: Device, folder: Path, real: str = "double") -> None:
+        folder.mkdir()
+        call = "  return arm_set((arm_controller*)controller, (arm_setting)setting, (casadi_real)value);"
+        nothing = "  (void)controller, (void)setting, (void)value;\n  return 0;"
+        own = {**sources(device), "library.c": filled(device, "library.c", change=call if device.bounds else nothing)}
+        for file, text in own.items():
+            (folder / file).write_text(text)
+        files = [str(folder / file) for file in own if file.endswith(".c")]
+        flags = ["-std=c99", "-O1", "-ffp-contract=off", "-fPIC", "-shared", f"-Dcasadi_real={real}"]
+        subprocess.run([str(find_compiler()), *flags, *files, "-o", str(folder / "arm.so"), "-lm"], check=True)
+        self.called = ctypes.CDLL(str(folder / "arm.so"))
+        self.paths, self.commands = list(device.bounds), device.problem.plant.input.size
+
+    def begun(self) -> ctypes.Array[ctypes.c_char]:
+        """One more instance."""
+        made = ctypes.create_string_buffer(self.called.arm_size())
+        self.called.arm_begin(made)
+        return made
+
+    def cycle(self, instance: ctypes.Array[ctypes.c_char], row: np.ndarray) -> list[float]:
+        """Status and command of one cycle."""
+        command = (ctypes.c_double * self.commands)()
+        return [self.called.arm_cycle(instance, (ctypes.c_double * len(row))(*row), command), *command]
+
+    def change(self, instance: ctypes.Array[ctypes.c_char], path: str, value: float) -> bool:
+        """Whether a number is put in force."""
+        return bool(self.called.arm_change(instance, self.paths.index(path), ctypes.c_double(value)))
+
+
+Change = tuple[str, float]
+
+
+def random_changes(device: Device, random: np.random.Generator) -> dict[int, list[Change]]:
+    """Numbers inside the bounds of a setting and, one in three, not: no numbers, and those far outside."""
+    changes: dict[int, list[Change]] = {}
+    start = settings_of(device)
+    for k in sorted(random.choice(CYCLES, 12, replace=False).tolist()):
+        path = list(device.bounds)[random.integers(len(device.bounds))]
+        low, high = device.bounds[path]
+        near = start[path] * random.uniform(0.7, 1.1)
+        span = abs(start[path]) + 1.0
+        outside = [np.nan, np.inf, -np.inf, *(end for end in (low - span, high + span) if np.isfinite(end))]
+        changes.setdefault(k, []).append((path, float(random.choice(outside)) if random.random() < 1 / 3 else near))
+    return changes
+
+
+def is_allowed(device: Device, now: dict[str, float], path: str, value: float) -> bool:
+    """Whether a device is to take a number: finite, inside its bounds, and an interval stays one."""
+    low, high = device.bounds[path]
+    owner, _, end = path.rpartition(".")
+    other = now.get(f"{owner}.{ {'0': '1', '1': '0'}.get(end, '') }")
+    ordered = other is None or (value < other if end == "0" else value > other)
+    return bool(np.isfinite(value) and low <= value <= high and ordered)
+
+
+def stepped(
+    device: Device, rows: np.ndarray, changes: dict[int, list[Change]]
+) -> Iterator[tuple[list[bool], list[float]]]:
+    """What is to come in every cycle: whether changes are taken, and the status and command of Python with those that are."""
+    stepper, now = device.stepper, settings_of(device)
+    memory = stepper.start()
+    for k, row in enumerate(rows):
+        taken = []
+        for path, value in changes.get(k, []):
+            assert isinstance(stepper, fp.Stepper)
+            taken.append(is_allowed(device, now, path, value))
+            if taken[-1]:
+                assert stepper.change({path: value})
+                now[path] = value
+            elif np.isnan(value):  # Python takes limits wider than those of the build, and infinite ones
+                assert not stepper.change({path: value})
+        command, memory = stepper.step_measured(row[0], row[1:], memory)
+        yield taken, [float(stepper.trace()["status"].ravel()[0]), *command]
+
+
+def settings_of(device: Device) -> dict[str, float]:
+    """The settings of the build, by path."""
+    start = zip(device.settings.columns, device.settings.start().tolist(), strict=True)
+    return {column.removeprefix("setting."): value for column, value in start}
+
+
+def back(device: Device) -> None:
+    """The settings of the build."""
+    if isinstance(device.stepper, fp.Stepper) and device.bounds:
+        start = settings_of(device)
+        assert device.stepper.change({path: start[path] for path in device.bounds})
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", CASES)
+def test_instances_with_settings_of_their_own_answer_as_the_stepper(name, seed, tmp_path):
+    """Cycles of three controllers in any order, settings that change in between, samples with faults: bits, statuses, refusals."""
+    random = np.random.default_rng(seed)
+    one = device(name)
+    library = Library(one, tmp_path / "c")
+    bad = (np.nan, np.inf, -np.inf, 1e9, -1e200, 0.0)
+    rows = [random_rows(name, one, random, bad) for _ in range(INSTANCES)]
+    changes = [random_changes(one, random) for _ in range(INSTANCES)]
+    wanted = []
+    for own, changed in zip(rows, changes, strict=True):
+        back(one)
+        wanted.append(list(stepped(one, own, changed)))
+    instances, at = [library.begun() for _ in range(INSTANCES)], [0] * INSTANCES
+    for j in random.permutation(np.repeat(np.arange(INSTANCES), CYCLES)):
+        k = at[j]
+        taken = [library.change(instances[j], *change) for change in changes[j].get(k, [])]
+        assert (taken, library.cycle(instances[j], rows[j][k])) == wanted[j][k], f"instance {j}, cycle {k}"
+        at[j] += 1
+    refused = [not yes for answers in wanted for taken, _ in answers for yes in taken]
+    assert any(refused)
+    assert not all(refused)
+    statuses = {answer[0] for answers in wanted for _, answer in answers}
+    assert {int(Status.BAD_SAMPLE), int(Status.BRIDGED)} <= statuses
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", CASES)
+def test_bare_instances_answer_as_the_bare_step(name, seed, tmp_path):
+    """Without gate: samples without faults, and the bits of the controller's own step."""
+    random = np.random.default_rng(seed)
+    one = device(name, live=False, bare=True)
+    library = Library(one, tmp_path / "c")
+    rows = [random_rows(name, one, random, ()) for _ in range(INSTANCES)]
+    wanted = [[answer for _, answer in stepped(one, own, {})] for own in rows]
+    instances, at = [library.begun() for _ in range(INSTANCES)], [0] * INSTANCES
+    for j in random.permutation(np.repeat(np.arange(INSTANCES), CYCLES)):
+        assert library.cycle(instances[j], rows[j][at[j]]) == wanted[j][at[j]]
+        at[j] += 1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("bare", [False, True], ids=["gated", "bare"])
+@pytest.mark.parametrize("name", CASES)
+def test_a_float_export_is_near_the_double_one(name, bare, seed, tmp_path):
+    """A thousandth of the largest command; what is no number is a bad sample in both, and nothing stays behind it."""
+    random = np.random.default_rng(seed)
+    one = device(name, live=False, bare=bare)
+    single, double = Library(one, tmp_path / "float", "float"), Library(one, tmp_path / "double")
+    rows = random_rows(name, one, random, () if bare else (np.nan, np.inf, -np.inf))
+    answers = [
+        np.array([library.cycle(instance, row) for row in rows])
+        for library, instance in ((single, single.begun()), (double, double.begun()))
+    ]
+    assert np.isfinite(answers[0]).all()
+    bad = [part[:, 0] == int(Status.BAD_SAMPLE) for part in answers]
+    np.testing.assert_array_equal(*bad)
+    assert bad[0].any() != bare
+    largest = np.abs(answers[1][:, 1:]).max()
+    np.testing.assert_allclose(answers[0][:, 1:], answers[1][:, 1:], rtol=0, atol=1e-3 * largest)
