@@ -203,7 +203,7 @@ int main(int count, char** words) {
   }
 }
 """
-HARNESS = Path("/usr/include/simavr/sim_avr.h")
+HARNESS = (Path("/usr/include/simavr/sim_avr.h"), Path("/usr/include/libelf.h"))
 
 
 def motor(command: Callable[[float, float], float], seed: int) -> np.ndarray:
@@ -240,7 +240,9 @@ def motor(command: Callable[[float, float], float], seed: int) -> np.ndarray:
 
 
 @needs_avr
-@pytest.mark.skipif(not HARNESS.exists(), reason="no simavr library (packages libsimavr-dev and libelf-dev)")
+@pytest.mark.skipif(
+    not all(map(Path.exists, HARNESS)), reason="no simavr library (packages libsimavr-dev and libelf-dev)"
+)
 def test_an_uno_holds_a_motor_against_a_finger(tmp_path):
     """In the loop, commands are those of Python for the same samples; the iteration takes the error to a quarter."""
     task = fp.load_problem("noisy_motor")
