@@ -51,7 +51,7 @@ class Answer(FoundByName):
         question: in the words of a reader.
         verdict: yes, caution, no, unknown.
         evidence: the facts in a sentence, with the deciding number and its unit.
-        change: what to change; empty after a yes.
+        change: what to change; after a yes nothing.
         numbers: the same facts by name.
     """
 
@@ -62,8 +62,9 @@ class Answer(FoundByName):
     numbers: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        change = "" if self.verdict == Verdict.YES else self.change
         object.__setattr__(self, "evidence", numbers_written_out(self.evidence))
-        object.__setattr__(self, "change", numbers_written_out(self.change))
+        object.__setattr__(self, "change", numbers_written_out(change))
         super().__post_init__()
 
     @property
@@ -121,6 +122,11 @@ class Review(FoundByName):
 def decided(good: bool) -> Verdict:
     """Return yes where the condition holds, else no."""
     return Verdict.YES if good else Verdict.NO
+
+
+def graded(share: float, wanted: float) -> Verdict:
+    """Return yes for a share of at least what is wanted, no below 1, and caution between."""
+    return Verdict.YES if share >= wanted else Verdict.NO if share < 1 else Verdict.CAUTION
 
 
 def per_cycle(pole: float, problem: Problem) -> str:

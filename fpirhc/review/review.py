@@ -110,7 +110,7 @@ def schedule_stable(problem: Problem, controller: Controller) -> Answer | None:
         f"near the set-point errors change by {floquet.radius:.3g} per period of {floquet.period:g} {problem.time_unit}"
     )
     text += ", with ideal deformations"
-    change = "" if floquet.radius < 1 else "Change the slots' durations or rates; see floquet_radius."
+    change = "Change the slots' durations or rates; see floquet_radius."
     return Answer(
         QUESTION,
         decided(floquet.radius < 1),

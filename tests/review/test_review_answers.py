@@ -19,7 +19,7 @@ from fpirhc.contraction.spectrum import Spectrum, assess_gain
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.loops import Loops
-from fpirhc.review.question import Verdict, duration, per_cycle
+from fpirhc.review.question import Answer, Verdict, duration, graded, per_cycle
 from fpirhc.review.questions.convergence import _NEAR, _without, box_converges, converges
 from fpirhc.review.questions.gain import (
     FAR,
@@ -430,7 +430,7 @@ def test_a_gain_with_which_the_loop_diverges_is_a_no(monkeypatch, advice, said, 
     monkeypatch.setattr("fpirhc.review.questions.gain.least_gain", least)
     by_gain = SimpleNamespace(gains=(0.2, 0.25))
     case: Any = SimpleNamespace(by_gain=by_gain, diverges=True, controller=SimpleNamespace(deformation=fp.Affine(-0.5)))
-    told = fp.Answer("gain", Verdict.YES, "gain = -0.5", "told", {"gain": -0.5})
+    told = fp.Answer("gain", Verdict.CAUTION, "gain = -0.5", "told", {"gain": -0.5})
     one = _converging(case, told, advice)
     assert (one.verdict, one.evidence, one.change) == ("no", told.evidence + said, change)
     assert asked == ([(by_gain, 1.5)] if "small" in said else [])
@@ -754,3 +754,11 @@ def test_a_command_at_a_limit_has_no_margins_behind_a_dead_time():
     one = asked(task.problem, task.controllers["PID"], "enough margin")
     assert one.verdict == "unknown"
     assert "the command stands at a limit all along the reference" in one.evidence
+
+
+def test_a_yes_advises_nothing_and_a_number_has_three_verdicts():
+    """Below 1 it is a reason to stop, from what is wanted on it is fine; NaN, which nothing decides, is neither."""
+    answers = {verdict: Answer("Is it?", verdict, "it is", "Change it.").change for verdict in Verdict}
+    assert answers == {verdict: "" if verdict == Verdict.YES else "Change it." for verdict in Verdict}
+    sizes = (0.99, 1.0, 1.99, 2.0, math.inf, math.nan)
+    assert [graded(size, 2.0) for size in sizes] == ["no", "caution", "caution", "yes", "yes", "caution"]

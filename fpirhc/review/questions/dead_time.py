@@ -217,9 +217,8 @@ def prediction_knows(case: Case) -> Answer | None:
     best = min(sizes, key=lambda name: sizes[name])
     text = f"rms error {size:.3g} of the range with the model's prediction, {sizes[best]:.3g} with {best}"
     numbers = {"error": size, **{f"error with {name}": value for name, value in sizes.items() if math.isfinite(value)}}
-    if sizes[best] > _LESS * size:
-        return Answer(KNOWS, Verdict.YES, text, "", numbers)
-    return Answer(KNOWS, Verdict.CAUTION, text, f"Predict with what acts: Predicted(..., by={best}).", numbers)
+    verdict = Verdict.YES if sizes[best] > _LESS * size else Verdict.CAUTION
+    return Answer(KNOWS, verdict, text, f"Predict with what acts: Predicted(..., by={best}).", numbers)
 
 
 QUESTIONS = (

@@ -278,7 +278,7 @@ def gain_admissible(
         change = f"It is inside its limits, which does not say that it helps: see whether a comparison does. {change}"
     good = inside and not advice.why_not
     verdict = Verdict.UNKNOWN if advice.why_not else Verdict.CAUTION
-    return Answer(GAIN, Verdict.YES if good else verdict, text, "" if good else change, numbers)
+    return Answer(GAIN, Verdict.YES if good else verdict, text, change, numbers)
 
 
 def gain_of_target(case: Case) -> Answer | None:
@@ -297,10 +297,8 @@ def gain_of_target(case: Case) -> Answer | None:
             GAIN, Verdict.YES, f"{text}no gain up to {FAR:g} times as large is a limit of the whole loop", "", numbers
         )
     text += f"the smallest limit is {limit * scale:.3g}, set by {sets}"
-    if value / limit < 1:
-        return Answer(GAIN, Verdict.YES, text, "", numbers)
     along = case.loops.radii.max() < 1  # in the box it is another matter
-    verdict = Verdict.CAUTION if along else Verdict.NO
+    verdict = Verdict.YES if value / limit < 1 else Verdict.CAUTION if along else Verdict.NO
     return Answer(GAIN, verdict, text, f"Use {name} = {limit * scale / 2:.3g}, half of it.", numbers)
 
 
@@ -327,10 +325,8 @@ def one_sign(own: Spectrum, boxed: Spectrum) -> Answer:
     numbers = {"smallest": own.smallest_real, "largest": own.largest_real}
     numbers |= {"smallest_over_box": boxed.smallest_real, "largest_over_box": boxed.largest_real}
     change = "Give the approximate parameters the sign of every input's effect, and let each input act on its own coordinate."
-    if not own.one_sign:
-        return Answer(ONE_SIGN, Verdict.NO, text, change, numbers)
-    verdict = Verdict.YES if boxed.one_sign else Verdict.CAUTION
-    return Answer(ONE_SIGN, verdict, text, "" if boxed.one_sign else change, numbers)
+    verdict = Verdict.NO if not own.one_sign else Verdict.YES if boxed.one_sign else Verdict.CAUTION
+    return Answer(ONE_SIGN, verdict, text, change, numbers)
 
 
 TWO_CYCLES = "Is it free of bounded two-cycles?"

@@ -65,11 +65,8 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
         stiff = stiff_advice(grid, plant.approximate, planned=True)
         verdict = Verdict.CAUTION if grows * problem.duration <= _LITTLE else Verdict.NO
         return Answer(LONG_ENOUGH, verdict, text, stiff or _advice(plant, change), numbers)
-    if change > _SAME:
-        return Answer(
-            LONG_ENOUGH, Verdict.CAUTION, text, "A longer horizon, or a weight of its end, plans differently.", numbers
-        )
-    return Answer(LONG_ENOUGH, Verdict.YES, text, "", numbers)
+    verdict = Verdict.CAUTION if change > _SAME else Verdict.YES
+    return Answer(LONG_ENOUGH, verdict, text, "A longer horizon, or a weight of its end, plans differently.", numbers)
 
 
 def plan_gain(

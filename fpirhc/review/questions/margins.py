@@ -72,7 +72,7 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     gentler = "weigh the inputs more" if planned else "lower the rate"
     change = SLOWER if learner else f"{_LOWER}, or {gentler}." if adapts else f"{gentler.capitalize()}."
-    return Answer(MARGINS, Verdict.YES if good else Verdict.CAUTION, text, "" if good else change, numbers)
+    return Answer(MARGINS, Verdict.YES if good else Verdict.CAUTION, text, change, numbers)
 
 
 def smallest_margins(loops: Sequence[LinearLoop], problem: Problem) -> tuple[str, dict[str, float]]:

@@ -180,13 +180,12 @@ def reference_keeps_limits(grid: ReviewGrid) -> Answer | None:
     numbers = {f"room_{name_of[k][0]}": float(rooms[k]) for k in bound}
     outside = [name_of[k][0] for k in bound if rooms[k] < -_TOUCHES]
     touched = [name_of[k][0] for k in bound if abs(rooms[k]) <= _TOUCHES]
-    if not outside and not touched:
-        return Answer(LIMITS, Verdict.YES, text, "", numbers)
     change = f"Move the reference inside the limits of {', '.join([*outside, *touched])}, or widen them."
     soft = {*limits.soft, *limits.prices}
     softened = soft | {f"{i} rate" for i in soft - {*problem.plant.state.elements}}
     hard = [name for name in outside if name not in softened]
-    return Answer(LIMITS, Verdict.NO if hard else Verdict.CAUTION, text, change, numbers)
+    verdict = Verdict.NO if hard else Verdict.CAUTION if outside or touched else Verdict.YES
+    return Answer(LIMITS, verdict, text, change, numbers)
 
 
 def _drawn_to_reference(ocp: OptimalControl) -> bool:
@@ -285,9 +284,8 @@ def _conditioning(grid: ReviewGrid) -> Answer:
         return Answer(
             INVERSE, Verdict.CAUTION, f"{text}; it changes sign within the box of the parameters", _CHANGE, numbers
         )
-    if condition > _DOUBTFUL or share < _VANISHING:
-        return Answer(INVERSE, Verdict.CAUTION, text, _CHANGE, numbers)
-    return Answer(INVERSE, Verdict.YES, text, "", numbers)
+    doubtful = condition > _DOUBTFUL or share < _VANISHING
+    return Answer(INVERSE, Verdict.CAUTION if doubtful else Verdict.YES, text, _CHANGE, numbers)
 
 
 _CHANGE = "Control another coordinate, move the reference away from the singular state, or use time slots."
@@ -327,9 +325,8 @@ def commands_inside(grid: ReviewGrid) -> Answer:
     text += f"; {100 * own:.3g} % of the way from the middle of the limits to one of them, {100 * widest:.3g} % over the box"
     held = _named_ranges(plant, commands, np.nan_to_num(used).max(axis=(0, 1)) > 1)
     change = f"Slow the reference down or ask for less; limits that are a choice must hold {held}."
-    if own > 1:
-        return Answer(COMMANDS, Verdict.NO, text, change, numbers)
-    return Answer(COMMANDS, Verdict.CAUTION if widest > 1 else Verdict.YES, text, change if widest > 1 else "", numbers)
+    verdict = Verdict.NO if own > 1 else Verdict.CAUTION if widest > 1 else Verdict.YES
+    return Answer(COMMANDS, verdict, text, change, numbers)
 
 
 def _named_ranges(plant: Plant, commands: np.ndarray, chosen: np.ndarray | None = None) -> str:

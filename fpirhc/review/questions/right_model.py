@@ -189,10 +189,8 @@ def pays(case: Case) -> Answer:
     if not adapted < without:
         why = "for the exact values of the model's own parameters, which move nothing beside a reality"
         return by_run(case, PAYS, f"{text}, {why}") if case.grid.elsewhere else _no_gain(text, numbers)
-    if null > _HARM * without:
-        change = "Adaptation would do harm with a slightly better model: use a form that leaves a right model alone."
-        return Answer(PAYS, Verdict.CAUTION, text, change, numbers)
-    return Answer(PAYS, Verdict.YES, text, "", numbers)
+    change = "Adaptation would do harm with a slightly better model: use a form that leaves a right model alone."
+    return Answer(PAYS, Verdict.CAUTION if null > _HARM * without else Verdict.YES, text, change, numbers)
 
 
 def _no_gain(text: str, numbers: dict[str, float]) -> Answer:

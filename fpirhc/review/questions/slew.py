@@ -19,7 +19,7 @@ from fpirhc.plant.motion import controlled_places
 from fpirhc.review.grid import ReviewGrid, below_responses, state_slopes
 from fpirhc.review.loops import is_planned
 from fpirhc.review.prediction import errors_without_adaptation, response_errors
-from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict, graded
 from fpirhc.review.questions.speed import law_of
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.task.disturbance import disturbed_place
@@ -57,9 +57,7 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
         text += f"; a jump of a disturbance takes the map {cycles} cycle{'s' * (cycles > 1)}"
     ratio = step / problem.period / max(needed, 1e-300)
     change = f"Raise the map's scale at least {SPARE / ratio:.2g} times, or leave it out to have it chosen."
-    if ratio >= SPARE:
-        return Answer(SLEW, Verdict.YES, text, "", numbers)
-    return Answer(SLEW, Verdict.NO if ratio < 1 else Verdict.CAUTION, text, change, numbers)
+    return Answer(SLEW, graded(ratio, SPARE), text, change, numbers)
 
 
 def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
@@ -134,10 +132,7 @@ def range_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarra
     ratio = size / max(largest, 1e-300)
     text = f"{name} {size:.3g} is {ratio:.3g} times the largest request and response, {largest:.3g}"
     change = f"Use {name} = {_ROOM * largest:.2g} or more."
-    if ratio < 1:
-        return Answer(RANGE, Verdict.NO, text, change, {"ratio": ratio})
-    good = ratio >= _ROOM
-    return Answer(RANGE, Verdict.YES if good else Verdict.CAUTION, text, "" if good else change, {"ratio": ratio})
+    return Answer(RANGE, graded(ratio, _ROOM), text, change, {"ratio": ratio})
 
 
 BASIN = "Does it come back from the largest response error?"
@@ -163,9 +158,8 @@ def comes_back(case: Case) -> Answer | None:
     text = f"errors up to {error:.3g} are predicted; it comes back from a single one of {basin:.3g}, {ratio:.3g} times as large"
     text += "" if ratio >= _WANTED else f", where {_WANTED:g} times are wanted, because errors that last add up"
     numbers = {"error": error, "basin": basin}
-    if ratio >= _WANTED:
-        return Answer(BASIN, Verdict.YES, text, "", numbers)
-    verdict = Verdict.CAUTION if ratio > _LASTING or not deformation.iteration.constant else Verdict.NO
+    unsure = ratio > _LASTING or not deformation.iteration.constant
+    verdict = Verdict.YES if ratio >= _WANTED else Verdict.CAUTION if unsure else Verdict.NO
     change = f"Raise the map's scale at least {_WANTED / ratio:.2g} times, or leave it out to have it chosen."
     return Answer(BASIN, verdict, text, change, numbers)
 

@@ -11,7 +11,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.plant.maps import response_age
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import is_planned
-from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict
+from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict, graded
 from fpirhc.review.questions.right_model import INCREMENT, REFERENCED, forms_of
 
 FAST = "Does the iteration keep up with its tracking law?"
@@ -34,15 +34,9 @@ def fast_enough(case: Case) -> Answer | None:
     text = f"gain x eigenvalue is at least {product:.3g}, {ratio:.3g} times what {poles} poles"
     text += f" at {rate:g} {grid.problem.rate_unit} need"
     numbers = {"product": product, "ratio": ratio}
-    if ratio >= _SPARE:
-        return Answer(FAST, Verdict.YES, text, "", numbers)
-    return Answer(
-        FAST,
-        Verdict.NO if ratio < 1 else Verdict.CAUTION,
-        text,
-        faster(case, _SPARE / ratio, "lower rate x period"),
-        numbers,
-    )
+    verdict = graded(ratio, _SPARE)
+    change = "" if verdict == Verdict.YES else faster(case, _SPARE / ratio, "lower rate x period")
+    return Answer(FAST, verdict, text, change, numbers)
 
 
 def faster(case: Case, factor: float, otherwise: str) -> str:
@@ -83,9 +77,8 @@ def bears_lag(case: Case) -> Answer | None:
         f"{limit:.3g} {unit} a fast iteration is unstable at any gain"
     )
     numbers = {"lag": longest, "limit": limit}
-    if longest >= _CYCLES * period:
-        return Answer(LAG, Verdict.YES, text, "", numbers)
-    return Answer(LAG, Verdict.CAUTION, text, "Lower the gain, or model the lag and pair through it.", numbers)
+    verdict = Verdict.YES if longest >= _CYCLES * period else Verdict.CAUTION
+    return Answer(LAG, verdict, text, "Lower the gain, or model the lag and pair through it.", numbers)
 
 
 def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:

@@ -80,9 +80,8 @@ def relative_orders(grid: ReviewGrid) -> Answer:
     whole = "; the controlled coordinates and their derivatives make up the whole state"
     text += f"; {which} {alone}" if inside else whole
     numbers = {**{f"order_{c}": float(r or 0) for c, r in structural.items()}, "internal_states": float(inside)}
-    if structural != declared:
-        return Answer(ORDERS, Verdict.NO, text, "Write the response as the derivative that the input acts on.", numbers)
-    return Answer(ORDERS, Verdict.YES, text, "", numbers)
+    change = "Write the response as the derivative that the input acts on."
+    return Answer(ORDERS, decided(structural == declared), text, change, numbers)
 
 
 START = "Does the run start inside the limits of states?"
@@ -102,11 +101,10 @@ def start_keeps_limits(grid: ReviewGrid) -> Answer | None:
         for name in outside or limits
     )
     numbers = {"outside": float(len(outside))}
-    if not outside:
-        return Answer(START, Verdict.YES, text, "", numbers)
     soft = set(outside) <= {*problem.limits.soft, *problem.limits.prices}
     change = f"Move the start of {', '.join(outside)} inside the limits, widen them, or make them soft."
-    return Answer(START, Verdict.CAUTION if soft else Verdict.NO, text, change, numbers)
+    verdict = Verdict.YES if not outside else Verdict.CAUTION if soft else Verdict.NO
+    return Answer(START, verdict, text, change, numbers)
 
 
 OUTSIDE = "Do signals from outside stay where the review sees them?"
@@ -128,7 +126,7 @@ def stay_nominal(grid: ReviewGrid) -> Answer | None:
         moves |= max(abs(low - nominal), abs(high - nominal)) > _SAME * (1 + abs(nominal))
         values = f"{low:.6g}" if f"{low:.6g}" == f"{high:.6g}" else f"{low:.6g} to {high:.6g}"
         facts.append(f"{name} is {nominal:.6g} {plant.parameters[name].unit} here, {values} in the run")
-    change = "Review other values too: outside(nominal=...)." if moves else ""
+    change = "Review other values too: outside(nominal=...)."
     return Answer(OUTSIDE, Verdict.CAUTION if moves else Verdict.YES, "; ".join(facts), change)
 
 
@@ -151,7 +149,7 @@ def right_after_a_while(grid: ReviewGrid) -> Answer | None:
             BELIEVED, decided(good=True), f"all errors of {', '.join(believed)} show in {measured}, which corrects them"
         )
     text = f"no measurement ({measured}) corrects the errors of {', '.join(free.states)}; {_decay(problem, free)}"
-    change = "" if free.decays else f"Measure {free.states[0]}, or a quantity that depends on it."
+    change = f"Measure {free.states[0]}, or a quantity that depends on it."
     return Answer(BELIEVED, decided(free.decays), text, change, {"pole": free.pole})
 
 
