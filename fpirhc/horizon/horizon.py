@@ -35,7 +35,8 @@ class Horizon(Checked):
         replan: when the next plan is made: after one "stage", after one control "cycle", or after so many cycles, at most those of
             a stage. Where a plan follows sooner than a stage, the horizon begins at the cycle's own time, the last plan is
             interpolated to the new stages, and the change of the first input counts with the time that it takes: the limit of
-            its rate holds from plan to plan, and its cost is stages per plan times that of a later change.
+            its rate holds from plan to plan, and its cost is stages per plan times that of a later change. More plans on long
+            stages do not lower the error of a wrong model; a first stage of one cycle and `lengths` that grow do.
         share: of a stage, the time from plan to plan. Controllers fill it in from `replan`.
         measured: names of states whose limits hold for the measured state: for the plan's plus the distance of the measured one
             from the plan's start. Controllers fill it in where a plan starts elsewhere, see `fpirhc.horizon.nominal`.
