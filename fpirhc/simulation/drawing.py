@@ -26,7 +26,7 @@ _BESIDE, _BELOW = 0.75, 0.33  # labels of a row's axes, inches from the axes
 _TALL = 20  # largest over usual size from which the range of a panel is cut, so that one spike does not hide the rest
 
 
-class Recorded(Protocol):
+class _Recorded(Protocol):
     """What figures read of a `Run`, which draws itself and so stands above them."""
 
     @property
@@ -82,18 +82,18 @@ def literal(text: str) -> str:
     return printable(text).replace("$", r"\$")
 
 
-def time_label(run: Recorded) -> str:
+def time_label(run: _Recorded) -> str:
     """Return the label of a time axis: 'time [s]'."""
     return literal(f"time [{run.time_unit}]")
 
 
-def quantity_label(run: Recorded, signal: str, names: Sequence[str]) -> str:
+def quantity_label(run: _Recorded, signal: str, names: Sequence[str]) -> str:
     """Return the label of an axis that shows these entries of a signal, with their unit where they have one in common."""
     units = list(dict.fromkeys(run.unit(f"{signal}.{name}") for name in names))
     return literal(", ".join(names) + (f" [{units[0]}]" if len(units) == 1 else ""))
 
 
-def by_unit(run: Recorded, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
+def by_unit(run: _Recorded, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
     """Return these entries of a signal by their unit, in their order: a chart has one unit."""
     groups: dict[str, list[str]] = {}
     for name in names:
@@ -101,7 +101,7 @@ def by_unit(run: Recorded, signal: str, names: Sequence[str]) -> dict[str, list[
     return groups
 
 
-def draw_bands(axis: Axes, run: Recorded) -> None:
+def draw_bands(axis: Axes, run: _Recorded) -> None:
     """Draw time slots as shaded bands, named in the legend."""
     named: set[int] = set()
     for start, end, slot in run.spans():
@@ -117,7 +117,7 @@ def draw_bands(axis: Axes, run: Recorded) -> None:
         named.add(slot)
 
 
-def draw_changes(axis: Axes, run: Recorded) -> None:
+def draw_changes(axis: Axes, run: _Recorded) -> None:
     """Draw the times at which live settings changed as vertical lines, named in the legend."""
     for k, (time, _) in enumerate(run.in_force[1:]):
         axis.axvline(time, color="#777777", lw=0.8, ls=":", label=None if k else "change of settings")
@@ -128,7 +128,7 @@ def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
     return values[:: max(1, values.shape[0] // points)]
 
 
-def draw_line(axis: Axes, run: Recorded, column: str, label: str, color: str, style: str = "-") -> None:
+def draw_line(axis: Axes, run: _Recorded, column: str, label: str, color: str, style: str = "-") -> None:
     """Draw one column of a run over time; its unit stands in the legend."""
     axis.plot(
         thinned(run.time),
@@ -147,7 +147,7 @@ def draw_legend(axis: Axes) -> None:
         axis.legend(fontsize=7, loc="best", framealpha=0.8)
 
 
-def draw_responses(axis: Axes, run: Recorded, name: str) -> None:
+def draw_responses(axis: Axes, run: _Recorded, name: str) -> None:
     """Draw the nominal, desired, deformed and realised response of one coordinate; a spike does not hide the rest."""
     columns = {what: f"{signal}.{name}" for what, signal in responses_of(run.layout).items()}
     for what, column in columns.items():
@@ -158,7 +158,7 @@ def draw_responses(axis: Axes, run: Recorded, name: str) -> None:
         axis.set_ylim(-3 * usual, 3 * usual)
 
 
-def draw_signal(axis: Axes, run: Recorded, names: Sequence[str], signal: str) -> None:
+def draw_signal(axis: Axes, run: _Recorded, names: Sequence[str], signal: str) -> None:
     """Draw entries of a signal of a run over time, each in its colour."""
     for k, name in enumerate(names):
         draw_line(axis, run, f"{signal}.{name}", name, PALETTE[k % len(PALETTE)])
@@ -182,7 +182,7 @@ def responses_of(layout: Layout) -> dict[str, str]:
     return {n: n for n in ("nominal", "desired", "deformed")} | {"realised": "realised_of_slots" if own else "realised"}
 
 
-def run_figure(run: Recorded) -> Figure:
+def run_figure(run: _Recorded) -> Figure:
     """Return a figure with errors, coordinates, commands and responses of one run over time, one chart per unit."""
     judged, inputs, first = (
         run.layout["error"].elements,
@@ -207,7 +207,7 @@ def run_figure(run: Recorded) -> Figure:
     return figure
 
 
-def _draw_motion(axis: Axes, run: Recorded, names: Sequence[str], signal: str) -> None:
+def _draw_motion(axis: Axes, run: _Recorded, names: Sequence[str], signal: str) -> None:
     for k, name in enumerate(names):
         color = PALETTE[k % len(PALETTE)]
         draw_line(axis, run, f"{signal}.{name}", name, color)
@@ -216,5 +216,5 @@ def _draw_motion(axis: Axes, run: Recorded, names: Sequence[str], signal: str) -
             draw_line(axis, run, f"setpoint.{name}", f"{name} set-point", color, ":")
 
 
-def _draw_first_response(axis: Axes, run: Recorded, names: Sequence[str], _: str) -> None:
+def _draw_first_response(axis: Axes, run: _Recorded, names: Sequence[str], _: str) -> None:
     draw_responses(axis, run, names[0])

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, groupby
-from typing import Any, cast
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -342,7 +342,8 @@ def scalar_code(function: ca.Function) -> ca.Function:
 
 def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix], *, inlines: bool = False) -> None:
     """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory."""
-    arguments: list[Any] = [known[name] for name in (*block.inputs.names, *block.memory.names)]
+    # Of graphs they are MX, which the stub does not mix with SX.
+    arguments = cast(list[ca.SX], [known[name] for name in (*block.inputs.names, *block.memory.names)])
     values = block.function.call(arguments, inlines, False)
     results = cast(dict[str, Matrix], dict(zip(block._results, values, strict=True)))
     for name in block.writes.names:

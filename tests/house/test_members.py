@@ -67,9 +67,9 @@ def test_examples_of_wrappers_need_something_inside():
 def test_modules_of_the_review_are_found_beside_its_function(first):
     """The function has the name of the package; a module below it is found whichever of the two is met first."""
     code = (
-        f"{first}import fpirhc.review.question as question; import fpirhc.review.question; import fpirhc as fp; "
+        f"{first}import fpirhc.review.question as question; import fpirhc.review.grid; import fpirhc as fp; "
         "assert fp.review.question is question is sys.modules['fpirhc.review.question']; "
-        "assert fp.review.answer is sys.modules['fpirhc.review.question']; "
+        "assert fp.review.grid is sys.modules['fpirhc.review.grid']; "
         "assert callable(fp.review); assert fp.review.__name__ == 'review'"
     )
     subprocess.run([sys.executable, "-c", f"import sys; {code}"], check=True, timeout=60)
