@@ -95,9 +95,9 @@ function draw(answers) {
   moving?.load(answers.map((one, k) => ({ name: DATA.loops[k].name, color: colors[k], step: DATA.motion.step, width: one.frameWidth, numbers: one.frames })));
   say("sentence", verdict(answers));
   say("factors", answers.map(contraction).filter(Boolean).join(". "));
-  const sorted = [...times].slice(-50).sort((a, b) => a - b), worst = sorted[Math.floor(0.95 * (sorted.length - 1))];
+  const sorted = [...times].slice(-50).sort((a, b) => a - b), worst = sorted[Math.ceil(0.95 * sorted.length) - 1];
   say("rate", answers.map((a, k) => DATA.loops[k].name + " " + a.took.toFixed(0) + " ms").join(", ") +
-    " for " + DATA.cycles + " cycles; from move to picture " + sorted[sorted.length >> 1].toFixed(0) + " ms (95 %: " + worst.toFixed(0) + " ms)");
+    " for " + DATA.cycles + " cycles; from move to picture " + sorted[(sorted.length - 1) >> 1].toFixed(0) + " ms (95 %: " + worst.toFixed(0) + " ms)");
 }
 
 // rms errors from the time on from which errors count
