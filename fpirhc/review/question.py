@@ -1,4 +1,4 @@
-"""The contract of a question about a problem or a controller: a file of the folder `questions` adds one.
+"""The contract of a question about a problem or a controller, and of its answer: a file of the folder `questions` adds one.
 
 A file defines `QUESTIONS`, values of `ProblemQuestion` and `ControllerQuestion`. Another package names one of them in an entry
 point of the group `fpirhc.questions`.

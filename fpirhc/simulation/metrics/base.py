@@ -1,4 +1,7 @@
-"""The contract of metrics: one value holds a number's name, function, appearance and comparison."""
+"""The contract of metrics: one value holds a number's name, function, appearance and comparison.
+
+A run is measured by the metrics of the folder `entries`, of installed packages, and of a problem file.
+"""
 
 from __future__ import annotations
 
@@ -94,8 +97,6 @@ class Metric(Checked):
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[object, ...]:
         """A known metric is pickled by its name, so that metrics of runs can come from other processes."""
-        from fpirhc.simulation.metrics.base import known_metric
-
         return (known_metric, (self.name,)) if known_metric(self.name) is self else super().__reduce_ex__(protocol)
 
     @property
