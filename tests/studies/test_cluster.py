@@ -130,6 +130,15 @@ def test_an_address_that_does_not_answer_is_named(address: str, monkeypatch: pyt
         Cluster(address, opening, greeting, 1)
 
 
+def test_a_cluster_without_workers_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A warning, because workers may come yet; warnings are errors here."""
+    monkeypatch.setattr(cluster, "_WAIT", 0.5)
+    with distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0") as local:
+        address = local.scheduler_address
+        with pytest.raises(RuntimeWarning, match=f"the cluster at {address} has no workers; .*: dask worker {address}"):
+            studied(tmp_path, cluster=address)
+
+
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     opening, greeting = opening_of(fp.load_problem("two_mass").path)

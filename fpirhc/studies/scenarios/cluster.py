@@ -21,6 +21,7 @@ import sys
 import tempfile
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -29,6 +30,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from fpirhc.errors import FpirhcError, InvalidValue, WorkerDied, package
+from fpirhc.fields.user_code import users_level
 from fpirhc.studies.scenarios.worker import Job, Study, answered, study
 from fpirhc.symbolic.native import machine_facts
 
@@ -302,6 +304,7 @@ class Cluster:
                 running += 1
             if not running:
                 return
+            self._wait_for_workers()
             future, result = next(pool)
             running -= 1
             if future.status != "finished":
@@ -310,6 +313,17 @@ class Cluster:
             future.release()  # a worker that is killed would compute every result that it holds anew
             size = min(max(size, math.ceil(_CHUNK * len(answers) / max(seconds, 1e-6))), 2 * size, _MOST)
             yield answers
+
+    def _wait_for_workers(self) -> None:
+        """Warn where nobody takes the tasks; a cluster may begin workers when it has tasks, or bring back those it lost."""
+        if self._client.nthreads():
+            return
+        try:
+            self._client.wait_for_workers(1, timeout=_WAIT)
+        except TimeoutError:
+            address = self._client.scheduler.address
+            text = f"the cluster at {address} has no workers; the study waits for them: dask worker {address}"
+            warnings.warn(text, RuntimeWarning, stacklevel=users_level())
 
     def _room(self) -> int:
         """Number of tasks that are sent before an answer has come; workers may come and go."""
