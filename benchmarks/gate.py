@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -29,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from in_turns import Work, compared, loop_time
 from table import write_table
 
-TASK = fp.load_problem("two_mass")
+two_mass = cache(lambda: fp.load_problem("two_mass"))
 CONTROLLERS = ("CTC", "CTC+FPI (eq 6)", "RHC", "RHC+FPI")
 REPEATS = 41
 STEPS = 10_000  # by hand
@@ -68,14 +69,14 @@ def no_gate() -> Iterator[None]:
 
 def cycles(name: str) -> Work:
     """Process time of the compiled loop alone."""
-    return loop_time(simulator(TASK.problem, TASK.controllers[name]))
+    return loop_time(simulator(two_mass().problem, two_mass().controllers[name]))
 
 
 def steps(name: str) -> Work:
     """Process time of steps by hand with the first sample, a period apart, the memory handed on."""
-    stepper = fp.Stepper(TASK.problem, TASK.controllers[name])
-    state, realised = TASK.problem.start_state, np.zeros(len(TASK.problem.plant.inputs))
-    times = [k * TASK.problem.period for k in range(STEPS)]
+    stepper = fp.Stepper(two_mass().problem, two_mass().controllers[name])
+    state, realised = two_mass().problem.start_state, np.zeros(len(two_mass().problem.plant.inputs))
+    times = [k * two_mass().problem.period for k in range(STEPS)]
 
     def work() -> float:
         memory = stepper.start()
@@ -97,7 +98,7 @@ def price(name: str, what: str, make: Callable[[str], Work], count: int) -> list
 
 def main() -> None:
     """Measure and print."""
-    rows = [price(name, "loop", cycles, TASK.problem.cycles) for name in CONTROLLERS]
+    rows = [price(name, "loop", cycles, two_mass().problem.cycles) for name in CONTROLLERS]
     rows += [price(name, "step by hand", steps, STEPS) for name in CONTROLLERS]
     write_table("gate", ("", "without the gate", "with it", "difference"), rows)
 

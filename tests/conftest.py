@@ -8,6 +8,7 @@ of a module has the fixture's time too, whoever set it up: in the quick lane the
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ _seconds = pytest.StashKey[
 ]()  # s, of a test itself and of the shared fixtures that it reads
 _shared = pytest.StashKey[dict[tuple[str, str], float]]()  # s, by node and name of a fixture that serves several tests
 _left_out = pytest.StashKey[frozenset[str]]()
+_loaded = pytest.StashKey[list[str]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -46,6 +48,21 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
 def pytest_pycollect_makeitem(collector: pytest.Module | pytest.Class, name: str) -> list[pytest.Item] | None:
     """Make nothing of a test that is left out, whose parameters are often many; None: as usual."""
     return [] if _without_folder(f"{collector.nodeid}::{name}") in collector.config.stash[_left_out] else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection(session: pytest.Session) -> Generator[None, object, object]:
+    """Note which problem files are loaded meanwhile."""
+    before = {*sys.modules}
+    result = yield
+    session.config.stash[_loaded] = sorted(n for n in {*sys.modules} - before if n.startswith("fpirhc_problem_"))
+    return result
+
+
+@pytest.fixture(scope="session")
+def loaded_while_collecting(request: pytest.FixtureRequest) -> list[str]:
+    """Modules of the problem files that this process loaded before its first test."""
+    return request.config.stash[_loaded]
 
 
 @pytest.hookimpl(wrapper=True)

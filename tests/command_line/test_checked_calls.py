@@ -5,46 +5,47 @@ from __future__ import annotations
 import inspect
 import pickle
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField
 from fpirhc.fields.checked import checks_of
 from fpirhc.fields.kinds import Anything
 
-TASK = fp.load_problem("two_mass")
-PROBLEM, CTC = TASK.problem, TASK.controllers["CTC"]
+torque = cache(lambda: tasks.two_mass.controllers["CTC"])
 
 ANY: Any = fp  # a type checker would refuse these calls
 CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a name of a controller": (
-        lambda: ANY.simulate(PROBLEM, "RHC", seed=0),
+        lambda: ANY.simulate(tasks.two_mass.problem, "RHC", seed=0),
         "simulate.controller: expected a Controller, got the text 'RHC'; write controllers['RHC'] of a loaded problem file",
     ),
     "a name of a problem": (
-        lambda: ANY.simulate("two_mass", CTC, seed=0),
+        lambda: ANY.simulate("two_mass", torque(), seed=0),
         "simulate.problem: expected a Problem, got the text 'two_mass'; write fp.load_problem('two_mass').problem",
     ),
     "a loaded file": (
-        lambda: ANY.simulate(TASK, CTC, seed=0),
+        lambda: ANY.simulate(tasks.two_mass, torque(), seed=0),
         "simulate.problem: expected a Problem, got a value of the class Task; give its .problem",
     ),
     "all controllers": (
-        lambda: ANY.simulate(PROBLEM, {"CTC": CTC}, seed=0),
+        lambda: ANY.simulate(tasks.two_mass.problem, {"CTC": torque()}, seed=0),
         "give one of its entries, such as ['CTC']",
     ),
     "a forgotten argument": (
-        lambda: ANY.simulate(PROBLEM, CTC),
+        lambda: ANY.simulate(tasks.two_mass.problem, torque()),
         "simulate needs seed; write simulate(problem=..., controller=..., seed=...)",
     ),
     "a misspelt argument": (
-        lambda: ANY.simulate(PROBLEM, CTC, seed=0, compile=False),
+        lambda: ANY.simulate(tasks.two_mass.problem, torque(), seed=0, compile=False),
         "simulate has no argument 'compile'. Did you mean 'compiled'?",
     ),
     "a seed that is no number": (
-        lambda: ANY.simulate(PROBLEM, CTC, seed="a"),
+        lambda: ANY.simulate(tasks.two_mass.problem, torque(), seed="a"),
         "simulate.seed: expected a whole number of at least 0, got the text 'a'",
     ),
     "a problem in place of its file": (
@@ -52,15 +53,15 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         "compare.task: expected a Task, got the text 'two_mass'; write fp.load_problem('two_mass')",
     ),
     "one controller for a review": (
-        lambda: ANY.review(PROBLEM, CTC, seed=0, mismatch=0.0),
+        lambda: ANY.review(tasks.two_mass.problem, torque(), seed=0, mismatch=0.0),
         "review.controllers: expected {name: a Controller}, got a value of the class ComputedTorque",
     ),
     "a file of a run": (
-        lambda: ANY.measure(PROBLEM, "run.npz"),
+        lambda: ANY.measure(tasks.two_mass.problem, "run.npz"),
         "measure.run: expected a Run, got the text 'run.npz'; write fp.load_run('run.npz')",
     ),
     "a text for a path": (
-        lambda: ANY.compare_scenarios(TASK, seed=0, folder="results"),
+        lambda: ANY.compare_scenarios(tasks.two_mass, seed=0, folder="results"),
         "compare_scenarios.folder: expected a Path, got the text 'results'; write pathlib.Path('results')",
     ),
     "a misspelt word": (
@@ -68,7 +69,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         "Horizon.replan: expected 'stage' or 'cycle' or a whole number from 1 to 1000000, got the text 'cycles'; write 'cycle'",
     ),
     "a stepper of a name": (
-        lambda: ANY.Stepper(PROBLEM, "CTC"),
+        lambda: ANY.Stepper(tasks.two_mass.problem, "CTC"),
         "Stepper.controller: expected a Controller, got the text 'CTC'; write controllers['CTC'] of a loaded problem file",
     ),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from fpirhc.cli.main import main
 from fpirhc.plant.motion import with_exact_parameters
 
 STEERING = (Path(abroad.__file__).parent / "vehicle_steering.py").read_text()
-TASK = abroad.load("vehicle_steering")
+steering = cache(lambda: abroad.load("vehicle_steering"))
 REFERENCED, PLAIN, TORQUE = "RHC+model-referenced", "RHC+FPI", "CTC+FPI"
 
 
@@ -44,12 +45,12 @@ def answer_of_plain(capsys, effective: float) -> dict[str, Any]:
 
 
 def with_gain(name: str, effective: float):
-    controller = TASK.controllers[name]
+    controller = steering().controllers[name]
     return controller.with_deformation(controller.deformation.with_effective_gain(effective))
 
 
 def rms_and_movement(controller) -> tuple[float, float]:
-    metrics = fp.measure(TASK.problem, fp.simulate(TASK.problem, controller, seed=0, compiled=False))
+    metrics = fp.measure(steering().problem, fp.simulate(steering().problem, controller, seed=0, compiled=False))
     return metrics.rms_error["y"], metrics["total_variation"]["delta"]
 
 
@@ -70,7 +71,10 @@ def test_review_refusal_and_report_name_the_same_gain(folder, capsys):
     assert main(["run", "car.py", REFERENCED]) == 2
     assert sentence in capsys.readouterr().err.replace("\n", " ")
     with pytest.raises(fp.FpirhcError, match=re.escape(f"; {sentence}")):
-        fp.Stepper(TASK.problem, TASK.controllers[REFERENCED].with_deformation(fp.ModelReferenced(fp.Affine(gain=0.8))))
+        fp.Stepper(
+            steering().problem,
+            steering().controllers[REFERENCED].with_deformation(fp.ModelReferenced(fp.Affine(gain=0.8))),
+        )
     Path("car.py").write_text(STEERING)
     assert main(["run", "car.py", REFERENCED, "--no-compile", "--set", "deformation.map.gain=0.8"]) == 2
     assert sentence in capsys.readouterr().err.replace("\n", " ")
@@ -81,7 +85,7 @@ def test_review_refusal_and_report_name_the_same_gain(folder, capsys):
 
 def test_with_the_recommended_gain_the_wheel_moves_as_without_adaptation():
     """The error is a fiftieth; towards the limit of the iteration by itself the wheel of the plain form chatters."""
-    before, still = rms_and_movement(TASK.controllers["RHC"])
+    before, still = rms_and_movement(steering().controllers["RHC"])
     after, moved = rms_and_movement(with_gain(REFERENCED, 1.0))
     assert after < before / 40
     assert moved < 1.05 * still
@@ -121,8 +125,8 @@ def test_the_gain_of_a_plain_form(folder, capsys, effective, verdict, recommende
 
 def test_the_limit_of_the_poles_is_where_a_loop_of_the_box_loses_them():
     """The plant is the model, an end of the box: below its limit the wheel comes to rest after the lane change, above it never."""
-    exact = with_exact_parameters(TASK.problem.plant, TASK.problem.plant.approximate)
-    problem = replace(TASK.problem, plant=exact, duration=16.0)
+    exact = with_exact_parameters(steering().problem.plant, steering().problem.plant.approximate)
+    problem = replace(steering().problem, plant=exact, duration=16.0)
     sizes = []
     for effective in (1.6, 1.75):
         run = fp.simulate(problem, with_gain(TORQUE, effective), seed=0, compiled=False)

@@ -446,7 +446,7 @@ REFUSED = {
         "'y' of order 1",
     ),
     "not fully actuated": (
-        fp.load_problem("cart_pole").problem,
+        "cart_pole",
         replace(AID, bounds={"m": (0.1, 1.0)}, rule=fp.Projection(0.1)),
         NotSupported,
         "fully actuated",
@@ -475,8 +475,9 @@ REFUSED = {
 @pytest.mark.parametrize("why", REFUSED)
 def test_what_does_not_fit_is_refused_before_the_run(why):
     problem, controller, error, reason = REFUSED[why]
+    shipped = fp.load_problem(problem).problem if isinstance(problem, str) else problem
     with pytest.raises(error, match=reason):
-        fp.simulate(problem, controller, seed=0, compiled=False)
+        fp.simulate(shipped, controller, seed=0, compiled=False)
 
 
 @pytest.mark.parametrize(

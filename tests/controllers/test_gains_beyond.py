@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.errors import NotContractive
-from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.simulation.simulate import simulator
 
-TASK = load_problem("two_mass")
-PROBLEM = replace(TASK.problem, duration=0.05, measure_from=0.0)
+brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
 LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))
 LARGEST = (
     4 / 1.5
@@ -32,13 +32,13 @@ def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
     path = "deformation.gain"
     for make in (fp.Stepper, simulator):
         with pytest.raises(NotContractive, match=message):
-            make(PROBLEM, affine(gain), compiled=False)
-    loop = simulator(PROBLEM, affine(-0.5), compiled=False, live=[path])
+            make(brief(), affine(gain), compiled=False)
+    loop = simulator(brief(), affine(-0.5), compiled=False, live=[path])
     with pytest.raises(NotContractive, match=message):
         loop.run(seed=0, settings={path: gain})
     with pytest.raises(NotContractive, match=message):
         loop.run(seed=0, changes={0.02: {path: gain}})
-    stepper = fp.Stepper(PROBLEM, affine(-0.5), compiled=False, live=[path])
+    stepper = fp.Stepper(brief(), affine(-0.5), compiled=False, live=[path])
     assert not stepper.change({path: gain})
     assert (stepper.refused, stepper.numbers[path]) == (1, -0.5)
     assert "converges only for effective gains below 1.33" in stepper.why_refused
@@ -46,28 +46,28 @@ def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
 
 @pytest.mark.parametrize("gain", [-0.99 * LARGEST, -0.1])
 def test_a_gain_below_the_limit_runs(gain):
-    assert fp.simulate(PROBLEM, affine(-0.5), seed=0, settings={"deformation.gain": gain}).stop is None
+    assert fp.simulate(brief(), affine(-0.5), seed=0, settings={"deformation.gain": gain}).stop is None
 
 
 def test_who_asks_for_it_gets_it():
     """The wrapper changes nothing but the refusal: below the limit the run is the same, bit by bit."""
     one, other = (
-        fp.simulate(PROBLEM, affine(-0.5, around), seed=0, compiled=False) for around in (lambda m: m, fp.BeyondLimit)
+        fp.simulate(brief(), affine(-0.5, around), seed=0, compiled=False) for around in (lambda m: m, fp.BeyondLimit)
     )
     assert np.array_equal(one["command"], other["command"])
-    beyond = fp.simulate(PROBLEM, affine(-1.02 * LARGEST, fp.BeyondLimit), seed=0, compiled=False)
+    beyond = fp.simulate(brief(), affine(-1.02 * LARGEST, fp.BeyondLimit), seed=0, compiled=False)
     assert np.abs(beyond["realised"] - beyond["desired"])[-1].max() > np.abs(one["realised"] - one["desired"])[-1].max()
     with pytest.raises(NotContractive, match="wrong sign"):
-        fp.simulate(PROBLEM, affine(0.5, fp.BeyondLimit), seed=0)
+        fp.simulate(brief(), affine(0.5, fp.BeyondLimit), seed=0)
 
 
 def test_a_map_that_lowers_its_gain_begins_where_it_likes():
     """`Tuned` finds its gain on line, from twice the limit as well."""
-    fp.Stepper(PROBLEM, affine(-2 * LARGEST, lambda m: fp.Tuned(m, largest_gain=6.0)), compiled=False)
+    fp.Stepper(brief(), affine(-2 * LARGEST, lambda m: fp.Tuned(m, largest_gain=6.0)), compiled=False)
 
 
 def test_forms_of_the_iteration_have_their_own_limits():
     """The model-referenced form at -1e300 is refused, too."""
     with pytest.raises(NotContractive, match="effective gains below"):
-        fp.Stepper(PROBLEM, affine(-1e300, fp.ModelReferenced), compiled=False)
-    fp.Stepper(PROBLEM, affine(-0.9, fp.ModelReferenced), compiled=False)
+        fp.Stepper(brief(), affine(-1e300, fp.ModelReferenced), compiled=False)
+    fp.Stepper(brief(), affine(-0.9, fp.ModelReferenced), compiled=False)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, cast
 
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation import Deformation, Identity
 from fpirhc.errors import InvalidField, InvalidProblem
-from fpirhc.problem_files.problem_file import load_problem
 
-TASK = load_problem("two_mass")
-PROBLEM = replace(TASK.problem, duration=0.01, measure_from=0.0)
+brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.01, measure_from=0.0))
 LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))
 
 
@@ -115,9 +115,9 @@ def test_blocks_of_a_wrong_form_are_named():
     with pytest.raises(
         InvalidProblem, match=r"Formless.blocks\(problem\) must return two lists \(blocks, delays\), got \[\]"
     ):
-        fp.simulate(PROBLEM, Formless(), seed=0, compiled=False)
+        fp.simulate(brief(), Formless(), seed=0, compiled=False)
 
 
 def test_a_whole_wrapper_runs():
-    one, other = (fp.simulate(PROBLEM, c, seed=0, compiled=False) for c in (LAW, Whole(LAW)))
+    one, other = (fp.simulate(brief(), c, seed=0, compiled=False) for c in (LAW, Whole(LAW)))
     assert (one["command"] == other["command"]).all()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from forms import FORMS
 from plants import pendulum
 from plants import simulated as run
@@ -27,16 +29,14 @@ from fpirhc.status import Status
 from fpirhc.symbolic.layout import Named
 
 # Slots and schedules of shipped controllers are read and changed, which the contract of controllers says nothing about.
-CRANE: Any = fp.load_problem("crane_slots")
-TANKS: Any = fp.load_problem("two_tanks_slots")
-MASSES: Any = fp.load_problem("mass_spring_slots")
-POLE: Any = fp.load_problem("cart_pole_slots")
+
+SHIPPED: Any = tasks
 
 
 def crane(start: dict[str, float], **changes: Any) -> fp.Problem:
     """The crane from another start, measured from the first cycle."""
-    values = {e: start.get(e, 0.0) for e in CRANE.problem.plant.state.elements}
-    return replace(CRANE.problem, start=values, measure_from=0.0, **changes)
+    values = {e: start.get(e, 0.0) for e in SHIPPED.crane_slots.problem.plant.state.elements}
+    return replace(SHIPPED.crane_slots.problem, start=values, measure_from=0.0, **changes)
 
 
 def switches(run_: fp.Run) -> np.ndarray:
@@ -49,8 +49,8 @@ def switches(run_: fp.Run) -> np.ndarray:
 
 def test_crane_schedule_is_stable_although_no_slot_is():
     """The pendulum swings undamped in a cart slot, the cart rolls on in an angle slot; one period shrinks both."""
-    slots = CRANE.controllers["slots"]
-    floquet = floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend)
+    slots = SHIPPED.crane_slots.controllers["slots"]
+    floquet = floquet_radius(SHIPPED.crane_slots.problem, slots.slots, slots.schedule, blend=slots.blend)
     assert floquet.radius == pytest.approx(0.0485, abs=5e-4)
     assert floquet.period == pytest.approx(5.3)
     for values in floquet.eigenvalues.values():
@@ -76,8 +76,8 @@ def period_map(problem: fp.Problem, controller: Controller, period: float) -> np
 
 def test_nonlinear_run_shrinks_by_the_floquet_radius():
     """Near the set-point, by the wrong model with the deformation: 0.0493 at 5 ms and 0.0487 at 1 ms for 0.0485."""
-    slots = CRANE.controllers["slots+FPI"]
-    radius = floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend).radius
+    slots = SHIPPED.crane_slots.controllers["slots+FPI"]
+    radius = floquet_radius(SHIPPED.crane_slots.problem, slots.slots, slots.schedule, blend=slots.blend).radius
     away = []
     for period in (5e-3, 1e-3):
         problem = crane({}, period=period, duration=10.6 + 2 * period, limits=fp.Limits())
@@ -93,18 +93,20 @@ def test_nonlinear_run_shrinks_by_the_floquet_radius():
 )
 def test_integrals_and_offsets_are_part_of_the_radius(of_cart, of_angle, blend, radius):
     """A slow offset, and an integral that starts anew, change the radius from 0.0485 to either side of 1; the run agrees."""
-    slots = CRANE.controllers["slots+FPI"]
+    slots = SHIPPED.crane_slots.controllers["slots+FPI"]
     laws = fp.Exponential(rate=1.0, integral=of_cart), fp.Exponential(rate=3.0, integral=of_angle)
     pair = tuple(replace(s, tracking=law) for s, law in zip(slots.slots, laws, strict=True))
     slots = replace(slots, slots=pair, blend=blend)
-    assert floquet_radius(CRANE.problem, pair, slots.schedule, blend=blend).radius == pytest.approx(radius, rel=1e-3)
+    assert floquet_radius(SHIPPED.crane_slots.problem, pair, slots.schedule, blend=blend).radius == pytest.approx(
+        radius, rel=1e-3
+    )
     problem = crane({}, period=2e-3, duration=21.3, limits=fp.Limits())
     assert np.abs(np.linalg.eigvals(period_map(problem, slots, 5.3))).max() == pytest.approx(radius, rel=0.02)
 
 
 def test_an_unstable_schedule_is_seen_and_grows_so():
     """The cart-pole's schedule grows by 1.09 per period by Floquet, and the run grows as it says."""
-    slots, problem = POLE.controllers["slots+FPI"], POLE.problem
+    slots, problem = SHIPPED.cart_pole_slots.controllers["slots+FPI"], SHIPPED.cart_pole_slots.problem
     radius = floquet_radius(problem, slots.slots, slots.schedule, blend=slots.blend).radius
     assert radius == pytest.approx(1.094, abs=1e-3)
     still = replace(problem, duration=1.21, measure_from=0.0, limits=fp.Limits())
@@ -115,19 +117,19 @@ def test_one_slot_alone_has_the_radius_of_its_eigenvalues():
     """Without a switch one period is e^(A T), whose radius is e^(largest real part T)."""
     for integral in (False, True):
         slot = fp.Slot("q2", fp.Exponential(rate=4.0, integral=integral))
-        floquet = floquet_radius(MASSES.problem, [slot], fp.Periodic({"q2": 1.5}), blend=0.1)
+        floquet = floquet_radius(SHIPPED.mass_spring_slots.problem, [slot], fp.Periodic({"q2": 1.5}), blend=0.1)
         assert floquet.eigenvalues["q2"].size == 4 + integral
         assert floquet.eigenvalues["q2"].real.max() == pytest.approx(-0.1, abs=1e-3)
         assert floquet.radius == pytest.approx(np.exp(1.5 * floquet.eigenvalues["q2"].real.max()), rel=1e-9)
 
 
 def test_no_radius_without_a_set_point_or_a_period():
-    slots = CRANE.controllers["slots"]
+    slots = SHIPPED.crane_slots.controllers["slots"]
     selection = fp.ByError({"cart": 1.0, "angle": 1.0}, dwell=0.5)
-    floquet = floquet_radius(CRANE.problem, slots.slots, selection)
+    floquet = floquet_radius(SHIPPED.crane_slots.problem, slots.slots, selection)
     assert floquet.radius is None
     assert floquet.reason == "the schedule is not periodic"
-    moving = replace(CRANE.problem, reference=fp.Trajectory(lambda t: {"cart": 0.1 * t, "angle": 0 * t}))
+    moving = replace(SHIPPED.crane_slots.problem, reference=fp.Trajectory(lambda t: {"cart": 0.1 * t, "angle": 0 * t}))
     floquet = floquet_radius(moving, slots.slots, slots.schedule)
     assert floquet.radius is None
     assert "still moves" in floquet.reason
@@ -138,24 +140,27 @@ def test_no_radius_without_a_set_point_or_a_period():
 
 def angle_gain(angle: np.ndarray) -> np.ndarray:
     """Size of d angle'' / dF of the crane."""
-    p = dict(zip(CRANE.problem.plant.parameter.elements, CRANE.problem.plant.exact, strict=True))
+    p = dict(
+        zip(SHIPPED.crane_slots.problem.plant.parameter.elements, SHIPPED.crane_slots.problem.plant.exact, strict=True)
+    )
     return np.cos(angle) / p["l"] / (p["M"] + p["m"] * np.sin(angle) ** 2)
 
 
 CHAINS = (  # order, and what the input does to that derivative, by hand
-    (MASSES, "q2", 2, lambda x, p: 1 / p["m2"]),
-    (MASSES, "q1", 4, lambda x, p: p["k2"] / (p["m1"] * p["m2"])),  # through the spring
-    (TANKS, "h1", 1, lambda x, p: 1 / p["A1"]),
-    (TANKS, "h2", 2, lambda x, p: p["c1"] / (2 * p["A1"] * p["A2"] * np.sqrt(x["h1"]))),
-    (CRANE, "cart", 2, lambda x, p: 1 / (p["M"] + p["m"] * np.sin(x["angle"]) ** 2)),
-    (CRANE, "angle", 2, lambda x, p: -angle_gain(x["angle"])),
+    ("mass_spring_slots", "q2", 2, lambda x, p: 1 / p["m2"]),
+    ("mass_spring_slots", "q1", 4, lambda x, p: p["k2"] / (p["m1"] * p["m2"])),  # through the spring
+    ("two_tanks_slots", "h1", 1, lambda x, p: 1 / p["A1"]),
+    ("two_tanks_slots", "h2", 2, lambda x, p: p["c1"] / (2 * p["A1"] * p["A2"] * np.sqrt(x["h1"]))),
+    ("crane_slots", "cart", 2, lambda x, p: 1 / (p["M"] + p["m"] * np.sin(x["angle"]) ** 2)),
+    ("crane_slots", "angle", 2, lambda x, p: -angle_gain(x["angle"])),
 )
 
 
-@pytest.mark.parametrize(("task", "coordinate", "order", "gain"), CHAINS)
-def test_order_and_gain(task, coordinate, order, gain):
+@pytest.mark.parametrize(("name", "coordinate", "order", "gain"), CHAINS)
+def test_order_and_gain(name, coordinate, order, gain):
     """The number of derivatives until the input appears, and its factor, by which the response is affine in it."""
-    plant, chain = task.problem.plant, output_chain(task.problem.plant, coordinate)
+    plant = getattr(SHIPPED, name).problem.plant
+    chain = output_chain(plant, coordinate)
     p = dict(zip(plant.parameter.elements, plant.exact, strict=True))
     assert chain.order == order
     for state in np.random.default_rng(1).uniform(0.5, 6.0, size=(5, plant.state.size)):
@@ -167,7 +172,7 @@ def test_order_and_gain(task, coordinate, order, gain):
 
 def test_chain_of_the_lower_tank():
     """h2' = (c1 sqrt(h1) - c2 sqrt(h2)) / A2."""
-    plant = TANKS.problem.plant
+    plant = SHIPPED.two_tanks_slots.problem.plant
     p = dict(zip(plant.parameter.elements, plant.exact, strict=True))
     for h1, h2 in np.random.default_rng(2).uniform(0.5, 6.0, size=(5, 2)):
         rate = (p["c1"] * np.sqrt(h1) - p["c2"] * np.sqrt(h2)) / p["A2"]
@@ -179,7 +184,7 @@ def test_chain_of_the_lower_tank():
 
 
 def test_fixed_and_periodic_are_the_same_run():
-    problem, slots = crane({"cart": -1.0}, duration=8.0), CRANE.controllers["slots+FPI"]
+    problem, slots = crane({"cart": -1.0}, duration=8.0), SHIPPED.crane_slots.controllers["slots+FPI"]
     spans = [("cart", 0.0, 1.4), ("angle", 1.4, 5.3), ("cart", 5.3, 6.7), ("angle", 6.7, 8.0)]
     fixed = run(problem, replace(slots, schedule=fp.FixedSchedule(spans)))
     periodic = run(problem, slots)
@@ -191,7 +196,9 @@ def test_fixed_and_periodic_are_the_same_run():
 
 def chosen(schedule: Schedule, **changes: Any) -> fp.Run:
     """The crane with slots that are chosen as it goes."""
-    return run(CRANE.problem, replace(CRANE.controllers["slots+FPI"], schedule=schedule, **changes))
+    return run(
+        SHIPPED.crane_slots.problem, replace(SHIPPED.crane_slots.controllers["slots+FPI"], schedule=schedule, **changes)
+    )
 
 
 def test_by_error_keeps_dwell_and_hysteresis():
@@ -222,11 +229,11 @@ def test_by_look_ahead_keeps_the_dwell():
 def test_look_ahead_chooses_what_the_runs_show():
     """The first slot is the one after which the weighted state is smaller, as runs with each slot alone find."""
     weights, dwell, random = {"cart": 3.0, "cart'": 1.0, "angle": 1.0, "angle'": 1.0}, 1.0, np.random.default_rng(4)
-    names = CRANE.problem.plant.state.elements
-    slots = CRANE.controllers["slots exact model"].controller
+    names = SHIPPED.crane_slots.problem.plant.state.elements
+    slots = SHIPPED.crane_slots.controllers["slots exact model"].controller
     sizes, firsts = np.array([weights[e] for e in names]), []
     for state in 1e-3 * random.normal(size=(6, 4)):
-        problem = crane(dict(zip(names, state, strict=True)), duration=dwell + 2 * CRANE.problem.period)
+        problem = crane(dict(zip(names, state, strict=True)), duration=dwell + 2 * SHIPPED.crane_slots.problem.period)
         values = []
         for slot in slots.slots:
             alone = replace(slots, slots=[slot], schedule=fp.Periodic({slot.coordinate: dwell}))
@@ -241,7 +248,9 @@ def test_look_ahead_chooses_what_the_runs_show():
 def test_a_slot_without_gain_is_not_chosen():
     """The angle has the larger error; but tilted by 0.2 rad the force's effect on it is below 99 % of that at the start."""
     schedule = fp.ByError({"cart": 1e-6, "angle": 1.0}, dwell=0.01)
-    slots = replace(CRANE.controllers["slots exact model"].controller, schedule=schedule, smallest_gain=0.99)
+    slots = replace(
+        SHIPPED.crane_slots.controllers["slots exact model"].controller, schedule=schedule, smallest_gain=0.99
+    )
     result = run(crane({"cart": 0.1}, duration=2.0), fp.ExactModel(slots))
     gain = angle_gain(result["state.angle"])
     assert gain.min() > 0.99 * gain[0]
@@ -329,7 +338,11 @@ def in_steps(problem: Any, period: float, orders: int) -> fp.Problem:
 
 def masses_in_steps(period: float) -> fp.Problem:
     """The two masses, of orders 2 and 4, towards rest."""
-    still = replace(MASSES.problem, reference=fp.Trajectory(lambda t: {"q1": 0 * t, "q2": 0 * t}), measure_from=0.0)
+    still = replace(
+        SHIPPED.mass_spring_slots.problem,
+        reference=fp.Trajectory(lambda t: {"q1": 0 * t, "q2": 0 * t}),
+        measure_from=0.0,
+    )
     return in_steps(still, period, 2)
 
 
@@ -338,7 +351,7 @@ SLOW = fp.Exponential(rate=1.0, integral=False)
 
 def slow() -> Any:
     """Slots of the masses whose errors are still there after a period."""
-    slots = MASSES.controllers["slots"]
+    slots = SHIPPED.mass_spring_slots.controllers["slots"]
     pair = [replace(s, tracking=SLOW) for s in slots.slots]
     return replace(slots, slots=pair, schedule=fp.Periodic({"q2": 0.4, "q1": 0.6}))
 
@@ -355,8 +368,8 @@ def test_slots_on_a_map_shrink_by_the_radius_of_the_map():
 
 def test_a_map_is_the_plant_for_short_steps():
     """The radius of Euler's steps goes to that of the differential equation as the step."""
-    slots = MASSES.controllers["slots"]
-    problems = MASSES.problem, masses_in_steps(2e-3), masses_in_steps(1e-3)
+    slots = SHIPPED.mass_spring_slots.controllers["slots"]
+    problems = SHIPPED.mass_spring_slots.problem, masses_in_steps(2e-3), masses_in_steps(1e-3)
     known, *found = (
         floquet_radius(p, slots.slots, slots.schedule, blend=slots.blend).radius or math.nan for p in problems
     )
@@ -372,7 +385,10 @@ def referenced(slots: Any, **settings: Any) -> Any:
 
 def test_a_wrong_model_of_steps_is_corrected():
     """The masses as a map, with slots of order 2 and 4: the form leaves a hundredth of what the wrong model leaves."""
-    problem, slots = in_steps(MASSES.problem, 5e-3, 2), MASSES.controllers["slots"]
+    problem, slots = (
+        in_steps(SHIPPED.mass_spring_slots.problem, 5e-3, 2),
+        SHIPPED.mass_spring_slots.controllers["slots"],
+    )
     plain, adapted = (rms(problem, run(problem, c)) for c in (slots, referenced(slots)))
     assert (adapted < 0.01 * plain).all()
     assert (plain > 1e-3).all()
@@ -381,7 +397,7 @@ def test_a_wrong_model_of_steps_is_corrected():
 def test_slots_behind_a_dead_time_switch_without_a_jump():
     """Predicted, with the dead time in the form, which is told it by the problem; a form that is told none chatters."""
     problem = crane({"cart": -1.0}, duration=10.6, dead_time=fp.DeadTime(inputs={"F": 0.01}))
-    slots = referenced(CRANE.controllers["slots"])
+    slots = referenced(SHIPPED.crane_slots.controllers["slots"])
     largest = []
     for controller in (slots, referenced(slots, cycles=0.0)):
         result = run(problem, fp.Predicted(controller, inputs=0.01))
@@ -394,11 +410,14 @@ def test_slots_behind_a_dead_time_switch_without_a_jump():
 
 def test_responses_of_slots_are_differences_of_positions():
     """Of both coordinates, one of which no sensor has a response of: the fourth difference of q1, the second of q2."""
-    period = MASSES.problem.period
+    period = SHIPPED.mass_spring_slots.problem.period
     problem = replace(
-        MASSES.problem, sensing=fp.Sensing(estimator=fp.PositionDifference()), duration=1.5, measure_from=0.0
+        SHIPPED.mass_spring_slots.problem,
+        sensing=fp.Sensing(estimator=fp.PositionDifference()),
+        duration=1.5,
+        measure_from=0.0,
     )
-    result = run(problem, MASSES.controllers["slots+FPI"])
+    result = run(problem, SHIPPED.mass_spring_slots.controllers["slots+FPI"])
     at = {name: result[f"plant_state.{name}"] for name in ("q1", "q2")}
     for name, order in (("q1", 4), ("q2", 2)):
         expected = np.diff(at[name], order) / period**order
@@ -409,15 +428,18 @@ def test_responses_of_slots_are_differences_of_positions():
 def test_slots_with_encoders_correct_a_wrong_model():
     """Tanks whose levels are counted in thousandths of a decimetre: the error falls as it does without sensors."""
     fine = {name: fp.Sensor(quantum=1e-3) for name in ("h1", "h2")}
-    problem = replace(TANKS.problem, sensing=fp.Sensing(sensors=fine, estimator=fp.SavitzkyGolay(window=9, degree=2)))
-    slots = TANKS.controllers["slots"].with_deformation(fp.Affine(gain=-0.2))
-    plain, adapted = (rms(problem, run(problem, c)) for c in (TANKS.controllers["slots"], slots))
+    problem = replace(
+        SHIPPED.two_tanks_slots.problem,
+        sensing=fp.Sensing(sensors=fine, estimator=fp.SavitzkyGolay(window=9, degree=2)),
+    )
+    slots = SHIPPED.two_tanks_slots.controllers["slots"].with_deformation(fp.Affine(gain=-0.2))
+    plain, adapted = (rms(problem, run(problem, c)) for c in (SHIPPED.two_tanks_slots.controllers["slots"], slots))
     assert (adapted < 0.1 * plain).all()
 
 
 def masses_by_states() -> fp.Plant:
     """The two masses as first-order equations in another order, with extension and sum as states."""
-    plant = MASSES.problem.plant
+    plant = SHIPPED.mass_spring_slots.problem.plant
 
     def rates(x, u, p):
         low, pull = (x.total - x.between) / 2, p.k2 * x.between
@@ -440,17 +462,22 @@ def masses_by_states() -> fp.Plant:
 
 
 @pytest.mark.parametrize("name", ["slots", "slots+FPI"])
-@pytest.mark.parametrize("reality", [MASSES.problem.plant, masses_by_states()], ids=["same", "by states"])
+@pytest.mark.parametrize(
+    "reality", [lambda: SHIPPED.mass_spring_slots.problem.plant, masses_by_states], ids=["same", "by states"]
+)
 def test_slots_read_their_responses_from_a_reality(name, reality):
     """A reality that is the plant itself, or its equations in other states, is the plant: over a switch, with a wrong model."""
-    problem = replace(MASSES.problem, duration=1.5, measure_from=0.0)
-    plain = run(problem, MASSES.controllers[name])
-    real = run(replace(problem, reality=fp.Reality(reality)), MASSES.controllers[name])
+    problem = replace(SHIPPED.mass_spring_slots.problem, duration=1.5, measure_from=0.0)
+    plain = run(problem, SHIPPED.mass_spring_slots.controllers[name])
+    real = run(replace(problem, reality=fp.Reality(reality())), SHIPPED.mass_spring_slots.controllers[name])
     assert len(switches(real)) == 1
     for signal in ("state", "command", "realised", "deformed"):
         scale = np.abs(plain[signal]).max()
         np.testing.assert_allclose(real[signal] / scale, plain[signal] / scale, atol=1e-9, err_msg=signal)
-    assert "a reality moves" in MASSES.controllers[name].notes(replace(problem, reality=fp.Reality(reality)))[0]
+    assert (
+        "a reality moves"
+        in SHIPPED.mass_spring_slots.controllers[name].notes(replace(problem, reality=fp.Reality(reality())))[0]
+    )
 
 
 # Switches
@@ -467,7 +494,7 @@ def test_command_is_continuous_at_switches(name):
     """A slot begins with the last command, and its steps in the next 0.1 s vanish with the period; a jump would not."""
     largest = []
     for period in (5e-3, 2.5e-3):
-        steps, at = moved(CRANE.controllers[name], period)
+        steps, at = moved(SHIPPED.crane_slots.controllers[name], period)
         assert len(at) == 3
         assert steps[at - 1].max() < 1e-12
         largest.append(max(steps[k - 1 : k + round(0.1 / period)].max() for k in at))
@@ -477,7 +504,7 @@ def test_command_is_continuous_at_switches(name):
 
 def test_without_blend_the_command_jumps():
     """What `blend` is for: joined at once, the law moves the command by as much at any period."""
-    pairs = [moved(replace(CRANE.controllers["slots"], blend=0.0), period) for period in (5e-3, 2.5e-3)]
+    pairs = [moved(replace(SHIPPED.crane_slots.controllers["slots"], blend=0.0), period) for period in (5e-3, 2.5e-3)]
     largest = [steps[at].max() for steps, at in pairs]
     assert largest[1] > 0.9 * largest[0] > 0.5
 
@@ -491,7 +518,7 @@ def own_law(run_: fp.Run, name: str, rate: float) -> np.ndarray:
 @pytest.mark.parametrize("blend", [0.1, 0.3])
 def test_offset_decays_with_the_blend(name, blend):
     """What the desired response is away from the law falls as e^(-t / blend) and begins at what the plant does."""
-    result = run(crane({"cart": -1.0}, duration=5.3), replace(CRANE.controllers[name], blend=blend))
+    result = run(crane({"cart": -1.0}, duration=5.3), replace(SHIPPED.crane_slots.controllers[name], blend=blend))
     (at,) = switches(result)
     offset = result["desired.angle"] - own_law(result, "angle", 3.0)
     expected = offset[at] * np.exp(-(result.time[at:] - result.time[at]) / blend)
@@ -506,7 +533,7 @@ def test_a_deformation_starts_afresh_with_every_slot():
     """The tuned gain of one slot says nothing of the next: its factor is 1 at every start, and grows to 3 within."""
     sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=10.0)
     tuned = fp.Tuned(sigmoid, largest_gain=3 * sigmoid.effective_gain())
-    slots = CRANE.controllers["slots+FPI"]
+    slots = SHIPPED.crane_slots.controllers["slots+FPI"]
     slots = replace(slots, slots=[replace(s, deformation=tuned) for s in slots.slots])
     result = run(crane({"cart": -1.0}, duration=10.6), slots)
     assert len(result.spans()) == 4
@@ -520,7 +547,10 @@ def test_a_deformation_starts_afresh_with_every_slot():
 
 def test_an_integral_starts_afresh_with_every_slot():
     """Bumpless: it begins where it cancels the feedback of error and rate, whatever it was at the end of the slot before."""
-    slots, problem = TANKS.controllers["slots"], replace(TANKS.problem, duration=480.0, measure_from=0.0)
+    slots, problem = (
+        SHIPPED.two_tanks_slots.controllers["slots"],
+        replace(SHIPPED.two_tanks_slots.problem, duration=480.0, measure_from=0.0),
+    )
     result = run(problem, replace(slots, blend=0.0))
     chain = output_chain(problem.plant, "h2")
     of_integral, of_error, of_rate = fp.Exponential(rate=0.1).gains(2)
@@ -543,7 +573,7 @@ def test_an_integral_starts_afresh_with_every_slot():
 def test_blanked_cycles_keep_the_distance():
     """In the first cycles of a slot the request keeps its distance from the desired response; without blank it does not."""
     for blank in (0, 4):
-        slots = replace(CRANE.controllers["slots+FPI"], blank=blank)
+        slots = replace(SHIPPED.crane_slots.controllers["slots+FPI"], blank=blank)
         result = run(crane({"cart": -1.0}, duration=10.6), slots)
         away = result["deformed"] - result["desired"]
         for k in switches(result):
@@ -554,7 +584,7 @@ def test_blanked_cycles_keep_the_distance():
 
 def test_too_little_gain_holds_the_command():
     """Held in exactly the cycles in which the active slot's gain is below its share, and the status says so."""
-    slots = replace(CRANE.controllers["slots exact model"].controller, smallest_gain=0.995)
+    slots = replace(SHIPPED.crane_slots.controllers["slots exact model"].controller, smallest_gain=0.995)
     result = run(crane({"cart": -1.0}, duration=10.6), fp.ExactModel(slots))
     gain = angle_gain(result["state.angle"])
     cart_gain = gain / np.cos(result["state.angle"])
@@ -613,16 +643,16 @@ def refused(problem: fp.Problem, controller: Controller) -> str:
 
 
 def crane_slots(**changes: Any) -> Any:
-    return replace(CRANE.controllers["slots"], **changes)
+    return replace(SHIPPED.crane_slots.controllers["slots"], **changes)
 
 
 def pole_slots(**changes: Any) -> Any:
-    return replace(POLE.controllers["slots"], **changes)
+    return replace(SHIPPED.cart_pole_slots.controllers["slots"], **changes)
 
 
 def crane_with(cart: Any = None, angle: Any = None) -> Any:
     """The crane's slots, one of them with this map."""
-    maps = zip(CRANE.controllers["slots"].slots, (cart, angle), strict=True)
+    maps = zip(SHIPPED.crane_slots.controllers["slots"].slots, (cart, angle), strict=True)
     return crane_slots(slots=tuple(slot if map is None else replace(slot, deformation=map) for slot, map in maps))
 
 
@@ -653,7 +683,9 @@ def slotted(*names: str) -> fp.Slotted:
 ONE = fp.Exponential(rate=1.0)
 NO_PATH = alone(lambda q, v, u, p: {"a": u.F / p.m, "b": -q.b, "c": q.a - q.c}, "a", "b", "c", controlled=("a",))
 WRONG_SLOTS = fp.Slot("carts", ONE), fp.Slot("angle", ONE, order=3), fp.Slot("angle", ONE, order=2)
-MEAN = replace(TANKS.problem, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=9, degree=2)))
+averaged = cache(
+    lambda: replace(SHIPPED.two_tanks_slots.problem, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=9, degree=2)))
+)
 FALLS = (
     "slot 'cart' lasts 1.4 s, in which its zero dynamics, diverging at 3.5 1/s, grow e^4.9 times",
     "make it shorter than 1.32 s",
@@ -705,16 +737,16 @@ LONG_FALLS = (
     fp.FixedSchedule([("angle", 0.0, 0.5), ("cart", 0.5, 1.0), ("cart", 1.0, 1.9), ("angle", 1.9, 6.0)]),
     fp.ByError({"angle": 1.0, "cart": 1.0}, dwell=1.4),
 )
-REFUSED: dict[str, tuple[fp.Problem, Any, tuple[str, ...]]] = {
-    **{f"schedule {n}": (CRANE.problem, crane_slots(schedule=one), counted(texts)) for n, (one, texts) in SCHEDULES.items()},
-    "slots and schedule": (CRANE.problem, crane_slots(slots=WRONG_SLOTS, schedule=fp.Periodic({"carts": 1.0})), counted((
+refusals = cache(lambda: {  # the problem or its name, the controller, and what is said
+    **{f"schedule {n}": ("crane_slots", crane_slots(schedule=one), counted(texts)) for n, (one, texts) in SCHEDULES.items()},
+    "slots and schedule": ("crane_slots", crane_slots(slots=WRONG_SLOTS, schedule=fp.Periodic({"carts": 1.0})), counted((
         "coordinate 'angle' has more than one slot",
         "slot 'carts': coordinate 'carts' is unknown. Did you mean 'cart'? Valid: cart, angle.",
         "order=3 is not the relative order from 'F' to 'angle', which is 2; write order=2 or leave it out",
         "Periodic: slot 'angle' is never active",
     ))),
-    "none": (CRANE.problem, crane_slots(slots=()), ("there are no slots",)),
-    "not judged": (replace(CRANE.problem, judged=("cart",)), crane_slots(), (
+    "none": ("crane_slots", crane_slots(slots=()), ("there are no slots",)),
+    "not judged": (replace(SHIPPED.crane_slots.problem, judged=("cart",)), crane_slots(), (
         "slot 'angle' is not among the coordinates that are judged; write Problem(..., judged=('cart', 'angle'))",
     )),
     "no path from the input": (NO_PATH, slotted("a", "b"), (
@@ -722,39 +754,40 @@ REFUSED: dict[str, tuple[fp.Problem, Any, tuple[str, ...]]] = {
         "(relative order by coordinate: a 2, b none, c 4); choose a coordinate that has one",
     )),
     # The pole falls at 3.49 1/s: ln(100) / 3.49 = 1.32 s is the longest cart slot, by any schedule that promises more.
-    **{f"falls, {type(one).__name__}": (POLE.problem, pole_slots(schedule=one), FALLS) for one in LONG_FALLS},
+    **{f"falls, {type(one).__name__}": ("cart_pole_slots", pole_slots(schedule=one), FALLS) for one in LONG_FALLS},
     # Pairs of cycles before a switch belong to another coordinate; also where another wrapper hides them.
-    **{name: (CRANE.problem, crane_with(map), (
+    **{name: ("crane_slots", crane_with(map), (
         f"slot 'cart': {name.partition(',')[0]} keeps pairs of earlier cycles, which belong to another slot",
     )) for name, map in QUEUES.items()},
-    "wrong sign": (CRANE.problem, crane_with(angle=fp.Sigmoid(gain=2.0, shift=-0.3, scale=10.0)), (
+    "wrong sign": ("crane_slots", crane_with(angle=fp.Sigmoid(gain=2.0, shift=-0.3, scale=10.0)), (
         "slot 'angle': Sigmoid(gain=2) has the wrong sign",
     )),
-    "no scale": (CRANE.problem, crane_with(angle=fp.Sigmoid(gain=-2.0)), (
+    "no scale": ("crane_slots", crane_with(angle=fp.Sigmoid(gain=-2.0)), (
         "slot 'angle': Sigmoid(scale=None): the scale is still to be chosen",
     )),
-    "gain behind a mean": (MEAN, TANKS.controllers["slots"].with_deformation(fp.Affine(gain=-0.9)), (
+    "gain behind a mean": (averaged(), SHIPPED.two_tanks_slots.controllers["slots"].with_deformation(fp.Affine(gain=-0.9)), (
         "its response is of several cycles, so the iteration converges only for",
     )),
     "not affine": (alone(lambda q, v, u, p: {"y": (u.F + 0.1 * u.F**3) / p.m}, "y"), slotted("y"), (
         "derivative 2 of 'y' is not affine in 'F', which a slot needs",
     )),
     # In a step of the lower level stands the root of the upper one after a step.
-    "steps": (in_steps(TANKS.problem, 0.5, 1), TANKS.controllers["slots"], ("derivative 2 of 'h2' is not affine in 'inflow'",)),
-}  # fmt: skip
+    "steps": (in_steps(SHIPPED.two_tanks_slots.problem, 0.5, 1), SHIPPED.two_tanks_slots.controllers["slots"], (
+        "derivative 2 of 'h2' is not affine in 'inflow'",
+    )),
+})  # fmt: skip
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_mistakes_are_named(name):
+def test_mistakes_are_named():
     """All of them at once, before the run."""
-    problem, slots, texts = REFUSED[name]
-    message = refused(problem, slots)
-    assert [text for text in texts if text not in message] == []
+    for name, (problem, slots, texts) in refusals().items():
+        message = refused(getattr(SHIPPED, problem).problem if isinstance(problem, str) else problem, slots)
+        assert [text for text in texts if text not in message] == [], name
 
 
 def test_zero_dynamics_that_diverge_little_are_accepted():
     """A cart slot shorter than 1.32 s, or one whose growth is allowed."""
-    brief = replace(POLE.problem, duration=0.02, measure_from=0.0)
+    brief = replace(SHIPPED.cart_pole_slots.problem, duration=0.02, measure_from=0.0)
     run(brief, pole_slots(schedule=fp.Periodic({"angle": 0.5, "cart": 1.31})))
     run(brief, pole_slots(schedule=fp.Periodic({"angle": 0.5, "cart": 1.4}), largest_growth=150.0))
 
@@ -773,7 +806,7 @@ def test_zero_dynamics_that_diverge_little_are_accepted():
 def test_numbers_out_of_range(changed):
     ((name, value),) = changed.items()
     with pytest.raises(InvalidValue, match=rf"Slotted(\({name}={value!r}\)|\.{name}): expected a"):
-        replace(CRANE.controllers["slots"], **changed)
+        replace(SHIPPED.crane_slots.controllers["slots"], **changed)
 
 
 # The shipped problems
@@ -787,11 +820,11 @@ def rms(problem: fp.Problem, run_: fp.Run) -> np.ndarray:
 
 def test_slots_of_the_cart_pole_are_the_wrong_plan():
     """RHC holds the cart within centimetres where slots drive it away, whatever their model."""
-    problem = replace(POLE.problem, duration=3.0)
-    planned = rms(problem, run(problem, POLE.controllers["RHC"]))
+    problem = replace(SHIPPED.cart_pole_slots.problem, duration=3.0)
+    planned = rms(problem, run(problem, SHIPPED.cart_pole_slots.controllers["RHC"]))
     assert planned[0] < 0.02
     for name in ("slots", "slots+FPI", "slots exact model"):
-        assert rms(problem, run(problem, POLE.controllers[name]))[0] > 10 * planned[0]
+        assert rms(problem, run(problem, SHIPPED.cart_pole_slots.controllers[name]))[0] > 10 * planned[0]
 
 
 # Runs and reports
@@ -799,7 +832,7 @@ def test_slots_of_the_cart_pole_are_the_wrong_plan():
 
 def test_a_saved_run_keeps_its_slots(tmp_path):
     """The signal, and with it the spans, survive saving; other controllers have none."""
-    result = run(crane({"cart": -1.0}, duration=6.0), CRANE.controllers["slots+FPI"])
+    result = run(crane({"cart": -1.0}, duration=6.0), SHIPPED.crane_slots.controllers["slots+FPI"])
     result.save(tmp_path / "run.npz")
     loaded = fp.load_run(tmp_path / "run.npz")
     np.testing.assert_array_equal(loaded["slot"], result["slot"])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from plants import linear, pendulum
 from test_adaptation import Scalar
 
@@ -92,14 +94,14 @@ def short(problem: fp.Problem, **changes) -> fp.Problem:
     return replace(problem, duration=0.3, measure_from=0.0, **changes)
 
 
-TWO_MASS = short(fp.load_problem("two_mass").problem)
+two_mass = cache(lambda: short(fp.load_problem("two_mass").problem))
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=2.0)
 LAW = fp.Exponential(rate=6.0)
 
 
 def test_inputs_arrive_when_they_should():
     """Each input has its own delay; a fraction of a cycle is interpolated; queues begin with zero commands."""
-    delayed = replace(TWO_MASS, dead_time=fp.DeadTime(inputs={"Q1": 3.25e-3, "Q2": 2e-3}))
+    delayed = replace(two_mass(), dead_time=fp.DeadTime(inputs={"Q1": 3.25e-3, "Q2": 2e-3}))
     run = fp.simulate(delayed, fp.ComputedTorque(LAW), seed=0, compiled=False)
     sent, arrived = run["command"], run["arriving"]
     padded = np.vstack([np.zeros((4, 2)), sent])
@@ -111,7 +113,7 @@ def test_inputs_arrive_when_they_should():
 
 def test_measurements_are_old():
     """The controller sees the state of 5 cycles ago (the start before that); the run is judged by the true one."""
-    delayed = replace(TWO_MASS, dead_time=fp.DeadTime(measurement=5e-3))
+    delayed = replace(two_mass(), dead_time=fp.DeadTime(measurement=5e-3))
     run = fp.simulate(delayed, fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=5)), seed=0, compiled=False)
     np.testing.assert_array_equal(run["state"][5:], run["plant_state"][:-5])
     np.testing.assert_array_equal(run["state"][:5], np.tile(delayed.start_state, (5, 1)))
@@ -158,18 +160,17 @@ def test_desired_responses_predict_an_ideal_plant():
     np.testing.assert_allclose(states[0], states[1], atol=1e-9)
 
 
-DUFFING = fp.load_problem("delayed_mass")
-LATE = replace(DUFFING.problem, duration=9.0, measure_from=4.0)  # 60 ms, rate x dead time = 0.36
+late_mass = cache(lambda: replace(tasks.delayed_mass.problem, duration=9.0, measure_from=4.0))
 
 
 def rms_error(dead_time: float, controller: Controller) -> float:
-    problem = replace(LATE, dead_time=fp.DeadTime(inputs={"Q": dead_time}))
+    problem = replace(late_mass(), dead_time=fp.DeadTime(inputs={"Q": dead_time}))
     return fp.measure(problem, fp.simulate(problem, controller, seed=0, compiled=None)).rms_error["q"]
 
 
 def controllers(believed: float) -> dict[str, Controller]:
     """The forms of the deformation, for a believed dead time."""
-    cycles = believed / DUFFING.problem.period
+    cycles = believed / tasks.delayed_mass.problem.period
     sigmoid = fp.Sigmoid(gain=-0.5)
     increment = fp.ComputedTorque(LAW, fp.Increment(sigmoid, cycles=cycles))
     return {
@@ -203,10 +204,10 @@ def test_misestimated_dead_time_degrades_gracefully(share):
     for believed, uncertainty in ((0.06, 0), (share * 0.06, 18), (share * 0.06, 0)):
         deformation = fp.Increment(fp.Sigmoid(gain=-0.5), cycles=1e3 * believed, uncertainty=uncertainty)
         run = fp.simulate(
-            LATE, fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=believed), seed=0, compiled=None
+            late_mass(), fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=believed), seed=0, compiled=None
         )
-        late = run.time >= LATE.measure_from
-        errors.append(fp.measure(LATE, run).rms_error["q"])
+        late = run.time >= late_mass().measure_from
+        errors.append(fp.measure(late_mass(), run).rms_error["q"])
         moves.append(np.abs(np.diff(run["command"][late, 0])).mean())
     assert errors[1] < 4 * errors[0]
     assert moves[1] < 2 * moves[0]
@@ -240,7 +241,7 @@ def test_receding_horizon_starts_where_its_command_acts():
 )
 def test_bad_dead_times(dead_time, sentence):
     with pytest.raises(FpirhcError, match=sentence):
-        replace(TWO_MASS, dead_time=dead_time)
+        replace(two_mass(), dead_time=dead_time)
 
 
 def with_unknown_delay(deformation, desired, delay, noise, seed=0):
@@ -283,7 +284,7 @@ def test_smooth_requests_tell_no_dead_time():
 def test_a_run_in_which_no_dead_time_was_found_says_so(size, says):
     """A sine tells none; with noise in the velocities, and so in the request, one is found, and nothing needs to be said."""
     noisy = fp.Sensing({f"{n}'": fp.Sensor(fp.Noise(size)) for n in ("q1", "q2")}) if size else fp.Sensing()
-    problem = replace(TWO_MASS, sensing=noisy, duration=2.0, measure_from=1.0)
+    problem = replace(two_mass(), sensing=noisy, duration=2.0, measure_from=1.0)
     run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.SelfPaired(SIGMOID, most=5)), seed=0, compiled=False)
     assert bool((run["paired_cycles"] < 0).all()) == says
     assert any("no dead time was identified in the whole run" in text for text in run.remarks) == says
@@ -292,7 +293,7 @@ def test_a_run_in_which_no_dead_time_was_found_says_so(size, says):
 
 def test_watching_changes_nothing():
     """The estimate beside a map leaves the run as it is, and is in the run by name."""
-    square = replace(LATE, duration=2.0, measure_from=0.0)
+    square = replace(late_mass(), duration=2.0, measure_from=0.0)
     plain, watched = (
         fp.simulate(square, fp.ComputedTorque(LAW, d), seed=0, compiled=False)
         for d in (SIGMOID, fp.DelayWatched(SIGMOID, most=80))
@@ -321,7 +322,7 @@ def test_bad_settings():
     ):
         fp.DeadTime(inputs={"Q1": -0.1})
     with pytest.raises(InvalidValue, match="3000 cycles of dead time, more than 1000"):
-        fp.simulate(TWO_MASS, fp.Predicted(fp.ComputedTorque(LAW), inputs=3.0), seed=0)
+        fp.simulate(two_mass(), fp.Predicted(fp.ComputedTorque(LAW), inputs=3.0), seed=0)
     cart_pole = fp.load_problem("cart_pole")
     with pytest.raises(NotSupported, match=r"ByModel\(\)"):
         fp.simulate(

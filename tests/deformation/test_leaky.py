@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_dead_time import DUFFING, LAW, affine, iteration_radius
+import tasks
+from test_dead_time import LAW, affine, iteration_radius
 
 import fpirhc as fp
 from fpirhc.contraction.delayed import limit_behind_weights, loop_polynomial
@@ -118,8 +119,8 @@ def test_leak_is_faster_than_the_mean():
 
 def delayed_rms(true: int, deformation: Deformation) -> float:
     """Rms error of the delayed mass with computed torque and a prediction that believe 20 cycles of dead time."""
-    dead_time = fp.DeadTime(inputs={"Q": true * DUFFING.problem.period})
-    problem = replace(DUFFING.problem, dead_time=dead_time, limits=fp.Limits())
+    dead_time = fp.DeadTime(inputs={"Q": true * tasks.delayed_mass.problem.period})
+    problem = replace(tasks.delayed_mass.problem, dead_time=dead_time, limits=fp.Limits())
     controller = fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=0.02)
     return fp.measure(problem, fp.simulate(problem, controller, seed=0)).rms_error["q"]
 
@@ -142,8 +143,8 @@ def test_without_a_leak_the_same_mass_swings(true):
 
 def unknown_rms(true: int, deformation: Deformation, predicted: float = 0.025) -> float:
     """Rms error of the delayed mass whose dead time is only known to be at most 50 cycles."""
-    dead_time = fp.DeadTime(inputs={"Q": true * DUFFING.problem.period})
-    problem = replace(DUFFING.problem, dead_time=dead_time, limits=fp.Limits())
+    dead_time = fp.DeadTime(inputs={"Q": true * tasks.delayed_mass.problem.period})
+    problem = replace(tasks.delayed_mass.problem, dead_time=dead_time, limits=fp.Limits())
     law = fp.ComputedTorque(LAW, deformation)
     run = fp.simulate(problem, fp.Predicted(law, inputs=predicted) if predicted else law, seed=0)
     return fp.measure(problem, run).rms_error["q"]
@@ -151,8 +152,10 @@ def unknown_rms(true: int, deformation: Deformation, predicted: float = 0.025) -
 
 def planned_rms(true: int, name: str) -> float:
     """Rms error of the shipped plans, which predict over 60 cycles, with another dead time."""
-    problem = replace(DUFFING.problem, dead_time=fp.DeadTime(inputs={"Q": true * DUFFING.problem.period}))
-    return fp.measure(problem, fp.simulate(problem, DUFFING.controllers[name], seed=0)).rms_error["q"]
+    problem = replace(
+        tasks.delayed_mass.problem, dead_time=fp.DeadTime(inputs={"Q": true * tasks.delayed_mass.problem.period})
+    )
+    return fp.measure(problem, fp.simulate(problem, tasks.delayed_mass.controllers[name], seed=0)).rms_error["q"]
 
 
 def test_plans_bear_a_dead_time_that_is_wrong_by_a_tenth():

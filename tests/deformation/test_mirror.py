@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from exchange import told, with_exact_model
 from plants import chain
 
@@ -18,7 +19,6 @@ from fpirhc.errors import NotContractive
 
 LAW = fp.Exponential(rate=6.0)
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=50.0)
-TWO_MASS = fp.load_problem("two_mass").problem
 QUANTA = {"q1": fp.Sensor(quantum=1e-5), "q2": fp.Sensor(quantum=3e-5)}
 
 ESTIMATORS = (
@@ -55,7 +55,9 @@ def short(problem: fp.Problem, cycles: int = 150) -> fp.Problem:
 def test_null_behind_sensors_and_dead_time(estimator, wait):
     """An exact model is left alone to rounding: late, rounded and smoothed alike, the two responses are the same number."""
     quanta = QUANTA if isinstance(estimator, fp.PositionDifference | fp.StateVariableFilter) else {}
-    problem = short(with_exact_model(replace(TWO_MASS, dead_time=wait, sensing=fp.Sensing(quanta, estimator))))
+    problem = short(
+        with_exact_model(replace(tasks.two_mass.problem, dead_time=wait, sensing=fp.Sensing(quanta, estimator)))
+    )
     referenced = fp.ModelReferenced(SIGMOID, **told(problem))
     assert change(problem, fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, referenced)) <= 1e-9
 
@@ -63,7 +65,7 @@ def test_null_behind_sensors_and_dead_time(estimator, wait):
 @pytest.mark.parametrize("wait", WAITS[1:], ids=("inputs", "fractions", "before"))
 def test_null_with_a_measured_response_and_dead_time(wait):
     """The same with ideal sensors, and under a prediction: the mirror sees the measured state, not the predicted one."""
-    problem = short(with_exact_model(replace(TWO_MASS, dead_time=wait)))
+    problem = short(with_exact_model(replace(tasks.two_mass.problem, dead_time=wait)))
     law, adaptive = fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, fp.ModelReferenced(SIGMOID, **told(problem)))
     assert change(problem, law, adaptive) <= 1e-9
     ahead: Any = {"inputs": 3e-3, "measurement": 1e-3}
@@ -88,7 +90,7 @@ def test_null_at_other_orders(order):
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
 def test_wrong_model_behind_estimators(estimator):
     """The twin keeps to a plant that it models wrongly: tracking is ten times better than without adaptation."""
-    problem = replace(TWO_MASS, sensing=fp.Sensing(estimator=estimator), duration=6.0)
+    problem = replace(tasks.two_mass.problem, sensing=fp.Sensing(estimator=estimator), duration=6.0)
     none, result = (
         max(fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(LAW, d), seed=0)).rms_error.values())
         for d in (fp.Identity(), fp.ModelReferenced(SIGMOID.with_effective_gain(0.4)))
@@ -100,7 +102,7 @@ def test_twin_is_the_instant_where_the_response_is_measured():
     """Behind an estimator without delay the twin gives what the response of the instant gives, to the order of the period."""
     errors = {}
     for name, sensing in (("twin", fp.Sensing(estimator=fp.VelocityDifference())), ("instant", fp.Sensing())):
-        problem = replace(TWO_MASS, sensing=sensing, duration=6.0)
+        problem = replace(tasks.two_mass.problem, sensing=sensing, duration=6.0)
         run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.ModelReferenced(SIGMOID)), seed=0)
         errors[name] = fp.measure(problem, run).rms_error["q1"]
     assert errors["twin"] == pytest.approx(errors["instant"], rel=0.15)
@@ -110,10 +112,13 @@ def test_gain_that_the_delay_does_not_allow_is_refused():
     """With a model of a third of the plant's gain and a long window; the limit in the message is one that runs."""
     known = {
         n: replace(p, approximate=3 * p.exact if n in ("m1", "m2") else p.exact)
-        for n, p in TWO_MASS.plant.parameters.items()
+        for n, p in tasks.two_mass.problem.plant.parameters.items()
     }
     sensing = fp.Sensing(estimator=fp.SavitzkyGolay(window=41, degree=2))
-    problem = short(replace(TWO_MASS, plant=replace(TWO_MASS.plant, parameters=known), sensing=sensing), 50)
+    problem = short(
+        replace(tasks.two_mass.problem, plant=replace(tasks.two_mass.problem.plant, parameters=known), sensing=sensing),
+        50,
+    )
     with pytest.raises(
         NotContractive, match=r"ModelReferenced\(gain=-0.8\): the response comes 19.5 cycles late.*below 0.191"
     ):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from exchange import told, with_exact_model
 from kinds import shipped
 from plants import linear
@@ -23,7 +25,6 @@ from fpirhc.review.questions.right_model import Tried, recommended_form, right_f
 from fpirhc.symbolic.block import Block
 
 LAW = fp.Exponential(rate=6.0)
-TWO_MASS = fp.load_problem("two_mass")
 
 
 def short(problem: fp.Problem, cycles: int) -> fp.Problem:
@@ -55,7 +56,7 @@ def commands(problem: fp.Problem, run: fp.Run, requests: np.ndarray) -> np.ndarr
 @pytest.mark.parametrize("gain", [0.1, 0.4, 1.0])
 def test_affine_map_is_the_additive_disturbance_estimate(gain):
     """w+ = w + a (f - f^ - w), r = d - w, computed here from the run's signals alone, gives its commands to 1e-12, in noise."""
-    problem = short(noisy(TWO_MASS.problem), 2000)
+    problem = short(noisy(tasks.two_mass.problem), 2000)
     run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.ModelReferenced(affine(gain))), seed=4, compiled=False)
     seen = run["realised"] - modelled(problem, run)
     estimate, requests = np.zeros(2), run["desired"].copy()
@@ -68,7 +69,7 @@ def test_affine_map_is_the_additive_disturbance_estimate(gain):
 
 def test_unit_gain_is_incremental_inversion():
     """u_k = u_{k-1} + B^-1 (d_k - f_k): the model's drift cancels."""
-    problem = short(noisy(TWO_MASS.problem), 2000)
+    problem = short(noisy(tasks.two_mass.problem), 2000)
     run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.ModelReferenced(affine(1.0))), seed=4, compiled=False)
     zero = commands(problem, run, np.zeros((run.cycles, 2)))
     moves = commands(problem, run, run["desired"] - run["realised"]) - zero
@@ -183,14 +184,14 @@ TRACKING = (
 @pytest.mark.parametrize(("name", "deformation", "expected"), TRACKING)
 def test_two_mass_figures(name, deformation, expected):
     """Tracking with the wrong model, against another implementation of the same formulas, within 5 %."""
-    run = fp.simulate(TWO_MASS.problem, TWO_MASS.controllers[name].with_deformation(deformation), seed=0)
-    errors = fp.measure(TWO_MASS.problem, run).rms_error
+    run = fp.simulate(tasks.two_mass.problem, tasks.two_mass.controllers[name].with_deformation(deformation), seed=0)
+    errors = fp.measure(tasks.two_mass.problem, run).rms_error
     assert 1e3 * max(errors.values()) == pytest.approx(expected, rel=0.05)
 
 
 def test_noise_costs_less():
     """In noise of 1 m/s^2 it tracks better at the same gain: .57 mm, plain 1.14, increment 1.14 (CTC, -1.5)."""
-    problem, map = noisy(TWO_MASS.problem), fp.Sigmoid(gain=-1.5, scale=50.0)
+    problem, map = noisy(tasks.two_mass.problem), fp.Sigmoid(gain=-1.5, scale=50.0)
     plain, referenced = (
         fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(LAW, d), seed=0)).rms_error["q1"]
         for d in (map, fp.ModelReferenced(map))
@@ -227,7 +228,7 @@ def test_every_map_on_two_coordinates(map):
         problem, law = fp.load_problem("delayed_mass").problem, LAW
         problem = replace(problem, dead_time=fp.DeadTime())
     else:
-        problem, law = TWO_MASS.problem, LAW
+        problem, law = tasks.two_mass.problem, LAW
     none, result = (
         fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(law, d), seed=0)).rms_error
         for d in (fp.Identity(), fp.ModelReferenced(map))
@@ -274,7 +275,7 @@ def test_force_mrac_compares_commands():
     assert np.abs(run["command"] - run["force_desired"]).max() <= 1e-9 * np.abs(run["command"]).max()
 
 
-LATE = replace(TWO_MASS.problem, dead_time=fp.DeadTime(inputs={"Q1": 3e-3}))
+late_masses = cache(lambda: replace(tasks.two_mass.problem, dead_time=fp.DeadTime(inputs={"Q1": 3e-3})))
 CASES = (
     (
         fp.Filtered(fp.ModelReferenced(affine(0.5)), pole=0.5),
@@ -296,7 +297,7 @@ CASES = (
 @pytest.mark.parametrize(("deformation", "sentence"), CASES)
 def test_forms_that_cannot_be_used(deformation, sentence):
     with pytest.raises(NotSupported, match=sentence):
-        fp.simulate(short(TWO_MASS.problem, 10), fp.ComputedTorque(LAW, deformation), seed=0)
+        fp.simulate(short(tasks.two_mass.problem, 10), fp.ComputedTorque(LAW, deformation), seed=0)
 
 
 def test_controllers_that_cannot_use_it():
@@ -305,7 +306,7 @@ def test_controllers_that_cannot_use_it():
     with pytest.raises(
         NotSupported, match="ForceMRAC cannot use a model-referenced deformation here: it compares the last command"
     ):
-        fp.simulate(short(LATE, 10), controller, seed=0)
+        fp.simulate(short(late_masses(), 10), controller, seed=0)
     module = fp.load_problem("crane_slots")
     late = module.controllers["slots+FPI"].with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.5), measurement=2.5))
     with pytest.raises(fp.FpirhcError, match="a measurement is late by whole cycles"):
@@ -316,19 +317,19 @@ def test_a_plan_has_no_model_beside_it():
     """As the map of an optimiser the form is refused, with what to use."""
     planner = fp.FixedPoint(iterations=1, map=fp.ModelReferenced(fp.Affine(gain=-2.0)), tolerance=1e-2)
     with pytest.raises(NotSupported, match=r"FixedPoint\(map=ModelReferenced.*use the map inside"):
-        fp.simulate(short(TWO_MASS.problem, 10), fp.RecedingHorizon(planner), seed=0)
+        fp.simulate(short(tasks.two_mass.problem, 10), fp.RecedingHorizon(planner), seed=0)
 
 
 def test_the_stored_request_is_not_read():
     """The form costs no memory of the last request: the blocks of the loop do not read it."""
-    blocks, _ = fp.ComputedTorque(LAW, fp.ModelReferenced(affine(0.5))).blocks(TWO_MASS.problem)
+    blocks, _ = fp.ComputedTorque(LAW, fp.ModelReferenced(affine(0.5))).blocks(tasks.two_mass.problem)
     assert all(isinstance(b, Block) and "_deformed_last" not in b.reads for b in blocks)
 
 
 def test_guard_lets_it_pass():
     """A guard around the form changes nothing while nothing trips, and sets the request to the desired one after a trip."""
     form = fp.ModelReferenced(fp.Sigmoid(gain=-1.5, scale=50.0))
-    problem = short(TWO_MASS.problem, 2000)
+    problem = short(tasks.two_mass.problem, 2000)
     bare, guarded, tight = (
         fp.simulate(problem, fp.ComputedTorque(LAW, d), seed=0, compiled=False)
         for d in (form, fp.Guarded(form, largest_deformation=1e4), fp.Guarded(form, largest_deformation=1.0))
@@ -346,8 +347,8 @@ def test_review_says_which_form():
         module = fp.load_problem(name)
         assert recommended_form(module.problem)[0] == form
     harmless = lambda _: ""  # noqa: E731
-    assert right_form(TWO_MASS.problem, fp.ModelReferenced(affine(0.5)), harmless).verdict == "yes"
-    advice = right_form(TWO_MASS.problem, affine(0.5), harmless)
+    assert right_form(tasks.two_mass.problem, fp.ModelReferenced(affine(0.5)), harmless).verdict == "yes"
+    advice = right_form(tasks.two_mass.problem, affine(0.5), harmless)
     assert advice.verdict == "unknown"
     assert "it is plain; measurements speak for model-referenced" in advice.evidence
     assert advice.change == f"Try ModelReferenced(map={affine(0.5)!r})."
@@ -362,17 +363,17 @@ def test_review_says_which_form():
             share = own if form == affine(0.5) else other
             return {"q1": Tried(share, "1 m")} if not math.isnan(share) else {}
 
-        ran = right_form(TWO_MASS.problem, affine(0.5), harmless, error_of)
+        ran = right_form(tasks.two_mass.problem, affine(0.5), harmless, error_of)
         assert ran.verdict == verdict
         told = "the rms error of q1 is 1 m as it is, 1 m with the model-referenced form" in ran.evidence
         assert told == math.isfinite(own)
     two = {"q1": Tried(1.0, "1 m"), "q2": Tried(3.0, "3 m")}, {"q1": Tried(1.1, "1.1 m"), "q2": Tried(2.0, "2 m")}
-    worse = right_form(TWO_MASS.problem, affine(0.5), harmless, lambda form: two[form != affine(0.5)])
+    worse = right_form(tasks.two_mass.problem, affine(0.5), harmless, lambda form: two[form != affine(0.5)])
     assert "of q2 is 3 m as it is, 2 m with" in worse.evidence  # that of q1 would speak against the advice
     assert worse.change.startswith("Try")
-    decided = right_form(TWO_MASS.problem, affine(0.5), lambda form: "it loses" if form != affine(0.5) else "")
+    decided = right_form(tasks.two_mass.problem, affine(0.5), lambda form: "it loses" if form != affine(0.5) else "")
     assert decided.verdict == "yes"
     assert decided.evidence.endswith("; but here it loses, and the form in use does no harm")
-    lost = right_form(TWO_MASS.problem, affine(0.5), lambda _: "with the wrong model it loses")
+    lost = right_form(tasks.two_mass.problem, affine(0.5), lambda _: "with the wrong model it loses")
     assert lost.evidence.endswith("; but here with the wrong model it loses")
     assert "Try" not in lost.change

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -12,7 +13,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.horizon.nominal import consistent_state
 
-PATIENT = fp.load_problem("anaesthesia").problem.plant
+patient = cache(lambda: fp.load_problem("anaesthesia").problem.plant)
 LIGHT = np.array([2.0, 0.6, 0.1, 1.5])  # mg/l
 
 
@@ -28,16 +29,16 @@ def test_the_model_has_the_measured_outputs_there() -> None:
     """Of another patient, whose curve and whose speed the model has wrong: to the last digits that four steps give."""
     random = np.random.default_rng(4)
     for _ in range(20):
-        x, other = LIGHT * random.lognormal(0, 0.4, 4), PATIENT.exact * random.lognormal(0, 0.15, 4)
-        y = seen(PATIENT, x, other)
-        start = found(PATIENT, x, y, PATIENT.approximate)
-        assert np.abs(seen(PATIENT, x, PATIENT.approximate) - y).max() > 0.01
-        np.testing.assert_allclose(seen(PATIENT, start, PATIENT.approximate), y, rtol=1e-6, atol=1e-6)
+        x, other = LIGHT * random.lognormal(0, 0.4, 4), patient().exact * random.lognormal(0, 0.15, 4)
+        y = seen(patient(), x, other)
+        start = found(patient(), x, y, patient().approximate)
+        assert np.abs(seen(patient(), x, patient().approximate) - y).max() > 0.01
+        np.testing.assert_allclose(seen(patient(), start, patient().approximate), y, rtol=1e-6, atol=1e-6)
 
 
 def test_the_state_of_a_right_model_stays_as_it_is() -> None:
-    y = seen(PATIENT, LIGHT, PATIENT.exact)
-    assert np.array_equal(found(PATIENT, LIGHT, y, PATIENT.exact), LIGHT)
+    y = seen(patient(), LIGHT, patient().exact)
+    assert np.array_equal(found(patient(), LIGHT, y, patient().exact), LIGHT)
 
 
 def several(length: float = 1.0, seconds: float = 1.0) -> fp.Plant:
@@ -88,11 +89,11 @@ def test_it_depends_on_no_unit() -> None:
 
 def test_what_newton_does_not_find_is_left_without_a_jump() -> None:
     """From the measured bis to one that no concentration gives, in small steps: the state moves in small steps, and back home."""
-    y = seen(PATIENT, LIGHT, PATIENT.approximate)
+    y = seen(patient(), LIGHT, patient().approximate)
     path = np.linspace(0.0, 1.0, 4001)
-    function = consistent_state(PATIENT)
+    function = consistent_state(patient())
     states = np.column_stack(
-        [function(LIGHT, y + s * np.array([-y[0] + 1.0, 400.0]), PATIENT.approximate).full() for s in path]
+        [function(LIGHT, y + s * np.array([-y[0] + 1.0, 400.0]), patient().approximate).full() for s in path]
     )
     assert np.isfinite(states).all()
     assert np.array_equal(states[:, -1], LIGHT)
@@ -103,19 +104,19 @@ def test_what_newton_does_not_find_is_left_without_a_jump() -> None:
 
 def test_it_does_not_leave_the_ranges_of_the_plant() -> None:
     """Towards a bis above that without any drug: the effect site is emptied to a part, and the others go the same share."""
-    ranged = replace(PATIENT, ranges={"Ce": (1.2, 8.0), "C1": (0.0, 10.0)})
-    y = seen(PATIENT, LIGHT, PATIENT.approximate) + np.array([8.0, 0.0])
-    free, kept = (found(plant, LIGHT, y, PATIENT.approximate) for plant in (PATIENT, ranged))
+    ranged = replace(patient(), ranges={"Ce": (1.2, 8.0), "C1": (0.0, 10.0)})
+    y = seen(patient(), LIGHT, patient().approximate) + np.array([8.0, 0.0])
+    free, kept = (found(plant, LIGHT, y, patient().approximate) for plant in (patient(), ranged))
     assert free[3] < 1.2 < kept[3] < LIGHT[3]
     share = (kept - LIGHT) / (free - LIGHT)
     np.testing.assert_allclose(share, share[3], rtol=1e-9)
     outside = np.array([2.0, 0.6, 0.1, 1.0])  # already beyond, and moving away
-    assert np.array_equal(found(ranged, outside, y, PATIENT.approximate), outside)
+    assert np.array_equal(found(ranged, outside, y, patient().approximate), outside)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_what_is_not_a_number_moves_nothing(value: float) -> None:
-    assert np.array_equal(found(PATIENT, LIGHT, [value, 0.0], PATIENT.approximate), LIGHT)
+    assert np.array_equal(found(patient(), LIGHT, [value, 0.0], patient().approximate), LIGHT)
 
 
 def test_outputs_of_order_zero_are_left_out() -> None:

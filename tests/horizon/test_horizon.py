@@ -7,6 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from plants import chain, pendulum
 
 import fpirhc as fp
@@ -16,7 +17,6 @@ from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.full_space import auxiliary_gradient, auxiliary_hessian
 
-TASK = fp.load_problem("two_mass")
 PENDULUM_REFERENCE = fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)})
 COSTS = {
     "deviation": fp.Quadratic(states={"angle": 10.0, "angle'": 1.0}, deviation={"torque": 0.1}),
@@ -172,9 +172,9 @@ def test_mistakes_of_a_horizon():
         fp.Horizon(stages=3, step=0.1, discretisation=fp.Cvodes())
     with pytest.raises(InvalidProblem, match=r"does not divide the horizon step 0.01 s; use a step of 0.009 s"):
         fp.Problem(
-            plant=TASK.problem.plant,
-            reference=TASK.problem.reference,
-            start=TASK.problem.start,
+            plant=tasks.two_mass.problem.plant,
+            reference=tasks.two_mass.problem.reference,
+            start=tasks.two_mass.problem.start,
             period=3e-3,
             duration=1.0,
             horizon=fp.Horizon(stages=5, step=1e-2),
@@ -215,7 +215,7 @@ def test_a_table_serves_as_a_reference():
 
 def test_horizons_of_plants_with_other_exact_parameters_are_the_same_one():
     """A plan knows the approximate parameters alone: its horizon is that of a plant which is built anew with these exact ones."""
-    problem = TASK.problem
+    problem = tasks.two_mass.problem
     plant, other = problem.plant, problem.with_exact(1.1 * problem.plant.exact).plant
     believed = {name: replace(p, approximate=1.1 * p.approximate) for name, p in plant.parameters.items()}
 

@@ -8,19 +8,19 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_stage
 from fpirhc.horizon.transcription import transcribe
 
-TASK = fp.load_problem("anaesthesia")
 LINEAR = GaussNewton(linear_outputs=True)
 
 
 def awake(own: float = 92.96, **changes: Any) -> fp.Problem:
     """The patient of the gallery without drug, with this bis; to 50 within some minutes."""
-    problem = TASK.problem
+    problem = tasks.anaesthesia.problem
     parameters = problem.plant.parameters
     plant = replace(problem.plant, parameters={**parameters, "E0": replace(parameters["E0"], exact=own)})
     motion = fp.Trajectory(lambda t: {"bis": 50 + (own - 50) * (1 + t / 1.5) * ca.exp(-t / 1.5)})
@@ -63,7 +63,7 @@ def test_plans_are_those_of_another_solver():
 
 def test_with_limits_of_states():
     """The concentration in the blood stays below 4.5 mg/l, also in the induction."""
-    problem = awake(limits=replace(TASK.problem.limits, states={"C1": (-1.0, 4.5)}))
+    problem = awake(limits=replace(tasks.anaesthesia.problem.limits, states={"C1": (-1.0, 4.5)}))
     run = planned(problem, with_hessian(LINEAR))
     assert 4.4 < run["state.C1"].max() < 4.6
     assert np.abs(run["true_error.bis"][run.time > 8]).max() < 2.5

@@ -10,6 +10,7 @@ from pathlib import Path
 import gate
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 
@@ -28,7 +29,7 @@ def test_a_script_starts_and_what_it_replaces_is_there(name):
 @pytest.mark.parametrize("name", gate.CONTROLLERS)
 def test_without_its_gate_a_step_is_the_same_but_checks_nothing(name):
     """What `gate.py` compares: the same commands for good samples, and a bad one that reaches the controller."""
-    problem, controller = gate.TASK.problem, gate.TASK.controllers[name]
+    problem, controller = tasks.two_mass.problem, tasks.two_mass.controllers[name]
     with gate.no_gate():
         bare = fp.Stepper(problem, controller, compiled=False)
     steppers = [bare, fp.Stepper(problem, controller, compiled=False)]

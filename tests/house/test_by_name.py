@@ -8,20 +8,22 @@ import re
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.fields.checked import ByName, Fixed
-from fpirhc.problem_files.problem_file import load_problem
 
-TASK = load_problem("two_mass")
-SHORT = replace(TASK, problem=replace(TASK.problem, duration=0.05, measure_from=0.0))
-HEADLINE = TASK.headline or ("", "")
+shortened = cache(
+    lambda: replace(tasks.two_mass, problem=replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
+)
+headline = cache(lambda: tasks.two_mass.headline or ("", ""))
 QUICK = ["CTC", "CTC+FPI (eq 6)"]
 
 
@@ -46,42 +48,46 @@ def mappings(value: Any, path: str, seen: set[int]) -> Iterator[tuple[str, Mappi
 
 def measured() -> Any:
     """A run and its metrics."""
-    run = fp.simulate(SHORT.problem, SHORT.controllers[HEADLINE[1]], seed=0, compiled=False)
-    found = fp.measure(SHORT.problem, run)
+    run = fp.simulate(shortened().problem, shortened().controllers[headline()[1]], seed=0, compiled=False)
+    found = fp.measure(shortened().problem, run)
     return run, found, found.solve, found.statuses, found.cost, found["plans"]
 
 
 def stepped() -> Any:
     """What a stepper tells, with live settings."""
-    stepper = fp.Stepper(TASK.problem, TASK.controllers[HEADLINE[1]], live=["deformation.gain"], compiled=False)
+    stepper = fp.Stepper(
+        tasks.two_mass.problem, tasks.two_mass.controllers[headline()[1]], live=["deformation.gain"], compiled=False
+    )
     stepper.step_measured(0.0, np.zeros(len(stepper.measures)), stepper.start())
     return stepper.trace(), stepper.numbers, stepper.setpoints, stepper.outdated()
 
 
 def compared() -> Any:
     """A comparison with its null test and its prediction."""
-    comparison = fp.compare(SHORT, controllers=QUICK, seed=0, compiled=False)
-    prediction = fp.predict_response(SHORT.problem, SHORT.controllers[QUICK[1]], mismatch=5.0, compiled=False)
+    comparison = fp.compare(shortened(), controllers=QUICK, seed=0, compiled=False)
+    prediction = fp.predict_response(
+        shortened().problem, shortened().controllers[QUICK[1]], mismatch=5.0, compiled=False
+    )
     return comparison, prediction.half_width, prediction.rms(prediction.without)
 
 
 def reviewed() -> Any:
     """A review."""
-    return fp.review(SHORT.problem, {QUICK[1]: SHORT.controllers[QUICK[1]]}, mismatch=5.0, seed=0)
+    return fp.review(shortened().problem, {QUICK[1]: shortened().controllers[QUICK[1]]}, mismatch=5.0, seed=0)
 
 
 def studied(folder: Path) -> Any:
     """Scenarios and tuning."""
-    names = [HEADLINE[1]]
+    names = [headline()[1]]
     study = fp.compare_scenarios(
-        SHORT, count=1, percent=5.0, seed=0, folder=folder / "one", controllers=names, compiled=False
+        shortened(), count=1, percent=5.0, seed=0, folder=folder / "one", controllers=names, compiled=False
     )
-    return study, fp.tune(SHORT, trials=1, seed=0, folder=folder / "two", controllers=names, compiled=False)
+    return study, fp.tune(shortened(), trials=1, seed=0, folder=folder / "two", controllers=names, compiled=False)
 
 
 def test_every_mapping_of_a_problem_file_has_one_error_for_a_missing_name():
     """The problem, its plant and limits, the controllers and the ranges of the tuning."""
-    holds(TASK, least=12)
+    holds(tasks.two_mass, least=12)
 
 
 @pytest.mark.parametrize(("made", "least"), [(measured, 20), (stepped, 4), (compared, 30), (reviewed, 10)])
@@ -113,15 +119,15 @@ def tells(mapping: Mapping[str, Any], name: Any) -> bool:
 
 
 def test_the_nearest_name_is_offered():
-    name = HEADLINE[1]
+    name = headline()[1]
     with pytest.raises(
         InvalidName, match=rf"^Task\.controllers has no '{re.escape(name[:-1])}'\. Did you mean '{re.escape(name)}'"
     ):
-        TASK.controllers[name[:-1]]
+        tasks.two_mass.controllers[name[:-1]]
     with pytest.raises(InvalidName, match=r"^Plant\.parameters has no"):
-        TASK.problem.plant.parameters["mm"]
+        tasks.two_mass.problem.plant.parameters["mm"]
     with pytest.raises(KeyError):
-        TASK.controllers["nothing like it"]
+        tasks.two_mass.controllers["nothing like it"]
 
 
 def test_what_is_found_by_name_is_a_dictionary():
@@ -158,7 +164,7 @@ def test_what_is_found_by_name_is_a_dictionary():
 
 def test_what_a_frozen_value_holds_stays():
     """A start that was changed in place was shown, and the run began at the old one; the error says what to do."""
-    problem = TASK.problem
+    problem = tasks.two_mass.problem
     start: Any = problem.start
     body: Any = problem.plant.parameters
     with pytest.raises(NotSupported, match=r"Problem\.start cannot be changed in place.*\{\*\*start, name: value\}"):

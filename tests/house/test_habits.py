@@ -50,6 +50,11 @@ def test_the_quick_lane_leaves_out_tests_that_exist():
     assert ["::".join(place) for place in places if f"def {place[-1]}(" not in there(place[0])] == []
 
 
+def test_no_problem_is_loaded_before_the_first_test(loaded_while_collecting):
+    """Every process of a run collects all tests: names are enough for that, and `tasks` loads a problem where a test reads it."""
+    assert loaded_while_collecting == []
+
+
 def test_faults_are_made_in_modules_that_exist_and_in_each_once():
     """A module that was renamed would silently have no score."""
     targets = tomllib.loads(text("scripts/mutation.toml"))["target"]

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField, InvalidName, InvalidShape, InvalidValue, NoAnswer, nearest
-from fpirhc.problem_files.problem_file import load_problem
 
-TASK = load_problem("two_mass")
-PROBLEM = replace(TASK.problem, duration=0.02, measure_from=0.0)
-CONTROLLER = TASK.controllers["CTC+FPI (eq 6)"]
+brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.02, measure_from=0.0))
+adaptive = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
 HUGE = 10**400  # a whole number that is no float
 
 
 @pytest.fixture(scope="module")
 def run():
     """A short run."""
-    return fp.simulate(PROBLEM, CONTROLLER, seed=0, compiled=False)
+    return fp.simulate(brief(), adaptive(), seed=0, compiled=False)
 
 
 @pytest.mark.parametrize("name", [0, None, 1.5, ["error"], slice(0, 2), np.array([1]), ("error", "q1"), "eror"])
 def test_signals_and_metrics_are_found_by_names(name, run):
     """A number, a list or a range of rows is told as an unknown name is."""
-    metrics = fp.measure(PROBLEM, run)
+    metrics = fp.measure(brief(), run)
     steps: list[Any] = [run.__getitem__, run.unit, run.layout.__getitem__, run.layout.slice, metrics.__getitem__]
     for find in steps:
         with pytest.raises(InvalidName, match="Valid: "):
@@ -60,10 +60,10 @@ def test_a_layout_packs_numbers_only(run):
 def test_seeds_are_whole_numbers_from_zero(seed):
     """A generator of random numbers takes no other ones."""
     calls: list[Any] = [
-        lambda: fp.simulate(PROBLEM, CONTROLLER, seed=seed),
-        lambda: fp.compare(TASK, seed=seed),
-        lambda: fp.review(PROBLEM, {}, mismatch=10.0, seed=seed),
-        lambda: fp.predict_response(PROBLEM, CONTROLLER, seed=seed),
+        lambda: fp.simulate(brief(), adaptive(), seed=seed),
+        lambda: fp.compare(tasks.two_mass, seed=seed),
+        lambda: fp.review(brief(), {}, mismatch=10.0, seed=seed),
+        lambda: fp.predict_response(brief(), adaptive(), seed=seed),
     ]
     for call in calls:
         with pytest.raises(InvalidField, match=r"seed: expected a whole number of at least 0"):
@@ -120,7 +120,7 @@ def test_deviations_that_leave_no_digit_are_refused_by_name():
     """A hundred powers of ten apart the Riccati equation has no solution that numbers can hold."""
     wild = fp.DisturbanceKalman(drift={"q1": 1e90}, measured={"q1": 1e-90}, noise={"q2": 1.0})
     with pytest.raises(NoAnswer, match="no stationary gain makes the filter stable"):
-        fp.simulate(PROBLEM, fp.Estimating(CONTROLLER, wild), seed=0)
+        fp.simulate(brief(), fp.Estimating(adaptive(), wild), seed=0)
 
 
 def test_a_name_with_a_comma_stands_in_quotes():
@@ -143,7 +143,7 @@ def test_mistakes_name_what_was_written():
     with pytest.raises(InvalidField, match=r"outside\.nominal: expected a number"):
         fp.outside(nominal=mistaken["nominal"], unit="K")
     with pytest.raises(fp.FpirhcError, match="disturbances: 'Q2': disturbance must be one scalar expression, got None"):
-        replace(PROBLEM, disturbances={"Q1": fp.Step(1.0, 2.0), "Q2": fp.Formula(mistaken["formula"])})
+        replace(brief(), disturbances={"Q1": fp.Step(1.0, 2.0), "Q2": fp.Formula(mistaken["formula"])})
     late, drift = fp.ComputedTorque(fp.Exponential(rate=6.0)), dict.fromkeys(("q1", "q2"), 1.0)
     twice: list[Any] = [
         fp.Predicted(fp.Predicted(late, inputs=1e-2), inputs=1e-2),
@@ -151,7 +151,7 @@ def test_mistakes_name_what_was_written():
     ]
     for one in twice:
         with pytest.raises(fp.FpirhcError, match=f"{type(one).__name__} stands around another {type(one).__name__}"):
-            fp.simulate(PROBLEM, one, seed=0, compiled=False)
+            fp.simulate(brief(), one, seed=0, compiled=False)
     unknown = fp.Estimating(late, fp.DisturbanceKalman({"q": 1.0}, drift))
     with pytest.raises(fp.FpirhcError, match=r"coordinate 'q' is unknown.* Valid: q1, q2\."):
-        fp.simulate(PROBLEM, unknown, seed=0, compiled=False)
+        fp.simulate(brief(), unknown, seed=0, compiled=False)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from forms import FORMS
 
 import fpirhc as fp
@@ -18,7 +20,7 @@ from fpirhc.cli.main import main
 from fpirhc.conformance.laws import check_live
 from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import CompileError, InvalidName, InvalidValue, NotContractive, NotSupported
-from fpirhc.problem_files.problem_file import load_problem, with_numbers_of_all
+from fpirhc.problem_files.problem_file import with_numbers_of_all
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.scenarios.bench import Bench, Conditions
@@ -29,9 +31,9 @@ from fpirhc.symbolic.live import live_number
 from fpirhc.symbolic.paths import content_at
 from fpirhc.symbolic.program import generate
 
-TASK = load_problem("two_mass")
-PROBLEM = replace(TASK.problem, duration=0.3, measure_from=0.0)
-TORQUE, PLANNED = TASK.controllers["CTC+FPI (eq 6)"], TASK.controllers["RHC+FPI"]
+brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.3, measure_from=0.0))
+by_torque = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
+by_plan = cache(lambda: tasks.two_mass.controllers["RHC+FPI"])
 FOUR = ["tracking.rate", "deformation.gain", "deformation.scale", "deformation.shift"]
 FIVE = ["deformation.gain", "cost.states.q1", "cost.states.q2'", "cost.deviation.Q1", "limits.inputs.Q1.1"]
 
@@ -65,8 +67,8 @@ def test_a_changed_loop_is_the_rebuilt_one_bit_by_bit(compiled):
     in another order where a weight is no constant.
     """
     rng = np.random.default_rng(7)
-    torque = simulator(PROBLEM, TORQUE, compiled=compiled, live=FOUR)
-    planned = simulator(PROBLEM, PLANNED, compiled=compiled, live=FIVE)
+    torque = simulator(brief(), by_torque(), compiled=compiled, live=FOUR)
+    planned = simulator(brief(), by_plan(), compiled=compiled, live=FIVE)
     for k in range(3):
         four, five = random_numbers(rng)
         assert np.array_equal(torque.run(seed=0, settings=four).log, rebuilt(torque, four, compiled=compiled).log), four
@@ -82,7 +84,7 @@ def equal_to_rounding(one: np.ndarray, other: np.ndarray) -> bool:
 
 def test_a_change_during_a_run_is_that_of_a_loop_that_goes_on_with_the_number():
     """Before the change the run is the one without it; a change at the start is a run with the number."""
-    ready = simulator(PROBLEM, PLANNED, live=FIVE)
+    ready = simulator(brief(), by_plan(), live=FIVE)
     numbers = {"deformation.gain": -0.9, "cost.states.q1": 400.0}
     changed, plain = ready.run(seed=0, changes={0.1234: numbers}), ready.run(seed=0)
     assert np.array_equal(changed.log[:124], plain.log[:124])
@@ -94,9 +96,9 @@ def test_a_change_during_a_run_is_that_of_a_loop_that_goes_on_with_the_number():
 
 def test_nothing_live_is_the_same_c_text():
     """The list of live settings is chosen at the build; the default loop has constants, as ever."""
-    for controller in (TORQUE, PLANNED):
-        plain = close_loop(PROBLEM, live_settings(PROBLEM, controller).controller)
-        empty = simulator(PROBLEM, controller, compiled=False, live=()).loop
+    for controller in (by_torque(), by_plan()):
+        plain = close_loop(brief(), live_settings(brief(), controller).controller)
+        empty = simulator(brief(), controller, compiled=False, live=()).loop
         assert generate(plain.function) == generate(empty.function)
         assert "#define SCALE_AT" not in "".join(generate(plain.function))
 
@@ -114,7 +116,7 @@ WRONG = [
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["VM", "C"])
 def test_tolerance_and_damping_of_the_plans_are_data(compiled):
     """They stand in the data of the stages beside the weights, so one compiled plan serves all of them."""
-    short, controller = replace(PROBLEM, duration=0.05), cast(Any, PLANNED)
+    short, controller = replace(brief(), duration=0.05), cast(Any, by_plan())
     damped = replace(controller, optimiser=replace(controller.optimiser, damping=0.1))
     paths = ["optimiser.tolerance", "optimiser.damping", "cost.states.q1"]
     ready = simulator(short, damped, compiled=compiled, live=paths)
@@ -133,12 +135,12 @@ def test_tolerance_and_damping_of_the_plans_are_data(compiled):
 def test_what_cannot_be_live_is_refused_by_name(name, path, error, words):
     """A setting that is needed as a number would become NaN in CasADi, without an error."""
     with pytest.raises(error, match=words):
-        simulator(PROBLEM, TASK.controllers[name], live=[path])
+        simulator(brief(), tasks.two_mass.controllers[name], live=[path])
 
 
 def test_numbers_are_checked_at_every_change():
     """Unknown names, numbers outside a setting's range, infinite limits and gains that diverge."""
-    ready = simulator(PROBLEM, PLANNED, live=FIVE, compiled=False)
+    ready = simulator(brief(), by_plan(), live=FIVE, compiled=False)
     cases: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
         ({"deformation.gian": 1.0}, InvalidName, "deformation.gain"),
         ({"deformation.shift": 0.2}, InvalidName, "not live"),
@@ -159,11 +161,11 @@ def test_numbers_are_checked_at_every_change():
 @pytest.mark.parametrize("compiled", [True, False], ids=["C", "VM"])
 def test_a_stepper_that_changes_is_the_one_that_is_rebuilt(compiled):
     """The same measurements through a changed and a rebuilt controller give the same commands; see the test of the loop."""
-    run = simulator(PROBLEM, PLANNED, compiled=False).run(seed=0)
+    run = simulator(brief(), by_plan(), compiled=False).run(seed=0)
     numbers = {"deformation.gain": -0.8, "cost.states.q1": 600.0, "limits.inputs.Q1.1": 25.0}
-    live = fp.Stepper(PROBLEM, PLANNED, compiled=compiled, live=FIVE)
+    live = fp.Stepper(brief(), by_plan(), compiled=compiled, live=FIVE)
     assert live.change(numbers)
-    problem, controller, _ = live_settings(PROBLEM, PLANNED, FIVE).changed(numbers)
+    problem, controller, _ = live_settings(brief(), by_plan(), FIVE).changed(numbers)
     built = fp.Stepper(problem, controller, compiled=compiled)
     memories = live.start(), built.start()
     for k in range(60):
@@ -175,8 +177,8 @@ def test_a_stepper_that_changes_is_the_one_that_is_rebuilt(compiled):
 
 def test_a_stepper_refuses_numbers_and_keeps_the_old_ones():
     """A device goes on with the numbers in force; the refusal is counted, and an unknown name is a mistake of the program."""
-    stepper = fp.Stepper(PROBLEM, TORQUE, compiled=False, live=["deformation.gain"])
-    memory, state = stepper.start(), PROBLEM.start_state
+    stepper = fp.Stepper(brief(), by_torque(), compiled=False, live=["deformation.gain"])
+    memory, state = stepper.start(), brief().start_state
     _, memory = stepper.step(0.0, state, np.zeros(2), memory, settings={"deformation.gain": -0.9})
     plain, _ = stepper.step(1e-3, state + 1e-3, np.ones(2), memory)
     refused, _ = stepper.step(1e-3, state + 1e-3, np.ones(2), memory, settings={"deformation.gain": 0.9})
@@ -243,18 +245,18 @@ def check_numbers_of_the_problem(capsys):
 
 def test_a_number_that_a_controller_has_itself_is_its_own_in_a_comparison():
     """The others follow the problem's, as each would in a run; where all have their own the problem's stays."""
-    own = cast(Any, replace)(PLANNED, cost=PROBLEM.cost)
-    task = replace(TASK, controllers={"own": own, "shared": PLANNED, "torque": TORQUE})
+    own = cast(Any, replace)(by_plan(), cost=brief().cost)
+    task = replace(tasks.two_mass, controllers={"own": own, "shared": by_plan(), "torque": by_torque()})
     path = "cost.states.q1"
     both, one = with_numbers_of_all(task, {path: 7.0}), with_numbers_of_all(task, {path: 7.0}, ["own"])
     assert [content_at(t.controllers["own"], path) for t in (both, one)] == [7.0, 7.0]
-    assert [content_at(t.problem, path) for t in (both, one)] == [7.0, content_at(PROBLEM, path)]
+    assert [content_at(t.problem, path) for t in (both, one)] == [7.0, content_at(brief(), path)]
     assert cast(Any, both.controllers["shared"]).cost is None
 
 
 def jumps(controller, numbers, signal):
     """Change of a signal by other numbers in the cycle of the change, and its largest change per cycle before."""
-    ready = simulator(replace(PROBLEM, duration=1.5), controller, live=list(numbers))
+    ready = simulator(replace(brief(), duration=1.5), controller, live=list(numbers))
     changed, plain = ready.run(seed=0, changes={1.0: numbers}), ready.run(seed=0)
     usual = np.abs(np.diff(plain[signal][500:1000], axis=0)).max()
     return (changed[signal] - plain[signal])[1000], usual, plain
@@ -262,7 +264,7 @@ def jumps(controller, numbers, signal):
 
 def test_another_rate_leaves_the_integrals_share():
     """The desired response changes by what the law feeds back of e and e'; rate^3 e_int, most of it all, stays as it was."""
-    jump, usual, plain = jumps(TASK.controllers["CTC"], {"tracking.rate": 9.0}, "desired")
+    jump, usual, plain = jumps(tasks.two_mass.controllers["CTC"], {"tracking.rate": 9.0}, "desired")
     error, velocity = (
         np.array([plain[f"reference.{c}{d}"][1000] - plain[f"state.{c}{d}"][1000] for c in ("q1", "q2")])
         for d in ("", "'")
@@ -287,14 +289,14 @@ BUMPLESS: list[tuple[str, dict[str, Any]]] = [
 @pytest.mark.parametrize(("name", "numbers"), BUMPLESS, ids=[f"{n} {next(iter(v))}" for n, v in BUMPLESS])
 def test_gains_scales_weights_and_limits_change_without_a_jump(name, numbers):
     """The command changes by a usual cycle's change times the factor of a gain; without a rule an integral changes it by 100."""
-    jump, usual, _ = jumps(TASK.controllers[name], numbers, "command")
+    jump, usual, _ = jumps(tasks.two_mass.controllers[name], numbers, "command")
     assert np.abs(jump).max() <= 4 * usual
 
 
 @pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC+FPI"])
 def test_a_search_finds_the_same_with_one_compiled_loop(name, tmp_path):
     """Every trial costs what a loop costs that is built for it, to 1e-9, so the best settings are the same."""
-    task = replace(TASK, problem=PROBLEM)
+    task = replace(tasks.two_mass, problem=brief())
     tuned = tune(task, trials=4, seed=3, folder=tmp_path, controllers=[name])
     records = [json.loads(line) for line in (tmp_path / "trials.jsonl").read_text().splitlines()][1:]
     conditions = Conditions(3, TUNING, 0.0, compiled=False)
@@ -311,19 +313,19 @@ def test_a_search_among_whole_numbers_builds_a_loop_for_each(tmp_path):
     spans: dict[str, dict[str, fp.Span | fp.LogSpan]] = {
         "RHC+FPI": {"optimiser.iterations": fp.Span(1, 3), "deformation.gain": fp.LogSpan(-1.0, -0.1)}
     }
-    tuned = tune(replace(TASK, problem=PROBLEM, tuning=spans), trials=1, seed=0, folder=tmp_path)
+    tuned = tune(replace(tasks.two_mass, problem=brief(), tuning=spans), trials=1, seed=0, folder=tmp_path)
     assert isinstance(tuned.entries[0].settings["optimiser.iterations"], int)
 
 
 def test_a_compiler_that_fails_is_an_error(monkeypatch):
     """A loop without live settings runs in the virtual machine then; one with live settings must not hide what went wrong."""
     monkeypatch.setenv("FPIRHC_CC", "false")
-    short = replace(PROBLEM, duration=0.01)
-    assert not simulator(short, TORQUE).compiled
+    short = replace(brief(), duration=0.01)
+    assert not simulator(short, by_torque()).compiled
     with pytest.raises(CompileError):
-        simulator(short, TORQUE, live=["deformation.gain"])
+        simulator(short, by_torque(), live=["deformation.gain"])
     monkeypatch.setenv("FPIRHC_CC", "none")
-    assert not simulator(short, TORQUE, live=["deformation.gain"]).compiled
+    assert not simulator(short, by_torque(), live=["deformation.gain"]).compiled
 
 
 def test_nan_is_found_in_scalar_code_graphs_and_calls():

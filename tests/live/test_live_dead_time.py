@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.task.dead_time import DeadTime
 
-TWO = load_problem("two_mass")
-LATE = load_problem("delayed_mass")
 LONGEST = {"Q1": 0.012, "Q2": 0.02, "measurement": 0.008}  # s; cycles of 1 ms
-QUEUED = replace(
-    TWO.problem,
-    duration=0.2,
-    measure_from=0.0,
-    dead_time=DeadTime(inputs={"Q1": 0.003, "Q2": 0.0}, measurement=0.002, longest=LONGEST),
+queued = cache(
+    lambda: replace(
+        tasks.two_mass.problem,
+        duration=0.2,
+        measure_from=0.0,
+        dead_time=DeadTime(inputs={"Q1": 0.003, "Q2": 0.0}, measurement=0.002, longest=LONGEST),
+    )
 )
 PLANT = ["dead_time.inputs.Q1", "dead_time.inputs.Q2", "dead_time.measurement"]
 WAYS = pytest.mark.parametrize("compiled", [True, False], ids=["C", "VM"])
@@ -48,15 +49,15 @@ def same_signals(one: fp.Run, other: fp.Run) -> bool:
 )
 def test_a_dead_time_that_is_set_is_the_one_that_is_built(name, compiled):
     """Whole and broken cycles, none at all, and the longest; the rebuilt loop has queues of its own length."""
-    controller, rng = TWO.controllers[name], np.random.default_rng(3)
-    ready = simulator(QUEUED, controller, compiled=compiled, live=PLANT)
-    plain = simulator(QUEUED, controller, compiled=compiled).run(seed=0)
+    controller, rng = tasks.two_mass.controllers[name], np.random.default_rng(3)
+    ready = simulator(queued(), controller, compiled=compiled, live=PLANT)
+    plain = simulator(queued(), controller, compiled=compiled).run(seed=0)
     assert same_signals(ready.run(seed=0), plain)
     cases = [(0.0, 0.0, 0.0), tuple(rng.uniform(0, 1, 3) * list(LONGEST.values())), (0.012, 0.02, 0.008)]
     cases = cases[:2] if name == "RHC+FPI" else [*cases, (0.005, 0.011, 0.003)]
     for q1, q2, seen in cases:
         numbers: dict[str, Any] = dict(zip(PLANT, map(float, (q1, q2, seen)), strict=True))
-        own = replace(QUEUED, dead_time=DeadTime(inputs={"Q1": float(q1), "Q2": float(q2)}, measurement=float(seen)))
+        own = replace(queued(), dead_time=DeadTime(inputs={"Q1": float(q1), "Q2": float(q2)}, measurement=float(seen)))
         rebuilt = simulator(own, controller, compiled=compiled).run(seed=0)
         assert same_signals(ready.run(seed=0, settings=numbers), rebuilt), numbers
         assert rebuilt.cycles == 200
@@ -66,7 +67,7 @@ def test_a_dead_time_that_is_set_is_the_one_that_is_built(name, compiled):
 def test_a_form_that_leaves_its_dead_time_to_the_problem_follows_the_one_in_force(second):
     """Also where all inputs had one dead time in the build, and have several in the run."""
     controller = fp.ComputedTorque(fp.Exponential(rate=3.0), fp.ModelReferenced(fp.Affine(gain=-0.2)))
-    problem = replace(QUEUED, dead_time=DeadTime(inputs={"Q1": 0.003, "Q2": second}))
+    problem = replace(queued(), dead_time=DeadTime(inputs={"Q1": 0.003, "Q2": second}))
     ready = simulator(problem, controller, live=PLANT[:1], compiled=False)
     for first in (0.003, 0.0045, 0.002, 0.006):
         run = ready.run(seed=0, settings={PLANT[0]: first})
@@ -78,10 +79,10 @@ def test_a_form_that_leaves_its_dead_time_to_the_problem_follows_the_one_in_forc
 
 def test_a_dead_time_that_changes_during_a_run_reads_another_place_of_the_queue():
     """The command that acts is that of d cycles before, whatever d was earlier; before the run it is the one of the problem."""
-    ready = simulator(QUEUED, TWO.controllers["CTC+FPI (eq 6)"], live=PLANT[:1])
+    ready = simulator(queued(), tasks.two_mass.controllers["CTC+FPI (eq 6)"], live=PLANT[:1])
     run = ready.run(seed=0, changes={0.05: {PLANT[0]: 0.011}, 0.1: {PLANT[0]: 0.0}, 0.15: {PLANT[0]: 0.0025}})
     command, arriving = run["command"][:, 0], run["arriving"][:, 0]
-    before = QUEUED.inputs_before[0]
+    before = queued().inputs_before[0]
     sent = np.concatenate([np.full(20, before), command])
     whole = np.array([3] * 50 + [11] * 50 + [0] * 50)
     assert np.array_equal(arriving[:150], sent[np.arange(150) + 20 - whole])
@@ -94,7 +95,7 @@ def test_a_dead_time_that_changes_during_a_run_reads_another_place_of_the_queue(
 def test_an_estimator_waits_for_its_samples_behind_the_dead_time_in_force(compiled):
     """No response is used before its samples have arrived; how long that takes depends on the dead time."""
     sensing = fp.Sensing(estimator=fp.PositionDifference())
-    problem = replace(QUEUED, sensing=sensing)
+    problem = replace(queued(), sensing=sensing)
     controller = fp.ComputedTorque(fp.Exponential(rate=4.0), fp.Sigmoid(gain=-0.2, scale=20.0))
     ready = simulator(problem, controller, compiled=compiled, live=PLANT[2:])
     for late in (0.0, 0.0031, 0.008):
@@ -106,7 +107,7 @@ def test_an_estimator_waits_for_its_samples_behind_the_dead_time_in_force(compil
 LAW = fp.Exponential(rate=6.0)
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=20.0)
 INCREMENT = fp.Increment(SIGMOID.with_effective_gain(1 / 1.5), cycles=60, uncertainty=6, longest=80)
-BELIEFS: dict[str, tuple[Controller, str, tuple[float, ...]]] = {
+BELIEFS: dict[str, tuple[Controller | str, str, tuple[float, ...]]] = {
     "pair": (
         fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=60, longest=90)),
         "deformation.cycles",
@@ -128,11 +129,7 @@ BELIEFS: dict[str, tuple[Controller, str, tuple[float, ...]]] = {
         "inputs",
         (0.05, 0.0785, 0.002),
     ),
-    "plan from the prediction": (
-        replace(cast(Any, LATE.controllers["RHC"]), longest=0.08),
-        "measurement",
-        (0.01, 0.0195),
-    ),
+    "plan from the prediction": ("RHC", "measurement", (0.01, 0.0195)),
 }
 
 
@@ -142,9 +139,11 @@ BELIEFS: dict[str, tuple[Controller, str, tuple[float, ...]]] = {
 )
 def test_a_belief_that_is_set_is_the_one_that_is_built(name, compiled):
     """The controller's own dead time, and the plant's beside it, in one compiled loop."""
-    controller, path, values = BELIEFS[name]
+    own, path, values = BELIEFS[name]
+    shipped = cast(Any, tasks.delayed_mass.controllers)
+    controller = replace(shipped[own], longest=0.08) if isinstance(own, str) else own
     dead_time = DeadTime(inputs={"Q": 0.06}, longest={"Q": 0.1})
-    problem = replace(LATE.problem, duration=0.15, measure_from=0.0, dead_time=dead_time)
+    problem = replace(tasks.delayed_mass.problem, duration=0.15, measure_from=0.0, dead_time=dead_time)
     ready = simulator(problem, controller, compiled=compiled, live=[path, "dead_time.inputs.Q"])
     assert same_signals(ready.run(seed=0), simulator(problem, controller, compiled=compiled).run(seed=0))
     for k, value in enumerate(values):
@@ -155,29 +154,22 @@ def test_a_belief_that_is_set_is_the_one_that_is_built(name, compiled):
         assert np.ptp(rebuilt["command"]) > 0
 
 
-ARM = load_problem("planar_arm")
 THROUGH = fp.Cascade(fp.ComputedTorque(LAW), fp.Affine(gain=-0.3), fp.ThroughModel(lag=0.05))
-OWNERS: dict[str, tuple[Any, Controller, dict[str, tuple[float, float]]]] = {
-    "regressor": (ARM, ARM.controllers["AID+FPI"], {"inputs.tau1": (2.0, 3.4), "measurement": (1.0, 1.7)}),
-    "error of another instant": (
-        ARM,
-        ARM.controllers["Slotine-Li"],
-        {"inputs.tau2": (2.0, 0.0), "measurement": (3.0, 5.5)},
-    ),
-    "estimator": (
-        TANKS := load_problem("leaking_tanks"),
-        TANKS.controllers["RHC offset-free"],
-        {"inputs.u": (2.0, 3.0)},
-    ),
-    "target": (HEAT := load_problem("heat_exchanger"), HEAT.controllers["Cascade"], {"inputs.valve": (4.0, 6.5)}),
-    "the slowest input": (ARM, THROUGH, {"inputs.tau1": (2.0, 1.0), "inputs.tau2": (1.5, 2.5)}),
+OWNERS: dict[str, tuple[str, str | Controller, dict[str, tuple[float, float]]]] = {
+    "regressor": ("planar_arm", "AID+FPI", {"inputs.tau1": (2.0, 3.4), "measurement": (1.0, 1.7)}),
+    "error of another instant": ("planar_arm", "Slotine-Li", {"inputs.tau2": (2.0, 0.0), "measurement": (3.0, 5.5)}),
+    "estimator": ("leaking_tanks", "RHC offset-free", {"inputs.u": (2.0, 3.0)}),
+    "target": ("heat_exchanger", "Cascade", {"inputs.valve": (4.0, 6.5)}),
+    "the slowest input": ("planar_arm", THROUGH, {"inputs.tau1": (2.0, 1.0), "inputs.tau2": (1.5, 2.5)}),
 }
 
 
 @pytest.mark.parametrize("name", OWNERS)
 def test_what_learns_or_shifts_a_target_follows_a_dead_time_that_is_set(name):
     """A response belongs to the command and the target that caused it, also where a run says how long they take."""
-    task, controller, cycles = OWNERS[name]
+    problem_name, own, cycles = OWNERS[name]
+    task = getattr(tasks, problem_name)
+    controller = task.controllers[own] if isinstance(own, str) else own
     problem = replace(task.problem, duration=30 * task.problem.period, measure_from=0.0)
 
     def late(which: int) -> fp.Problem:
@@ -195,18 +187,18 @@ def test_what_learns_or_shifts_a_target_follows_a_dead_time_that_is_set(name):
 
 def test_a_dead_time_is_live_up_to_its_stated_longest():
     """Without a longest one there is room for twice the dead time; beyond it a number is refused before a run begins."""
-    late = LATE.problem.dead_time.inputs["Q"]
+    late = tasks.delayed_mass.problem.dead_time.inputs["Q"]
     for name, path, value in (
         ("CTC", "dead_time.inputs.Q", late),
         ("CTC+FPI paired", "deformation.cycles", 60.0),
         ("RHC", "inputs", late),
     ):
-        short = replace(LATE.problem, duration=0.15, measure_from=0.0)
-        roomy = simulator(short, LATE.controllers[name], compiled=False, live=[path])
+        short = replace(tasks.delayed_mass.problem, duration=0.15, measure_from=0.0)
+        roomy = simulator(short, tasks.delayed_mass.controllers[name], compiled=False, live=[path])
         roomy.run(seed=0, settings={path: 2 * value}, variant=replace(short, duration=0.1))
         with pytest.raises((InvalidValue, InvalidProblem), match="longest"):
             roomy.run(seed=0, settings={path: 2.1 * value})
-    ready = simulator(QUEUED, TWO.controllers["CTC"], compiled=False, live=PLANT)
+    ready = simulator(queued(), tasks.two_mass.controllers["CTC"], compiled=False, live=PLANT)
     for value, words in (
         (0.0123, "longer than its stated longest"),
         (-0.001, "at least 0"),
@@ -215,11 +207,11 @@ def test_a_dead_time_is_live_up_to_its_stated_longest():
         with pytest.raises((InvalidProblem, InvalidValue), match=words):
             ready.run(seed=0, settings={PLANT[0]: value})
     with pytest.raises(InvalidValue, match="the variant states"):
-        ready.run(seed=0, variant=replace(QUEUED, dead_time=DeadTime(longest={"Q1": 0.1})))
+        ready.run(seed=0, variant=replace(queued(), dead_time=DeadTime(longest={"Q1": 0.1})))
     with pytest.raises(InvalidProblem, match="longest"):
-        replace(QUEUED, dead_time=DeadTime(longest={"Q1": 0.0}))
+        replace(queued(), dead_time=DeadTime(longest={"Q1": 0.0}))
     with pytest.raises(InvalidProblem, match=r"longest.*'Q3'"):
-        replace(QUEUED, dead_time=DeadTime(longest={"Q3": 0.1}))
+        replace(queued(), dead_time=DeadTime(longest={"Q3": 0.1}))
     with pytest.raises(InvalidValue, match=r"Paired.*longest"):
         fp.Paired(SIGMOID, cycles=60, longest=50)
     with pytest.raises(InvalidValue, match=r"Predicted\(longest"):
@@ -228,7 +220,7 @@ def test_a_dead_time_is_live_up_to_its_stated_longest():
 
 def test_a_device_keeps_its_belief_where_another_is_refused():
     controller = fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=5, longest=9))
-    stepper = fp.Stepper(LATE.problem, controller, compiled=False, live=["deformation.cycles"])
+    stepper = fp.Stepper(tasks.delayed_mass.problem, controller, compiled=False, live=["deformation.cycles"])
     assert stepper.change({"deformation.cycles": 7.5})
     assert not stepper.change({"deformation.cycles": 9.5})
     assert not stepper.change({"deformation.cycles": -1.0})
@@ -238,9 +230,11 @@ def test_a_device_keeps_its_belief_where_another_is_refused():
 
 def test_scenarios_share_one_loop_for_all_dead_times():
     """What a scenario costs does not depend on whether its dead time was set or built."""
-    problem = replace(LATE.problem, duration=0.1, measure_from=0.0)
+    problem = replace(tasks.delayed_mass.problem, duration=0.1, measure_from=0.0)
     names = ("CTC+FPI paired", "CTC+FPI increment")
-    task = replace(LATE, problem=problem, controllers={name: LATE.controllers[name] for name in names})
+    task = replace(
+        tasks.delayed_mass, problem=problem, controllers={name: tasks.delayed_mass.controllers[name] for name in names}
+    )
     conditions = Conditions(3, COMPARING, 20.0, compiled=False)
     shared, apart = Bench(task, conditions), Bench(task, conditions)
     apart._shared = {(name, None): None for name in names}

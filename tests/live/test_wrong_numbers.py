@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from functools import cache
 
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidShape, InvalidValue
 from fpirhc.fields.kinds import real_number
-from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.simulation.simulate import simulator
 
-TASK = load_problem("two_mass")
-PROBLEM = replace(
-    TASK.problem, reference=fp.Setpoint({"q1": 0.1, "q2": 0.2}, rate=3.0), duration=0.02, measure_from=0.0
+aimed = cache(
+    lambda: replace(
+        tasks.two_mass.problem, reference=fp.Setpoint({"q1": 0.1, "q2": 0.2}, rate=3.0), duration=0.02, measure_from=0.0
+    )
 )
-CONTROLLER = TASK.controllers["CTC+FPI (eq 6)"]
+adaptive = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
 HUGE = 10**400  # a whole number that is no float
 GAIN, ENDS = "deformation.gain", "limits.inputs.Q1"
 
@@ -26,13 +28,13 @@ GAIN, ENDS = "deformation.gain", "limits.inputs.Q1"
 @pytest.fixture(scope="module")
 def stepper():
     """A stepper with a gain and an interval that are live."""
-    return fp.Stepper(PROBLEM, CONTROLLER, compiled=False, live=[GAIN, ENDS])
+    return fp.Stepper(aimed(), adaptive(), compiled=False, live=[GAIN, ENDS])
 
 
 def sample(stepper):
     """Arguments of a step at rest."""
     size = stepper.signals["desired"].size
-    return 0.0, np.array(PROBLEM.start_state), np.zeros(size), stepper.start()
+    return 0.0, np.array(aimed().start_state), np.zeros(size), stepper.start()
 
 
 NUMBERS: list[tuple[object, float | None]] = [
@@ -152,12 +154,12 @@ RUNS = [
 @pytest.fixture(scope="module")
 def loop():
     """A loop with a gain that is live."""
-    return simulator(PROBLEM, CONTROLLER, compiled=False, live=[GAIN])
+    return simulator(aimed(), adaptive(), compiled=False, live=[GAIN])
 
 
 @pytest.mark.parametrize(("given", "error", "words"), RUNS, ids=lambda v: str(v)[:30])
 def test_wrong_numbers_of_a_run_are_named(given, error, words, loop):
     """Before the run; a loop that is ready checks as `simulate` does."""
-    for run in (lambda: loop.run(seed=0, **given), lambda: fp.simulate(PROBLEM, CONTROLLER, seed=0, **given)):
+    for run in (lambda: loop.run(seed=0, **given), lambda: fp.simulate(aimed(), adaptive(), seed=0, **given)):
         with pytest.raises(error, match=words):
             run()

@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import chain, known
@@ -23,7 +24,7 @@ from fpirhc.optimisers.base import judge
 from fpirhc.symbolic.native import native
 from fpirhc.symbolic.program import generate
 
-TASK: Any = fp.load_problem("two_mass")
+SHIPPED: Any = tasks  # whose horizons and controllers are of known kinds
 GRADIENT = fp.ReducedGradient(iterations=60, tolerance=1e-4)
 BACKENDS = (fp.Ipopt(), fp.Fatrop(), fp.SequentialQuadratic(), fp.SequentialQuadratic(quadratic=fp.Osqp()))
 FIXED = fp.FixedPoint(iterations=8, tolerance=1e-6)
@@ -38,7 +39,7 @@ ids = [type(o).__name__ + ("" if "quadratic" not in dir(o) else o.quadratic.plug
 
 def two_mass(limits):
     """(ocp, data, first state) of the shipped problem's first horizon."""
-    p = TASK.problem
+    p = SHIPPED.two_mass.problem
     ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, limits)
     return ocp, stage_data(p.plant, p.reference, p.horizon, p.cost)(0.0, p.plant.approximate), p.start_state
 
@@ -74,7 +75,7 @@ def test_settings_are_checked():
 
 def receding(optimiser, deformation=None, **settings):
     """A short closed loop of two_mass."""
-    problem = replace(TASK.problem, duration=0.3, measure_from=0.1)
+    problem = replace(SHIPPED.two_mass.problem, duration=0.3, measure_from=0.1)
     return problem, fp.RecedingHorizon(optimiser, deformation or fp.Identity(), **settings)
 
 
@@ -101,7 +102,7 @@ def test_all_backends_drive_the_same_loop(optimiser):
 )
 def test_every_variant_is_cured_by_adaptation(nominal):
     """Restart, restart with tracking, and a propagated plan that is tracked: each follows the reference with FPI."""
-    problem = replace(TASK.problem, duration=4.0, measure_from=2.0)
+    problem = replace(SHIPPED.two_mass.problem, duration=4.0, measure_from=2.0)
     errors = {}
     for name, deformation in (("plain", fp.Identity()), ("adaptive", fp.Sigmoid(gain=-0.5, scale=20.0))):
         run = fp.simulate(problem, fp.RecedingHorizon(GRADIENT, deformation, replanning=nominal), seed=0)
@@ -113,7 +114,7 @@ def test_every_variant_is_cured_by_adaptation(nominal):
 def test_bounds_of_the_plan_are_shifted_by_the_correction():
     """The deformation takes part of the actuator, so the plan gets the rest: planned + correction stays inside."""
     tight = replace(
-        TASK.problem,
+        SHIPPED.two_mass.problem,
         limits=fp.Limits(inputs={"Q1": (-60.0, 10.0), "Q2": (-60.0, 40.0)}),
         duration=2.0,
         measure_from=0.5,
@@ -160,11 +161,13 @@ def test_stop_run_ends_with_the_reason():
 
 def test_scale_is_chosen_from_the_input_limits():
     """S covers a jump of the command from limit to limit; without limits it must be given."""
-    controller = resolved(TASK.problem, fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)))
+    controller = resolved(SHIPPED.two_mass.problem, fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)))
     jump = np.linalg.norm([600 / 1.5, 600 / 2.6])
     assert controller.deformation.largest_step() == pytest.approx(jump, rel=0.01)
     with pytest.raises(InvalidValue, match="input 'Q1' has no finite limits"):
-        resolved(replace(TASK.problem, limits=fp.Limits()), fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)))
+        resolved(
+            replace(SHIPPED.two_mass.problem, limits=fp.Limits()), fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5))
+        )
 
 
 def test_chain_of_order_four_under_receding_horizon():
@@ -190,9 +193,9 @@ def test_chain_of_order_four_under_receding_horizon():
 
 def scaled(factor):
     """The shipped problem with every weight times `factor`."""
-    cost: Any = TASK.problem.cost
+    cost: Any = SHIPPED.two_mass.problem.cost
     return replace(
-        TASK.problem,
+        SHIPPED.two_mass.problem,
         cost=fp.Quadratic(
             states={n: factor * w for n, w in cost.states.items()},
             deviation={n: factor * w for n, w in cost.deviation.items()},
@@ -205,7 +208,7 @@ def scaled(factor):
 def test_the_size_of_the_weights_changes_neither_plan_nor_status(factor, iterations):
     """A cost in other units is the same problem: tiny weights must not make every plan look converged."""
     diagnostics = {}
-    for name, problem in (("one", TASK.problem), ("scaled", scaled(factor))):
+    for name, problem in (("one", SHIPPED.two_mass.problem), ("scaled", scaled(factor))):
         ocp = transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, BOXES["active"])
         data = stage_data(problem.plant, problem.reference, problem.horizon, problem.cost)(
             0.0, problem.plant.approximate
@@ -235,7 +238,7 @@ COUPLED = {
 @pytest.mark.parametrize("optimiser", BACKENDS, ids=ids[2:])
 def test_costs_that_couple_states_and_inputs(optimiser, cost):
     """Hessians with entries off the diagonal, the stage state augmented by the last command: all backends agree."""
-    p = TASK.problem
+    p = SHIPPED.two_mass.problem
     ocp = transcribe(p.plant, p.reference, p.horizon, cost, BOXES["active"])
     data = stage_data(p.plant, p.reference, p.horizon, cost)(0.0, p.plant.approximate)
     first = np.concatenate([p.start_state, np.zeros(ocp.state.size - p.plant.state.size)])
@@ -371,13 +374,13 @@ def test_compiled_and_interpreted_steps_are_the_same():
     """The generated C has one copy of the stage however many stages and iterations there are."""
     sizes = {}
     for stages, iterations in ((20, 10), (20, 40), (80, 10)):
-        p = replace(TASK.problem, horizon=fp.Horizon(stages=stages, step=1e-2))
+        p = replace(SHIPPED.two_mass.problem, horizon=fp.Horizon(stages=stages, step=1e-2))
         ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
         step = fp.ReducedGradient(iterations=iterations, tolerance=1e-3).step(ocp)
         sizes[stages, iterations] = len(generate(step)[0])
     assert sizes[20, 40] < 1.1 * sizes[20, 10]
     assert sizes[80, 10] < 2 * sizes[20, 10]
-    p = TASK.problem
+    p = SHIPPED.two_mass.problem
     ocp, data, first = two_mass(BOXES["active"])
     step, memory = GRADIENT.step(ocp), GRADIENT.memory(ocp).start()
     arguments = (first, data, ocp.input_lower, ocp.input_upper, memory)

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from test_outputs import OPTIMISER, hill, planned, sedated
 
 import fpirhc as fp
@@ -15,7 +16,6 @@ from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive, NotSuppo
 from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.task.set_point import Setpoint
 
-TASK = fp.load_problem("problems/heat_exchanger.py")
 STATIC = fp.FeedforwardOnly()
 
 
@@ -35,19 +35,19 @@ def rms(problem: fp.Problem, controller: Any) -> tuple[float, float]:
 
 def test_paired_through_the_model_every_gain_serves():
     """A map with slopes from .15 to 2.15 behind a lag and a dead time: up to twelve times better than without, and quiet."""
-    without, _ = rms(TASK.problem, STATIC)
+    without, _ = rms(tasks.heat_exchanger.problem, STATIC)
     for gain, share in ((0.05, 0.2), (0.1, 0.13), (0.2, 0.11), (0.5, 0.1), (0.9, 0.1)):
-        error, step = rms(TASK.problem, fp.Cascade(STATIC, affine(gain)))
+        error, step = rms(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(gain)))
         assert error < share * without, gain
         assert step < 0.01, gain
 
 
 def test_with_the_last_target_only_a_small_gain_serves():
     """The iteration goes on while the output is under way: from .2 it is a limit cycle, worse than no iteration."""
-    without, _ = rms(TASK.problem, STATIC)
-    assert rms(TASK.problem, fp.Cascade(STATIC, affine(0.05), paired=None))[0] < 0.125 * without
+    without, _ = rms(tasks.heat_exchanger.problem, STATIC)
+    assert rms(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(0.05), paired=None))[0] < 0.125 * without
     for gain in (0.2, 0.5):
-        error, step = rms(TASK.problem, fp.Cascade(STATIC, affine(gain), paired=None))
+        error, step = rms(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(gain), paired=None))
         assert error > without
         assert step > 0.2
 
@@ -55,14 +55,16 @@ def test_with_the_last_target_only_a_small_gain_serves():
 @pytest.mark.parametrize(("lag", "dead_time"), [(10.0, 5.0), (40.0, 5.0), (20.0, 3.0), (20.0, 8.0)])
 def test_a_wrong_lag_or_dead_time_changes_little(lag, dead_time):
     """Half or twice the lag, 3 or 8 s of dead time in place of 5."""
-    error, step = rms(TASK.problem, fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=lag, dead_time=dead_time)))
-    assert error < 0.2 * rms(TASK.problem, STATIC)[0]
+    error, step = rms(
+        tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=lag, dead_time=dead_time))
+    )
+    assert error < 0.2 * rms(tasks.heat_exchanger.problem, STATIC)[0]
     assert step < 0.01
 
 
 def test_the_shift_is_that_of_the_recursion_by_hand():
     """Logged outputs through the formulas in numpy: reference and shift in force, undeformed target, map."""
-    run = fp.simulate(TASK.problem, fp.Cascade(STATIC, affine(0.4)), seed=1, compiled=False)
+    run = fp.simulate(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(0.4)), seed=1, compiled=False)
     decay, gain = np.exp(-1 / 20), 0.4
     reference, shifts = run["reference.outlet"], [0.0] * 6
     shift, in_force = 0.0, 0.3 - reference[0]
@@ -269,7 +271,7 @@ def test_a_review_has_the_linear_loop_of_a_cascade():
 
 def test_a_comparison_judges_a_cascade_beside_its_inner_controller():
     """The inner controller alone is the cascade without adaptation; a null test belongs to the pair."""
-    comparison = fp.compare(TASK, seed=0, controllers=["static inverse", "Cascade"], compiled=False)
+    comparison = fp.compare(tasks.heat_exchanger, seed=0, controllers=["static inverse", "Cascade"], compiled=False)
     assert comparison.findings[0].pair == ("static inverse", "Cascade")
     assert comparison.findings[0].outcome is Outcome.BETTER
     assert "Cascade lowers the rms error of outlet from 0.688 to 0.0573 K" in comparison.findings[0].text

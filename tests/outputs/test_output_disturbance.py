@@ -12,9 +12,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from own_disturbance import Sawtooth
 from plants import simulated
-from test_outputs import OPTIMISER, SAME, SHORT, TWO_MASS, curve, hill, on_outputs, planned, sedated
+from test_outputs import OPTIMISER, SAME, curve, hill, on_outputs, planned, sedated, shortened
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
@@ -129,12 +130,12 @@ def test_a_reality_has_it_on_its_own_output() -> None:
 def test_a_name_of_a_coordinate_is_the_coordinates() -> None:
     """An output q1 that is the coordinate q1 is disturbed as the coordinate is: its response."""
     disturbances = {"q1": fp.Sine(0.5, 3.0)}
-    short = replace(SHORT, duration=0.05, measure_from=0.0, disturbances=disturbances)
-    plain, run = (simulated(p, TWO_MASS.controllers["CTC"]) for p in (short, on_outputs(short)))
+    short = replace(shortened(), duration=0.05, measure_from=0.0, disturbances=disturbances)
+    plain, run = (simulated(p, tasks.two_mass.controllers["CTC"]) for p in (short, on_outputs(short)))
     assert np.array_equal(plain["state"], run["state"])
     assert "output_disturbance" not in run.layout.names
     other = {"one": fp.Output("m", lambda q, v, p: q.q1), "q2": SAME["q2"]}
-    named = replace(SHORT, plant=replace(SHORT.plant, outputs=other), disturbances={"one": fp.Sine(0.5, 3.0)},
+    named = replace(shortened(), plant=replace(shortened().plant, outputs=other), disturbances={"one": fp.Sine(0.5, 3.0)},
         reference=fp.Trajectory(lambda t: {"one": 2.2 + 0 * t, "q2": 5.4 + 0 * t}), cost=None, horizon=None,
         duration=0.05, measure_from=0.0)  # fmt: skip
     one = simulated(named, fp.ComputedTorque(fp.Exponential(6.0)))

@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from plants import simulated
 
 import fpirhc as fp
@@ -23,8 +25,7 @@ from fpirhc.review.review import predict
 from fpirhc.simulation.loop import close_loop
 
 TRACK = fp.Exponential(rate=6.0)
-TWO_MASS = fp.load_problem("two_mass")
-SHORT = replace(TWO_MASS.problem, duration=0.4, measure_from=0.1)
+shortened = cache(lambda: replace(tasks.two_mass.problem, duration=0.4, measure_from=0.1))
 SAME = {"q1": fp.Output("m", lambda q, v, p: q.q1), "q2": fp.Output("m", lambda q, v, p: q.q2)}
 
 
@@ -38,7 +39,9 @@ def on_outputs(problem: fp.Problem) -> fp.Problem:
 @pytest.mark.parametrize("name", ["CTC", "CTC+FPI (eq 6)"])
 def test_outputs_that_are_coordinates_need_no_more_operations(name: str) -> None:
     """Operations of one cycle, which do not depend on the machine as times do."""
-    plain, outputs = (close_loop(p, TWO_MASS.controllers[name]).function for p in (SHORT, on_outputs(SHORT)))
+    plain, outputs = (
+        close_loop(p, tasks.two_mass.controllers[name]).function for p in (shortened(), on_outputs(shortened()))
+    )
     assert outputs.n_instructions() <= plain.n_instructions() + 5  # four outputs are written, a term is doubled
 
 
@@ -51,7 +54,7 @@ SENSING = {
 @pytest.mark.parametrize("sensing", SENSING)
 def test_sensors_and_estimators_are_those_of_the_outputs(sensing: str) -> None:
     """The law and the map are given the same numbers; the inverse is given the state, which no sensor touches."""
-    problem = replace(SHORT, sensing=SENSING[sensing], horizon=None, cost=None)
+    problem = replace(shortened(), sensing=SENSING[sensing], horizon=None, cost=None)
     outputs = replace(problem, plant=replace(problem.plant, outputs=SAME))
     controller = fp.ComputedTorque(TRACK)
     plain, run = (simulated(p, controller, seed=1) for p in (problem, outputs))
@@ -303,7 +306,7 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "judged": (lambda: squared(lambda t: 1 + 0 * t, judged=("z",)), "judged: output 'z' is unknown"),
     "states in the cost": (lambda: squared(lambda t: 1 + 0 * t, cost=fp.Quadratic(states={"a": 1.0})), "have no reference"),
     "both in the cost": (
-        lambda: replace(SHORT, cost=fp.Quadratic(states={"q1": 1.0}, outputs={"q2": 1.0})),
+        lambda: replace(shortened(), cost=fp.Quadratic(states={"q1": 1.0}, outputs={"q2": 1.0})),
         "states and outputs: both weigh errors",
     ),
     "reality": (lambda: replace(squared(lambda t: 1 + 0 * t), reality=fp.Reality(double({}))), "it has no output 'y'"),

@@ -8,13 +8,15 @@ Runge-Kutta's formula is the same in both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from forms import named_again, with_arguments
 from on_problem import on_problem
 from plants import simulated
@@ -26,27 +28,36 @@ from fpirhc.plant.motion import followed_units
 
 # Coordinates as outputs
 
-TWO_MASS = fp.load_problem("two_mass")
 TRACK, MAP = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=20.0)
 PUSHED = {"disturbances": {"q1": fp.Sine(0.5, 3.0), "Q2": fp.Step(at=0.01, size=5.0)}}
 LATE = {"dead_time": fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}, measurement=2e-3)}
 AIMS = {"reference": fp.Setpoint({"q1": [(0.0, 2.2), (0.01, 2.4)], "q2": [(0.0, 5.4), (0.02, 5.3)]}, rate=10.0)}
 NOISES = {"q1": 1e-3, "q2": 1e-3, "q1'": 1e-2, "q2'": 1e-2, "q1''": 0.1, "q2''": 0.1}
 FILTER = fp.DisturbanceKalman({"q1": 5.0, "q2": 5.0}, NOISES)
-LOOPS: dict[str, tuple[Controller, fp.Problem]] = {
-    **{f"{type(e).__name__}-{k}": on_problem(e) for k, e in enumerate(examples("controllers", fp.ComputedTorque(TRACK, MAP)))},
+
+
+def on_two_mass(controller: Controller | str, changes: dict[str, Any]) -> tuple[Controller, fp.Problem]:
+    """A controller, or a shipped one by its name, and the problem with changes; a reality of None is the plant itself."""
+    task = tasks.two_mass
+    own = {"reality": fp.Reality(task.problem.plant)} if "reality" in changes else changes
+    return task.controllers[controller] if isinstance(controller, str) else controller, replace(task.problem, **own)
+
+
+LOOPS: dict[str, Callable[[], tuple[Controller, fp.Problem]]] = {
+    **{f"{type(e).__name__}-{k}": partial(on_problem, e)
+       for k, e in enumerate(examples("controllers", fp.ComputedTorque(TRACK, MAP)))},
     **{
-        name: (controller, replace(TWO_MASS.problem, **changes))
+        name: partial(on_two_mass, controller, changes)
         for name, controller, changes in (
             ("rate", fp.rivals.ResolvedAccelerationRate(rate=6.0), {}),  # the measured responses move the states of a wrong model
-            ("disturbed", TWO_MASS.controllers["RHC+FPI"], PUSHED),
+            ("disturbed", "RHC+FPI", PUSHED),
             ("plan", fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2), MAP, fp.FromPlan(TRACK)), {}),
-            ("late", TWO_MASS.controllers["RHC+FPI"], LATE),
+            ("late", "RHC+FPI", LATE),
             ("paired", fp.Predicted(fp.ComputedTorque(TRACK, fp.Paired(MAP, cycles=5)), inputs=3e-3, measurement=2e-3), LATE),
             ("at once", fp.Estimating(fp.ComputedTorque(TRACK), FILTER, at_once=True), {}),
-            ("set-points", TWO_MASS.controllers["CTC+FPI (eq 6)"], AIMS),
-            ("plans to set-points", TWO_MASS.controllers["RHC+FPI"], AIMS),
-            ("reality", fp.ComputedTorque(TRACK, fp.ModelReferenced(MAP)), {"reality": fp.Reality(TWO_MASS.problem.plant)}),
+            ("set-points", "CTC+FPI (eq 6)", AIMS),
+            ("plans to set-points", "RHC+FPI", AIMS),
+            ("reality", fp.ComputedTorque(TRACK, fp.ModelReferenced(MAP)), {"reality": None}),
         )
     },
 }  # fmt: skip
@@ -55,7 +66,7 @@ LOOPS: dict[str, tuple[Controller, fp.Problem]] = {
 @pytest.mark.parametrize("name", LOOPS)
 def test_coordinates_as_outputs_change_no_signal(name: str) -> None:
     """Of any controller, bit by bit. A schedule of slots gives every output a reference, and every coordinate at its time."""
-    controller, problem = LOOPS[name]
+    controller, problem = LOOPS[name]()
     short = replace(problem, duration=40 * problem.period, measure_from=0.0)
     plain, run = (simulated(p, controller, seed=1) for p in (short, named_again(short)))
     slots = isinstance(controller, fp.Slotted)
@@ -65,12 +76,9 @@ def test_coordinates_as_outputs_change_no_signal(name: str) -> None:
     assert np.ptp(run["command"], axis=0).max() > 0
 
 
-TANKS = fp.load_problem("leaking_tanks")
-
-
 def tanks() -> fp.Problem:
     """The leaking tanks by their states, with the levels as outputs."""
-    plant, cost = TANKS.problem.plant, TANKS.problem.cost
+    plant, cost = tasks.leaking_tanks.problem.plant, tasks.leaking_tanks.problem.cost
     assert isinstance(cost, fp.Quadratic)
     states = fp.Plant.of_states(
         states=plant.coordinates,
@@ -80,17 +88,17 @@ def tanks() -> fp.Problem:
         outputs={name: fp.Output("m", lambda x, p, name=name: x[name]) for name in plant.names},
         controlled=("h1",),
     )
-    return replace(TANKS.problem, plant=states, cost=replace(cost, states={}, outputs=cost.states))
+    return replace(tasks.leaking_tanks.problem, plant=states, cost=replace(cost, states={}, outputs=cost.states))
 
 
-@pytest.mark.parametrize("name", TANKS.controllers)
-def test_tanks_with_their_levels_as_outputs_are_the_tanks(name: str) -> None:
+def test_tanks_with_their_levels_as_outputs_are_the_tanks() -> None:
     """Every controller, in noise. Only h1 is controlled; the distance of h2 is held, and is zero."""
-    one, other = (replace(p, duration=40.0, measure_from=0.0) for p in (TANKS.problem, tanks()))
-    plain, run = (simulated(p, TANKS.controllers[name]) for p in (one, other))
-    for signal in ("state", "command", "realised", "command_shift"):
-        np.testing.assert_allclose(run[signal], plain[signal], rtol=1e-9, atol=1e-9)
-    assert np.ptp(run["command"]) > 10
+    one, other = (replace(p, duration=40.0, measure_from=0.0) for p in (tasks.leaking_tanks.problem, tanks()))
+    for name, controller in tasks.leaking_tanks.controllers.items():
+        plain, run = (simulated(p, controller) for p in (one, other))
+        for signal in ("state", "command", "realised", "command_shift"):
+            np.testing.assert_allclose(run[signal], plain[signal], rtol=1e-9, atol=1e-9, err_msg=name)
+        assert np.ptp(run["command"]) > 10
 
 
 # Plants whose outputs are linear in the state, and the same plants with their outputs as coordinates.

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.horizon.stage_data import shifted_reference
 
-TASK = fp.load_problem("anaesthesia")
-PROBLEM, PLANT = TASK.problem, TASK.problem.plant
+problem = cache(lambda: tasks.anaesthesia.problem)
+plant = cache(lambda: tasks.anaesthesia.problem.plant)
 
 
 @pytest.mark.parametrize(("name", "described"), [("RHC", 2.29), ("RHC+FPI", 0.00875)])
@@ -26,8 +29,8 @@ def test_a_plan_along_the_models_own_outputs_stays_at_the_wrong_one(name, descri
         return ca.Function("unshifted", symbols, symbols[:1])
 
     monkeypatch.setattr("fpirhc.controllers.receding_horizon.shifted_reference", unshifted)
-    run = fp.simulate(PROBLEM, TASK.controllers[name], seed=0, compiled=False)
-    assert fp.measure(PROBLEM, run).rms_error["bis"] == pytest.approx(described, abs=0.01)
+    run = fp.simulate(problem(), tasks.anaesthesia.controllers[name], seed=0, compiled=False)
+    assert fp.measure(problem(), run).rms_error["bis"] == pytest.approx(described, abs=0.01)
 
 
 def judged_by(curve: np.ndarray, name: str) -> float:
@@ -36,30 +39,30 @@ def judged_by(curve: np.ndarray, name: str) -> float:
     Their derivatives are those along the real motion: an observer that is right about everything but the curve.
     """
     x, u, p, real = (ca.SX.sym(n, s) for n, s in (("x", 4), ("u", 1), ("p", 4), ("real", 4)))
-    rate = PLANT.equations.rate(x, u, real)
-    chain = [PLANT.equations.output(x, u, p, ca.SX.zeros(4))[0]]
+    rate = plant().equations.rate(x, u, real)
+    chain = [plant().equations.output(x, u, p, ca.SX.zeros(4))[0]]
     for _ in range(2):
         chain.append(ca.jtimes(chain[-1], x, rate))
     shown = ca.Function("shown", [x, u, p, real], [ca.vertcat(*chain)])
-    wanted = PROBLEM.reference.function(PLANT)
-    advance = PROBLEM.integrator.step(PLANT, PROBLEM.period)
-    stepper = fp.Stepper(PROBLEM, TASK.controllers[name], compiled=False)
-    memory, state, command, realised = stepper.start(), PROBLEM.start_state.copy(), np.zeros(1), np.zeros(1)
+    wanted = problem().reference.function(plant())
+    advance = problem().integrator.step(plant(), problem().period)
+    stepper = fp.Stepper(problem(), tasks.anaesthesia.controllers[name], compiled=False)
+    memory, state, command, realised = stepper.start(), problem().start_state.copy(), np.zeros(1), np.zeros(1)
     errors = []
-    for k in range(PROBLEM.cycles):
-        time, depth = k * PROBLEM.period, float(shown(state, command, PLANT.exact, PLANT.exact)[0])
+    for k in range(problem().cycles):
+        time, depth = k * problem().period, float(shown(state, command, plant().exact, plant().exact)[0])
         errors.append(depth - float(wanted(time)[0][0]))
-        seen = np.asarray(shown(state, command, curve, PLANT.exact).full()).ravel()
+        seen = np.asarray(shown(state, command, curve, plant().exact).full()).ravel()
         command, memory = stepper.step(time, state, realised, memory, output=seen[:2])
-        state = np.asarray(advance(state, command, PLANT.exact, np.zeros(4)).full()).ravel()
-        realised = np.asarray(shown(state, command, curve, PLANT.exact).full()).ravel()[2:]
-    late = np.array(errors[round(PROBLEM.measure_from / PROBLEM.period) :])
+        state = np.asarray(advance(state, command, plant().exact, np.zeros(4)).full()).ravel()
+        realised = np.asarray(shown(state, command, curve, plant().exact).full()).ravel()[2:]
+    late = np.array(errors[round(problem().measure_from / problem().period) :])
     return float(np.sqrt(np.mean(late**2)))
 
 
 def test_the_iteration_helps_with_measured_outputs_and_not_with_those_of_the_wrong_curve():
     """It corrects the derivative of what it is shown: eleven times better, and no better at all."""
-    measured = [judged_by(PLANT.exact, name) for name in ("CTC", "CTC+FPI")]
-    modelled = [judged_by(PLANT.approximate, name) for name in ("CTC", "CTC+FPI")]
+    measured = [judged_by(plant().exact, name) for name in ("CTC", "CTC+FPI")]
+    modelled = [judged_by(plant().approximate, name) for name in ("CTC", "CTC+FPI")]
     assert measured == pytest.approx([0.142, 0.0126], rel=0.01)
     assert modelled == pytest.approx([2.33, 2.34], rel=0.01)

@@ -7,20 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
 from fpirhc.probing.recording import replay
 
-TASK = fp.load_problem("two_mass")
-
 
 def recorded(
     path: Path, *, name: str = "RHC+FPI", without: tuple[str, ...] = (), rows: int = 60
 ) -> dict[str, np.ndarray]:
     """Write what a controller was given and sent in its first cycles, and return it."""
-    problem, controller = TASK.problem, TASK.controllers[name]
+    problem, controller = tasks.two_mass.problem, tasks.two_mass.controllers[name]
     stepper = fp.Stepper(problem, controller, compiled=False)
     run = fp.simulate(problem, controller, seed=0, compiled=False)
     state, realised = run["state"][:rows], run["realised"][:rows]
@@ -44,8 +43,8 @@ def write(path: Path, columns: dict[str, np.ndarray]) -> None:
 def test_its_own_record_gives_its_own_commands(tmp_path, name):
     """To rounding, with its deformation, plan and integral."""
     columns = recorded(tmp_path / "run.csv", name=name)
-    answer = replay(TASK.problem, TASK.controllers[name], tmp_path / "run.csv")
-    sent = np.column_stack([columns[n] for n in TASK.problem.plant.inputs])
+    answer = replay(tasks.two_mass.problem, tasks.two_mass.controllers[name], tmp_path / "run.csv")
+    sent = np.column_stack([columns[n] for n in tasks.two_mass.problem.plant.inputs])
     assert answer.commands == pytest.approx(sent, rel=1e-9, abs=1e-9)
     assert all(rms < 1e-8 for rms, _, _ in answer.differences().values())
     assert sum(answer.statuses.values()) == 60
@@ -54,13 +53,13 @@ def test_its_own_record_gives_its_own_commands(tmp_path, name):
 def test_a_model_referenced_form_answers_to_the_commands_that_were_sent(tmp_path):
     """On a record of another controller its deformation is bounded by the model's error, and does not wind up."""
     columns = recorded(tmp_path / "run.csv", name="RHC", rows=200)
-    form = TASK.controllers["RHC+FPI, model-referenced"]
-    told = replay(TASK.problem, form, tmp_path / "run.csv")
-    write(tmp_path / "blind.csv", {n: c for n, c in columns.items() if n not in TASK.problem.plant.inputs})
-    blind = replay(TASK.problem, form, tmp_path / "blind.csv")
+    form = tasks.two_mass.controllers["RHC+FPI, model-referenced"]
+    told = replay(tasks.two_mass.problem, form, tmp_path / "run.csv")
+    write(tmp_path / "blind.csv", {n: c for n, c in columns.items() if n not in tasks.two_mass.problem.plant.inputs})
+    blind = replay(tasks.two_mass.problem, form, tmp_path / "blind.csv")
     assert blind.recorded is None
     assert blind.differences() == {}
-    sent = np.column_stack([columns[n] for n in TASK.problem.plant.inputs])
+    sent = np.column_stack([columns[n] for n in tasks.two_mass.problem.plant.inputs])
     assert np.abs(told.commands - sent).max() < np.abs(blind.commands - sent).max()
 
 
@@ -68,7 +67,7 @@ def test_a_lost_sample_skips_its_cycle(tmp_path):
     columns = recorded(tmp_path / "run.csv")
     columns["q1"][20] = np.nan
     write(tmp_path / "run.csv", columns)
-    answer = replay(TASK.problem, TASK.controllers["RHC+FPI"], tmp_path / "run.csv")
+    answer = replay(tasks.two_mass.problem, tasks.two_mass.controllers["RHC+FPI"], tmp_path / "run.csv")
     assert answer.statuses["BAD_SAMPLE"] == 1
     assert np.isfinite(answer.commands).all()
 
@@ -76,7 +75,7 @@ def test_a_lost_sample_skips_its_cycle(tmp_path):
 def test_a_response_without_a_column_is_a_difference(tmp_path):
     columns = recorded(tmp_path / "run.csv", without=("q1''", "q2''"))
     assert "q1''" not in columns
-    answer = replay(TASK.problem, TASK.controllers["RHC+FPI"], tmp_path / "run.csv")
+    answer = replay(tasks.two_mass.problem, tasks.two_mass.controllers["RHC+FPI"], tmp_path / "run.csv")
     assert np.isfinite(answer.commands).all()
 
 
@@ -88,13 +87,13 @@ def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
     assert "60 cycles" in shown
     assert "rms difference" in shown
     head, *rows = list(csv.reader(Path("commands.csv").read_text().splitlines()))
-    assert head == ["time", *TASK.problem.plant.inputs]
+    assert head == ["time", *tasks.two_mass.problem.plant.inputs]
     assert len(rows) == 60
 
 
-TIMES = np.arange(5) * TASK.problem.period
+TIMES = np.arange(5) * 1e-3  # the period of two_mass
 GOOD = {n: np.zeros(5) for n in ("q1", "q2", "q1'", "q2'", "q1''", "q2''")}
-INPUT = next(iter(TASK.problem.plant.inputs))
+INPUT = "Q1"
 
 
 @pytest.mark.parametrize(
@@ -114,7 +113,7 @@ def test_a_wrong_table_is_named(tmp_path, columns, words):
     """All mistakes of a file together, each with what was expected."""
     write(tmp_path / "run.csv", columns)
     with pytest.raises(fp.FpirhcError) as error:
-        replay(TASK.problem, TASK.controllers["RHC"], tmp_path / "run.csv")
+        replay(tasks.two_mass.problem, tasks.two_mass.controllers["RHC"], tmp_path / "run.csv")
     assert words in str(error.value)
     assert "recording run.csv" in str(error.value)
 
@@ -132,7 +131,7 @@ def test_a_file_that_is_no_table_is_named(tmp_path, text, words):
     if text is not None:
         (tmp_path / "run.csv").write_text(text)
     with pytest.raises(fp.FpirhcError) as error:
-        replay(TASK.problem, TASK.controllers["RHC"], tmp_path / "run.csv")
+        replay(tasks.two_mass.problem, tasks.two_mass.controllers["RHC"], tmp_path / "run.csv")
     assert words in str(error.value)
 
 

@@ -10,18 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.errors import NotContractive
 from fpirhc.studies.comparison.compare import compare
 
-TASK = fp.load_problem("two_mass")
-PROBLEM = TASK.problem
 
-
-def late_error(controller, problem=PROBLEM, since=3.0):
+def late_error(controller, problem=None, since=3.0):
     """(max |e|, rms e, rms response error) per coordinate from `since` on."""
-    run = fp.simulate(problem, controller, seed=0)
+    run = fp.simulate(problem or tasks.two_mass.problem, controller, seed=0)
     assert run.stop is None
     late = run.time >= since
     error = run["error"][late]
@@ -36,14 +34,14 @@ def sigmoid(gain, scale=1.0):
 
 def test_without_adaptation_the_wrong_model_fails():
     """Computed torque alone: 0.63 / 0.27 m."""
-    largest, _, response = late_error(TASK.controllers["CTC"])
+    largest, _, response = late_error(tasks.two_mass.controllers["CTC"])
     np.testing.assert_allclose(largest, [0.630, 0.271], rtol=0.01, equal_nan=False)
     np.testing.assert_allclose(response, [39.0, 17.0], rtol=0.02, equal_nan=False)
 
 
 def test_equation_six_makes_it_precise():
     """With A_c = -0.5: 6 / 3 mm, and the response error falls by a factor of a hundred."""
-    largest, _, response = late_error(TASK.controllers["CTC+FPI (eq 6)"])
+    largest, _, response = late_error(tasks.two_mass.controllers["CTC+FPI (eq 6)"])
     np.testing.assert_allclose(largest, [0.0061, 0.0033], rtol=0.08, equal_nan=False)
     np.testing.assert_allclose(response, [0.35, 0.19], rtol=0.05, equal_nan=False)
 
@@ -51,7 +49,7 @@ def test_equation_six_makes_it_precise():
 def test_equation_three_does_as_well():
     """The other map with the same effective gain leaves the same error."""
     six = late_error(sigmoid(-0.5, scale=20.0))[1]
-    three = late_error(TASK.controllers["CTC+FPI (eq 3)"])[1]
+    three = late_error(tasks.two_mass.controllers["CTC+FPI (eq 3)"])[1]
     np.testing.assert_allclose(three, six, rtol=0.05, equal_nan=False)
 
 
@@ -60,7 +58,7 @@ def test_response_error_times_gain_over_period_is_constant():
     constants = []
     for period in (2e-3, 1e-3, 5e-4):
         for gain in (-0.25, -0.5, -1.0):
-            problem = replace(PROBLEM, period=period, horizon=None, cost=None)
+            problem = replace(tasks.two_mass.problem, period=period, horizon=None, cost=None)
             response = np.linalg.norm(late_error(sigmoid(gain), problem)[2])
             constants.append(response * abs(gain) / period)
     sizes = np.array(constants)
@@ -77,13 +75,13 @@ def test_sector_bound():
 def test_wrong_sign_is_refused():
     """A positive gain on a plant whose eigenvalues are 1.5 and 1.3 is refused with the admissible gains."""
     with pytest.raises(NotContractive, match=r"wrong sign.*negative gain, 0 < \|gain\| < 3.36 .*< 2.82"):
-        fp.simulate(PROBLEM, sigmoid(0.1), seed=0)
+        fp.simulate(tasks.two_mass.problem, sigmoid(0.1), seed=0)
 
 
 @pytest.fixture(scope="module")
 def comparison():
     """All shipped controllers."""
-    return compare(TASK, seed=0)
+    return compare(tasks.two_mass, seed=0)
 
 
 def rms(entry, since=2.0):
@@ -102,9 +100,10 @@ def test_receding_horizon_with_a_wrong_model_fails_and_adaptation_cures_it(compa
 def test_real_plant_under_adaptation_moves_like_the_model(comparison):
     """The law behind it: RHC+FPI on the exact plant follows RHC on the approximate model taken as the plant."""
     model = replace(
-        PROBLEM.plant, parameters={n: replace(p, exact=p.approximate) for n, p in PROBLEM.plant.parameters.items()}
+        tasks.two_mass.problem.plant,
+        parameters={n: replace(p, exact=p.approximate) for n, p in tasks.two_mass.problem.plant.parameters.items()},
     )
-    ideal = fp.simulate(replace(PROBLEM, plant=model), TASK.controllers["RHC"], seed=0)
+    ideal = fp.simulate(replace(tasks.two_mass.problem, plant=model), tasks.two_mass.controllers["RHC"], seed=0)
     real = comparison["RHC+FPI"].run
     late = real.time >= 1.0
     difference = (real["state"] - ideal["state"])[late][:, :2]

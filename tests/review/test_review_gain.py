@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tasks
 from chains import chain, errors_after_request
 from reviewed import answer, mass, torque
 from test_review_laws import PERIOD, RATE, moving
@@ -14,46 +15,48 @@ import fpirhc as fp
 from fpirhc.review.questions.speed import gain_times
 from fpirhc.review.review import predict
 
-DAILY = fp.load_problem("problems/gallery/tumour_daily.py")
 PLANNED = "RHC+FPI, gentle"
 
 
 def test_a_gentle_gain_is_worse_than_none_and_what_would_do():
     """Daily doses with gain -0.3: no, and no benefit; the named gain and the named forms converge."""
-    gentle = DAILY.controllers[PLANNED]
-    slow = answer(DAILY.problem, gentle, "keep up")
+    gentle = tasks.tumour_daily.controllers[PLANNED]
+    slow = answer(tasks.tumour_daily.problem, gentle, "keep up")
     assert slow.verdict == "no"
     assert slow.numbers["ratio"] < 1
-    assert answer(DAILY.problem, gentle, "lower the response error").verdict == "no"
+    assert answer(tasks.tumour_daily.problem, gentle, "lower the response error").verdict == "no"
     needed = float(slow.change.split("gain = ")[1].split(",")[0])
     map_ = fp.Sigmoid(gain=-0.3, shift=0.3, scale=gentle.deformation.scale)  # type: ignore[attr-defined]
     assert replace(map_) == gentle.deformation
     larger = replace(map_, gain=needed)
     assert gain_times(map_, needed / map_.gain) == f"gain = {needed:.3g}"
     for mended in (larger, fp.Increment(map_, cycles=0), fp.ModelReferenced(map_)):
-        better = predict(DAILY.problem, gentle.with_deformation(mended))
+        better = predict(tasks.tumour_daily.problem, gentle.with_deformation(mended))
         assert better.verdict == "yes"
     assert "(ModelReferenced, Increment), or use gain = " in slow.change
     without, adapted = (
-        fp.measure(DAILY.problem, fp.simulate(DAILY.problem, gentle.with_deformation(one), seed=0, compiled=False))
+        fp.measure(
+            tasks.tumour_daily.problem,
+            fp.simulate(tasks.tumour_daily.problem, gentle.with_deformation(one), seed=0, compiled=False),
+        )
         for one in (fp.Identity(), larger)
     )
-    [weighed] = DAILY.problem.judged_names
+    [weighed] = tasks.tumour_daily.problem.judged_names
     assert adapted.rms_error[weighed] < without.rms_error[weighed]
 
 
 def test_smallest_gain_of_a_plan_is_where_its_loop_is_stable():
     """Just below it a pole is outside the unit circle, just above it none is."""
-    gentle = DAILY.controllers[PLANNED]
-    least = answer(DAILY.problem, gentle, "keep up").numbers["least"]
+    gentle = tasks.tumour_daily.controllers[PLANNED]
+    least = answer(tasks.tumour_daily.problem, gentle, "keep up").numbers["least"]
     for share, stable in ((0.97, False), (1.03, True)):
         one = gentle.with_deformation(gentle.deformation.with_effective_gain(share * least))
-        assert (predict(DAILY.problem, one).numbers["radius"] < 1) == stable
+        assert (predict(tasks.tumour_daily.problem, one).numbers["radius"] < 1) == stable
 
 
 def test_a_gain_inside_its_limits_with_which_the_loop_diverges_is_too_small():
     """No, with the smallest gain that does: with a fifth less the error is twenty times as large as with a fifth more."""
-    own = answer(DAILY.problem, DAILY.controllers[PLANNED], "gain admissible")
+    own = answer(tasks.tumour_daily.problem, tasks.tumour_daily.controllers[PLANNED], "gain admissible")
     least = own.numbers["least"]
     assert own.verdict == "no"
     assert least == pytest.approx(-0.731, rel=0.01)
@@ -62,8 +65,13 @@ def test_a_gain_inside_its_limits_with_which_the_loop_diverges_is_too_small():
     errors = []
     for gain in (0.8 * least, 1.2 * least):
         one = fp.Sigmoid(gain=gain, shift=0.3, scale=1.0)
-        run = fp.simulate(DAILY.problem, DAILY.controllers[PLANNED].with_deformation(one), seed=0, compiled=False)
-        errors.append(fp.measure(DAILY.problem, run).rms_error["size"])
+        run = fp.simulate(
+            tasks.tumour_daily.problem,
+            tasks.tumour_daily.controllers[PLANNED].with_deformation(one),
+            seed=0,
+            compiled=False,
+        )
+        errors.append(fp.measure(tasks.tumour_daily.problem, run).rms_error["size"])
     assert errors[0] > 20 * errors[1]
 
 

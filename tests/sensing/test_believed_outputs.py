@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from filters import extended_filter, runge_kutta
 from plants import simulated as run
 
@@ -119,9 +119,6 @@ def test_a_late_measured_state_begins_where_the_reality_does() -> None:
     assert result["state.R"][0] == 1.5
 
 
-TWO_MASS = fp.load_problem("two_mass")
-
-
 def test_a_reality_shows_its_output_and_starts_elsewhere_than_the_observer() -> None:
     """The real patient starts with other levels; the filter finds them from the depth, the model alone does not."""
     first = {"C": 2.5, "R": 0.5, "E": 2.5}
@@ -136,7 +133,6 @@ def test_a_reality_shows_its_output_and_starts_elsewhere_than_the_observer() -> 
     assert errors[0] < 0.1 * errors[1]
 
 
-ANAESTHESIA = fp.load_problem(str(Path(__file__).resolve().parents[2] / "problems/gallery/anaesthesia.py"))
 COMPARTMENTS = fp.KalmanFilter(
     measured={"bis": 0.5},
     noise={"C1": 0.3, "C2": 0.02, "C3": 0.02, "Ce": 0.1},
@@ -160,9 +156,9 @@ def bis_errors() -> dict[tuple[str, str], float]:
     for known, observer in BELIEFS.items():
         measured = None if observer is None else ["bis"]
         sensing = fp.Sensing({}, fp.PositionDifference(), measured=measured, observer=observer)
-        problem = replace(ANAESTHESIA.problem, sensing=sensing)
+        problem = replace(tasks.anaesthesia.problem, sensing=sensing)
         for name in NAMES:
-            result = run(problem, ANAESTHESIA.controllers[name])
+            result = run(problem, tasks.anaesthesia.controllers[name])
             errors[known, name] = fp.measure(problem, result).rms_error["bis"]
     return errors
 
@@ -201,7 +197,7 @@ def test_predictions_start_from_what_is_believed() -> None:
 
 def test_a_comparison_says_what_is_measured_and_what_is_believed() -> None:
     file = replace(
-        TWO_MASS, problem=sedated(FILTER, duration=2.0, measure_from=0.0), controllers={"CTC": PLAIN, "FPI": FPI}
+        tasks.two_mass, problem=sedated(FILTER, duration=2.0, measure_from=0.0), controllers={"CTC": PLAIN, "FPI": FPI}
     )
     comparison = fp.compare(replace(file, headline=("CTC", "FPI")), seed=0, compiled=False)
     said = next(line for line in comparison.information if line.startswith("all controllers"))

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
+from fpirhc.controllers.base import Controller
 from fpirhc.errors import DeviceFailed, InvalidName, InvalidShape, InvalidValue, NotInstalled
 from fpirhc.simulation.lanes import run_many
 from fpirhc.simulation.metrics.base import measured_errors
 from fpirhc.simulation.simulate import Simulator
 
-TWO_MASS = fp.load_problem("two_mass")
-ADAPTIVE = TWO_MASS.controllers["CTC+FPI (eq 6)"]
+adaptive = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
 
 
 def odd(q, v, u, p):
@@ -66,37 +69,41 @@ ODD = fp.Problem(
     duration=4.0,
     measure_from=1.0,
 )
-NOISY = replace(
-    TWO_MASS.problem,
-    duration=3.0,
-    measure_from=1.0,
-    disturbances={"q1": fp.Step(at=1.5, size=3.0)},
-    sensing=fp.Sensing(
-        {"q1": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.05), "q2": fp.Sensor(quantum=1e-4)},
-        fp.SavitzkyGolay(window=7, degree=4),
-    ),
+noisy = cache(
+    lambda: replace(
+        tasks.two_mass.problem,
+        duration=3.0,
+        measure_from=1.0,
+        disturbances={"q1": fp.Step(at=1.5, size=3.0)},
+        sensing=fp.Sensing(
+            {"q1": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.05), "q2": fp.Sensor(quantum=1e-4)},
+            fp.SavitzkyGolay(window=7, degree=4),
+        ),
+    )
 )
 LAW = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.ModelReferenced(fp.Affine(gain=-0.5)))
-FISHERY = fp.load_problem("fishery")
-CASES = {
-    "published form": (TWO_MASS.problem, ADAPTIVE),
-    "functions": (ODD, LAW),
-    "lost samples": (NOISY, LAW),
-    "dead time": (
-        replace(TWO_MASS.problem, dead_time=fp.DeadTime(inputs={"Q1": 5e-3, "Q2": 2.5e-3})),
+CASES: dict[str, Callable[[], tuple[fp.Problem, Controller]]] = {
+    "published form": lambda: (tasks.two_mass.problem, adaptive()),
+    "functions": lambda: (ODD, LAW),
+    "lost samples": lambda: (noisy(), LAW),
+    "dead time": lambda: (
+        replace(tasks.two_mass.problem, dead_time=fp.DeadTime(inputs={"Q1": 5e-3, "Q2": 2.5e-3})),
         fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Increment(fp.Affine(gain=-0.5), cycles=(5.0, 2.5))),
     ),
-    "plans": (TWO_MASS.problem, TWO_MASS.controllers["RHC+FPI"]),
-    "plans at limits": (
+    "plans": lambda: (tasks.two_mass.problem, tasks.two_mass.controllers["RHC+FPI"]),
+    "plans at limits": lambda: (
         replace(
-            TWO_MASS.problem,
+            tasks.two_mass.problem,
             duration=3.0,
             measure_from=1.0,
             limits=fp.Limits(inputs={"Q1": (-40.0, 40.0), "Q2": (-5.0, 5.0)}),
         ),
-        TWO_MASS.controllers["RHC+FPI"],
+        tasks.two_mass.controllers["RHC+FPI"],
     ),
-    "map": (FISHERY.problem, next(c for n, c in FISHERY.controllers.items() if n.startswith("CTC"))),
+    "map": lambda: (
+        tasks.fishery.problem,
+        next(c for n, c in tasks.fishery.controllers.items() if n.startswith("CTC")),
+    ),
 }
 
 
@@ -124,7 +131,7 @@ def test_errors_are_those_of_the_ordinary_loop(name):
     A quantum makes a whole one of a last place now and then, so behind coarse sensors it is 1e-9.
     """
     close = 1e-9 if name == "lost samples" else 1e-12
-    ready = fp.simulator(*CASES[name])
+    ready = fp.simulator(*CASES[name]())
     exact = plants(ready, 11, 0.05)
     many = run_many(ready, exact)
     assert many.lanes > 1, many.why
@@ -152,7 +159,7 @@ def some_device() -> str:
 @pytest.mark.parametrize("name", [name for name in CASES if name != "plans"])
 def test_a_device_has_the_errors_of_the_lanes(name):
     """Its functions round otherwise again; statuses are the same, and so is a plant that runs away."""
-    ready, device = fp.simulator(*CASES[name]), some_device()
+    ready, device = fp.simulator(*CASES[name]()), some_device()
     exact = plants(ready, 11, 0.05)
     lanes, many = run_many(ready, exact), run_many(ready, exact, device=device)
     assert many.lanes == 1, many.why
@@ -166,13 +173,15 @@ def test_a_device_has_the_errors_of_the_lanes(name):
 def test_what_a_device_cannot_run_is_told():
     """A loop with plans under limits of states runs one after the other there; a name that no device has is wrong."""
     device = some_device()
-    limited = replace(TWO_MASS.problem, duration=0.5, measure_from=0.1, limits=fp.Limits(states={"q1": (-10.0, 10.0)}))
-    ready = fp.simulator(limited, TWO_MASS.controllers["RHC"])
+    limited = replace(
+        tasks.two_mass.problem, duration=0.5, measure_from=0.1, limits=fp.Limits(states={"q1": (-10.0, 10.0)})
+    )
+    ready = fp.simulator(limited, tasks.two_mass.controllers["RHC"])
     many = run_many(ready, plants(ready, 2), device=device)
     assert many.lanes == 0
     assert many.why.startswith("the loop has a part that is not written for devices: fpirhc_plan")
     with pytest.raises(InvalidName, match="no OpenCL device is called 'abacus'"):
-        run_many(fp.simulator(*CASES["map"]), plants(fp.simulator(*CASES["map"]), 2), device="abacus")
+        run_many(fp.simulator(*CASES["map"]()), plants(fp.simulator(*CASES["map"]()), 2), device="abacus")
 
 
 def test_a_device_that_fails_is_named(monkeypatch):
@@ -183,7 +192,7 @@ def test_a_device_that_fails_is_named(monkeypatch):
     def exhausted(*_args):
         raise cl.MemoryError("OUT_OF_RESOURCES\nand more")
 
-    short = replace(TWO_MASS.problem, duration=0.5, measure_from=0.1)
+    short = replace(tasks.two_mass.problem, duration=0.5, measure_from=0.1)
     for name, told in (
         ("Context", r"does not start \(OUT_OF_RESOURCES\): end what else uses it, or leave the device out"),
         (
@@ -193,14 +202,14 @@ def test_a_device_that_fails_is_named(monkeypatch):
     ):
         with monkeypatch.context() as patched:
             patched.setattr(cl, name, exhausted)
-            ready = fp.simulator(short, ADAPTIVE)
+            ready = fp.simulator(short, adaptive())
             with pytest.raises(DeviceFailed, match=told):
                 run_many(ready, plants(ready, 2), device=device)
 
 
 def test_a_device_needs_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyopencl", None)
-    ready = fp.simulator(TWO_MASS.problem, ADAPTIVE, compiled=False)
+    ready = fp.simulator(tasks.two_mass.problem, adaptive(), compiled=False)
     with pytest.raises(NotInstalled, match=r"a device needs pyopencl, .*pip install 'fpirhc\[opencl\]'"):
         run_many(ready, plants(ready, 2), device="")
 
@@ -208,11 +217,11 @@ def test_a_device_needs_its_package(monkeypatch):
 def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
     """A twentieth of a mass makes the iteration diverge: its run ends as the ordinary one does."""
     ready = fp.simulator(
-        replace(TWO_MASS.problem, limits=fp.Limits()),
+        replace(tasks.two_mass.problem, limits=fp.Limits()),
         fp.ComputedTorque(fp.Exponential(rate=6.0), fp.BeyondLimit(fp.Affine(gain=-1.5))),
     )
     exact = plants(ready, 8, 0.01)
-    place = TWO_MASS.problem.plant.parameter.elements.index("m1")
+    place = tasks.two_mass.problem.plant.parameter.elements.index("m1")
     calm = run_many(ready, exact)
     exact[5, place] *= 0.05
     many = run_many(ready, exact)
@@ -232,8 +241,8 @@ def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
 )
 def test_without_lanes_the_errors_are_the_same_and_it_says_why(controller, compiler, why, monkeypatch):
     limits = fp.Limits(states={"q1": (-9.0, 9.0)} if compiler else {})
-    problem = replace(TWO_MASS.problem, duration=0.5, measure_from=0.1, limits=limits)
-    ready = fp.simulator(problem, TWO_MASS.controllers[controller], compiled=compiler)
+    problem = replace(tasks.two_mass.problem, duration=0.5, measure_from=0.1, limits=limits)
+    ready = fp.simulator(problem, tasks.two_mass.controllers[controller], compiled=compiler)
     if not compiler:
         monkeypatch.setenv("FPIRHC_CC", "none")
     exact = plants(ready, 2)
@@ -244,7 +253,7 @@ def test_without_lanes_the_errors_are_the_same_and_it_says_why(controller, compi
 
 
 def test_wrong_parameters_are_named():
-    ready = fp.simulator(TWO_MASS.problem, ADAPTIVE, compiled=False)
+    ready = fp.simulator(tasks.two_mass.problem, adaptive(), compiled=False)
     with pytest.raises(InvalidShape, match=r"exact of shape \(1, 2\)\): expected one row per plant with m1, "):
         run_many(ready, np.ones((1, 2)))
     exact = plants(ready, 3)

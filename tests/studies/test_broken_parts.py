@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.review import review as reviewing
@@ -17,20 +19,19 @@ from fpirhc.simulation import simulate as simulating
 from fpirhc.studies.comparison import compare as comparing
 from fpirhc.studies.comparison import pairwise
 
-TASK = fp.load_problem("two_mass")
-CONTROLLERS = {name: TASK.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")}
-PROBLEM = replace(TASK.problem, duration=0.05, measure_from=0.0, horizon=None, cost=None)
+compared = cache(lambda: {name: tasks.two_mass.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")})
+brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0, horizon=None, cost=None))
 
 
 def task(**changes):
     """Computed torque without and with adaptation, for 50 cycles."""
     small: dict[str, Any] = {
-        "problem": PROBLEM,
-        "controllers": CONTROLLERS,
-        "headline": tuple(CONTROLLERS),
+        "problem": brief(),
+        "controllers": compared(),
+        "headline": tuple(compared()),
         "pictures": (),
     }
-    return replace(TASK, **{**small, **changes})
+    return replace(tasks.two_mass, **{**small, **changes})
 
 
 def breaks(*_arguments, **_named):
@@ -42,8 +43,8 @@ def test_a_broken_metric_is_told_by_its_name():
     """The other metrics have their numbers, in `measure` and in a comparison."""
     mine = fp.Metric("mine", lambda problem, run: 1 / 0)
     rms = fp.Metric("largest", lambda problem, run: float(np.abs(run["error"]).max()))
-    run = fp.simulate(PROBLEM, CONTROLLERS["CTC"], seed=0, compiled=False)
-    metrics = fp.measure(PROBLEM, run, [mine, rms])
+    run = fp.simulate(brief(), compared()["CTC"], seed=0, compiled=False)
+    metrics = fp.measure(brief(), run, [mine, rms])
     assert metrics["largest"][""] > 0
     assert metrics["mine"] == {}
     [sentence] = metrics.broken
@@ -80,7 +81,7 @@ def test_a_null_test_that_breaks_loses_no_comparison(monkeypatch):
 def test_a_signal_that_breaks_after_the_run_does_not_lose_it(monkeypatch):
     """The run has its own signals, and says which one is missing."""
     monkeypatch.setattr(simulating, "_contraction", breaks)
-    run = fp.simulate(PROBLEM, CONTROLLERS["CTC+FPI (eq 6)"], seed=0, compiled=False)
+    run = fp.simulate(brief(), compared()["CTC+FPI (eq 6)"], seed=0, compiled=False)
     assert run.cycles == 50
     assert "contraction" not in run.layout
     [sentence] = cast(list[str], run.settings["broken"])
@@ -95,7 +96,7 @@ def answers(monkeypatch, *texts):
         "known_questions",
         lambda kind: tuple(replace(q, ask=breaks) if q.text in texts else q for q in known(kind)),
     )
-    review = fp.review(PROBLEM, CONTROLLERS, mismatch=20.0, seed=0)
+    review = fp.review(brief(), compared(), mismatch=20.0, seed=0)
     return {a.question: a for a in review.problem}, {a.question: a for a in review.controllers["CTC+FPI (eq 6)"]}
 
 

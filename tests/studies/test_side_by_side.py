@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tasks
 
 import fpirhc as fp
 from fpirhc.errors import NoCode
@@ -23,7 +25,6 @@ from fpirhc.studies.sweep import Axis, sweep
 from fpirhc.studies.tune import tune
 from fpirhc.symbolic.native import Native, native
 
-TWO_MASS = fp.load_problem("two_mass")
 SMOOTH, ROUNDED = 1e-12, 1e-9  # relative; behind a quantum a last place is now and then a whole one
 _RESIDUALS = ("stationarity", "feasibility")  # differences of large numbers: rounding is all that is in them
 _SHORT: dict[str, Any] = {"duration": 2.0, "measure_from": 0.5}
@@ -33,16 +34,18 @@ def short(task: Task, **changes: Any) -> Task:
     return replace(task, problem=replace(task.problem, **{**_SHORT, **changes}))
 
 
-NOISY = short(
-    TWO_MASS,
-    disturbances={"q1": fp.Noise(0.3)},
-    sensing=fp.Sensing({"q1": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.05)}, fp.SavitzkyGolay(window=7, degree=4)),
+noisy = cache(
+    lambda: short(
+        tasks.two_mass,
+        disturbances={"q1": fp.Noise(0.3)},
+        sensing=fp.Sensing({"q1": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.05)}, fp.SavitzkyGolay(window=7, degree=4)),
+    )
 )
-STUDIES = {
-    "computed torque": (short(TWO_MASS), "CTC+FPI (eq 6)", SMOOTH),
-    "plans": (short(TWO_MASS), "RHC+FPI", SMOOTH),
-    "noise and lost samples": (NOISY, "CTC", ROUNDED),
-    "map": (fp.load_problem("fishery"), "CTC+FPI", SMOOTH),
+STUDIES: dict[str, Callable[[], tuple[Task, str, float]]] = {
+    "computed torque": lambda: (short(tasks.two_mass), "CTC+FPI (eq 6)", SMOOTH),
+    "plans": lambda: (short(tasks.two_mass), "RHC+FPI", SMOOTH),
+    "noise and lost samples": lambda: (noisy(), "CTC", ROUNDED),
+    "map": lambda: (tasks.fishery, "CTC+FPI", SMOOTH),
 }
 
 
@@ -69,7 +72,7 @@ def assert_equal(found: Mapping[str, Any], expected: Mapping[str, Any], close: f
 @pytest.mark.parametrize("name", STUDIES)
 def test_records_are_those_of_ordinary_runs(name: str) -> None:
     """Every metric, in every scenario with its own parameters and its own noise."""
-    task, controller, close = STUDIES[name]
+    task, controller, close = STUDIES[name]()
     conditions = Conditions(seed=5, use=COMPARING, percent=10.0, compiled=True)
     bench, ordinary = Bench(task, replace(conditions, side_by_side=True)), Bench(task, conditions)
     records = list(bench.records(range(11), controller))
@@ -80,7 +83,7 @@ def test_records_are_those_of_ordinary_runs(name: str) -> None:
 
 def test_a_record_does_not_depend_on_its_neighbours() -> None:
     """Bit by bit: so it is the same whoever computes it, and with whatever others."""
-    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
+    bench = Bench(noisy(), Conditions(5, COMPARING, 10.0, True, side_by_side=True))
     together = list(bench.records(range(12), "RHC+FPI"))
     assert next(bench.records([9], "RHC+FPI")) == together[9]
     assert list(bench.records([11, 3], "RHC+FPI")) == [together[11], together[3]]
@@ -90,7 +93,7 @@ def test_a_record_does_not_depend_on_its_neighbours() -> None:
 def test_a_run_that_ends_early_is_the_ordinary_one_and_its_neighbours_stay() -> None:
     """A gain far beyond its limit makes the iteration run away; the lane of the stable gain does not notice."""
     controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.BeyondLimit(fp.Affine(gain=-0.5)))
-    task = short(TWO_MASS, limits=fp.Limits())
+    task = short(tasks.two_mass, limits=fp.Limits())
     task = replace(task, controllers={"wild": controller})
     path, conditions = "deformation.map.gain", Conditions(0, COMPARING, 5.0, True)
     live = {"wild": (path,)}
@@ -106,8 +109,8 @@ def test_a_run_that_ends_early_is_the_ordinary_one_and_its_neighbours_stay() -> 
 def test_a_metric_of_whole_runs_and_a_solver_are_told() -> None:
     """They run one after the other, with the same records."""
     middle = fp.Metric("middle", lambda _, run: float(np.median(run["error.q1"])))
-    own = replace(short(TWO_MASS), metrics=(*TWO_MASS.metrics, middle))
-    limited = short(TWO_MASS, limits=fp.Limits(states={"q1": (-9.0, 9.0)}))
+    own = replace(short(tasks.two_mass), metrics=(*tasks.two_mass.metrics, middle))
+    limited = short(tasks.two_mass, limits=fp.Limits(states={"q1": (-9.0, 9.0)}))
     conditions = Conditions(0, COMPARING, 5.0, True)
     for task, name, why in ((own, "CTC", "the metric 'middle' reads whole runs"), (limited, "RHC", "not written")):
         bench, ordinary = Bench(task, replace(conditions, side_by_side=True)), Bench(task, conditions)
@@ -121,7 +124,7 @@ def test_cases_of_one_loop_are_measured_each_by_its_own_problem() -> None:
         "weight", lambda problem, run: problem.plant.parameters["m1"].exact * run["time"].item(-1), reads=("time",)
     )
     changes = {f"{k}": {"exact.m1": 1.0 + 0.01 * k, "measure_from": 0.5 + k % 2} for k in range(16)}
-    task = replace(short(TWO_MASS), metrics=(*TWO_MASS.metrics, weight), cases=fp.Cases(changes))
+    task = replace(short(tasks.two_mass), metrics=(*tasks.two_mass.metrics, weight), cases=fp.Cases(changes))
     conditions = Conditions(0, COMPARING, 0.0, True, named=True)
     bench, ordinary = Bench(task, replace(conditions, side_by_side=True)), Bench(task, conditions)
     records = list(bench.records(range(16), "CTC"))
@@ -132,7 +135,7 @@ def test_cases_of_one_loop_are_measured_each_by_its_own_problem() -> None:
 
 def test_one_case_that_cannot_be_summed_up_leaves_the_others_alone() -> None:
     """It runs as an ordinary run, and the records of the others are the same to the bit."""
-    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
+    bench = Bench(noisy(), Conditions(5, COMPARING, 10.0, True, side_by_side=True))
     together = list(bench.records(range(4), "CTC"))
     lanes = next(iter(bench._lanes.values()))
     plain, odd = lanes._sums.start, bench._scenario(2).problem
@@ -159,8 +162,8 @@ def test_a_loop_without_lanes_is_built_once_for_every_run_at_most(monkeypatch: p
     monkeypatch.setattr("fpirhc.studies.scenarios.bench.built", counted)
     monkeypatch.setattr("fpirhc.simulation.simulate.Simulator.remembers", True)
     own = replace(
-        short(TWO_MASS),
-        metrics=(fp.Metric("middle", lambda _, run: float(np.median(run["error.q1"]))), *TWO_MASS.metrics),
+        short(tasks.two_mass),
+        metrics=(fp.Metric("middle", lambda _, run: float(np.median(run["error.q1"]))), *tasks.two_mass.metrics),
     )
     bench = Bench(own, Conditions(0, COMPARING, 5.0, True, side_by_side=True))
     for block in bench.blocks("CTC", range(4)):
@@ -171,7 +174,7 @@ def test_a_loop_without_lanes_is_built_once_for_every_run_at_most(monkeypatch: p
 
 def test_what_a_figure_reads_is_kept() -> None:
     """Figures of a problem file are functions of one signal, of which every cycle is kept."""
-    task = replace(short(TWO_MASS), metrics=(*TWO_MASS.metrics, fp.figures.InBand("state.q1", -1.0, 1.0)))
+    task = replace(short(tasks.two_mass), metrics=(*tasks.two_mass.metrics, fp.figures.InBand("state.q1", -1.0, 1.0)))
     conditions = Conditions(0, COMPARING, 5.0, True)
     bench, ordinary = Bench(task, replace(conditions, side_by_side=True)), Bench(task, conditions)
     [record] = bench.records([3], "CTC")
@@ -182,7 +185,7 @@ def test_what_a_figure_reads_is_kept() -> None:
 def test_scenarios_side_by_side_are_those_one_after_the_other(tmp_path: Path) -> None:
     """Statistics, and the records of two processes bit by bit; what was begun one by one goes on so, and says it."""
     settings: dict[str, Any] = {"count": 70, "percent": 10.0, "seed": 2, "controllers": ["CTC", "CTC+FPI (eq 6)"]}
-    task = TWO_MASS
+    task = tasks.two_mass
     lanes = compare_scenarios(task, folder=tmp_path / "lanes", **settings)
     plain = compare_scenarios(task, folder=tmp_path / "plain", **{**settings, "count": 12})
     assert not lanes.apart
@@ -201,7 +204,7 @@ def test_scenarios_side_by_side_are_those_one_after_the_other(tmp_path: Path) ->
 def test_a_sweep_side_by_side_is_the_sweep_of_single_runs(tmp_path: Path) -> None:
     """Parameters and a live gain, of which some values are refused."""
     axes = [Axis.parsed("deformation.gain=-3:-0.2:8"), Axis.parsed("exact.m1=0.5:2:8")]
-    task = short(TWO_MASS)
+    task = short(tasks.two_mass)
     lanes = sweep(task, axes, folder=tmp_path / "lanes", controllers=["CTC+FPI (eq 6)"]).maps[0]
     plain = sweep(task, axes, folder=tmp_path / "plain", controllers=["CTC+FPI (eq 6)"], compiled=False).maps[0]
     assert not lanes.apart
@@ -212,7 +215,7 @@ def test_a_sweep_side_by_side_is_the_sweep_of_single_runs(tmp_path: Path) -> Non
 
 def test_costs_of_a_search_are_those_of_single_runs(tmp_path: Path) -> None:
     spans = {"CTC+FPI (eq 6)": {"deformation.gain": fp.LogSpan(-1.2, -0.2)}}
-    task = replace(short(TWO_MASS), tuning=spans)
+    task = replace(short(tasks.two_mass), tuning=spans)
     settings: dict[str, Any] = {"trials": 3, "seed": 1, "count": 32, "percent": 10.0, "controllers": list(spans)}
     lanes = tune(task, folder=tmp_path / "lanes", **settings).entries[0]
     plain = tune(task, folder=tmp_path / "plain", **settings, compiled=False).entries[0]
@@ -224,7 +227,7 @@ def test_costs_of_a_search_are_those_of_single_runs(tmp_path: Path) -> None:
 
 def test_lanes_keep_to_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs take turns where their noise needs more room, and are the same."""
-    bench = Bench(NOISY, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
+    bench = Bench(noisy(), Conditions(5, COMPARING, 10.0, True, side_by_side=True))
     together = list(bench.records(range(20), "CTC"))
     monkeypatch.setattr("fpirhc.simulation.lanes._ROOM", 1)
     assert list(bench.records(range(20), "CTC")) == together
@@ -240,7 +243,7 @@ def test_a_map_over_starts_has_one_loop(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("fpirhc.simulation.simulate.native", counted)
     axes = [Axis.parsed("start.q1=1:3.4:4"), Axis.parsed("start.q1'=-4:4:4")]
-    task = short(TWO_MASS)
+    task = short(tasks.two_mass)
     found = sweep(task, axes, folder=tmp_path, controllers=["RHC"]).maps[0]
     assert len(compiled) == 1
     assert not found.apart
@@ -255,7 +258,7 @@ def test_a_map_over_starts_has_one_loop(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_population_is_judged_as_its_members_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     """Every trial has the cost of a search that runs its trials one after the other in scenarios one after the other."""
     spans = {"CTC+FPI (eq 6)": {"deformation.gain": fp.LogSpan(-1.2, -0.2)}}
-    task = replace(short(TWO_MASS), tuning=spans)
+    task = replace(short(tasks.two_mass), tuning=spans)
     settings: dict[str, Any] = {"trials": 24, "seed": 1, "count": 3, "percent": 10.0, "population": 8}
     whole = tune(task, folder=tmp_path / "whole", **settings)
     plain = tune(task, folder=tmp_path / "plain", **settings, compiled=False)
@@ -291,6 +294,6 @@ def test_a_worker_has_the_scenarios_of_a_register_for_all_controllers() -> None:
 
     numbers = list(range(64))
     jobs = [(numbers, "CTC"), (numbers, "RHC"), ([64], "CTC"), ([64], "RHC")]
-    bench = Bench(TWO_MASS, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
+    bench = Bench(tasks.two_mass, Conditions(5, COMPARING, 10.0, True, side_by_side=True))
     assert not list(scenario_study._answers(bench, _Listening(), jobs))  # type: ignore[arg-type]
     assert seen == [jobs[:2], jobs[2:3], jobs[3:]]

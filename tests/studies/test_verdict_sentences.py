@@ -38,6 +38,7 @@ def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, erro
     values += [
         np.asarray(changes.get(n, np.arange(CYCLES) % 2), dtype=float)[:, None] for n in ("command", "reference")
     ]
+    signals, values = [*signals, Signal("true_error", ("y", "z"), ("m", "rad"))], [*values, values[0]]
     if changes.get("planning"):
         signals, values = [*signals, Signal("solve", SOLVE)], [*values, np.zeros((CYCLES, len(SOLVE)))]
     log = np.hstack(values)[: changes.get("cycles", CYCLES)]

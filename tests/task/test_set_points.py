@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+import tasks
 from plants import chain
 from scipy.linalg import expm
 from scipy.special import comb
@@ -24,7 +25,6 @@ from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.symbolic.native import native
 from fpirhc.task.set_point import transition
 
-TWO_MASS = fp.load_problem("two_mass")
 STEPS = {"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": [(0.0, 5.4), (0.1, 5.6), (0.2, 5.3)]}
 
 
@@ -35,7 +35,7 @@ def on(problem, reference, duration=0.3):
 
 def two_mass(duration=0.3, **changes):
     """two_mass with set-points that change."""
-    return on(TWO_MASS.problem, fp.Setpoint(**{"values": STEPS, "rate": 10.0, **changes}), duration)
+    return on(tasks.two_mass.problem, fp.Setpoint(**{"values": STEPS, "rate": 10.0, **changes}), duration)
 
 
 def closed_form(rate, order, starts, steps):
@@ -96,37 +96,38 @@ SHIPPED = {
 LONG = ("RHC, absolute effort", "RHC+FPI, absolute effort", "RHC, stiff", "RHC+FPI, stiff, small S")
 
 
-@pytest.mark.parametrize(
-    ("name", "controller"), [(n, c) for n in SHIPPED for c in fp.load_problem(n).controllers if c not in LONG]
-)
-def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(name, controller):
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(name):
     """The same motion as a trajectory: only rounding differs.
 
     A plan adds nothing of its own, because its scale and first plan follow from the nominal motion, which is the same.
     """
-    task, (aims, order) = fp.load_problem(name), SHIPPED[name]
+    task, (aims, order) = getattr(tasks, name), SHIPPED[name]
     problem = task.problem
     starts = {c: float(problem.start.get(c, 0.0)) for c in problem.plant.names}
     rate = 8.0
     ours = on(problem, fp.Setpoint(aims, rate=rate, order=order, start=starts), 0.2)
     theirs = on(problem, closed_form(rate, order, starts, {c: [(0.0, w)] for c, w in aims.items()}), 0.2)
-    runs = [fp.simulate(p, task.controllers[controller], seed=0, compiled=False) for p in (ours, theirs)]
-    assert runs[0].cycles == runs[1].cycles > 0
-    states = [run["plant_state"] for run in runs]
-    assert np.ptp(states[1], axis=0).max() > 1e-3  # it does move
-    scale = np.maximum(1.0, np.abs(states[1]).max())
-    assert np.abs(states[0] - states[1]).max() < 1e-12 * scale
-    np.testing.assert_allclose(runs[0]["reference"], runs[1]["reference"], rtol=0, atol=1e-12)
-    if "cost" in runs[0].layout:
-        np.testing.assert_allclose(runs[0]["cost"], runs[1]["cost"], rtol=1e-6, atol=1e-9)
+    for controller in (one for label, one in task.controllers.items() if label not in LONG):
+        runs = [fp.simulate(p, controller, seed=0, compiled=False) for p in (ours, theirs)]
+        assert runs[0].cycles == runs[1].cycles > 0
+        states = [run["plant_state"] for run in runs]
+        assert np.ptp(states[1], axis=0).max() > 1e-3, controller  # it does move
+        scale = np.maximum(1.0, np.abs(states[1]).max())
+        assert np.abs(states[0] - states[1]).max() < 1e-12 * scale, controller
+        np.testing.assert_allclose(
+            runs[0]["reference"], runs[1]["reference"], rtol=0, atol=1e-12, err_msg=repr(controller)
+        )
+        if "cost" in runs[0].layout:
+            np.testing.assert_allclose(runs[0]["cost"], runs[1]["cost"], rtol=1e-6, atol=1e-9, err_msg=repr(controller))
 
 
 @pytest.mark.parametrize("controller", ["CTC", "CTC+FPI (eq 6)"])
 def test_steps_within_a_run_equal_the_trajectory(controller):
     """The law holds through changes where no horizon knows them ahead: 1e-12 of states, motions and responses."""
     starts = {"q1": 2.2, "q2": 5.4}
-    problems = two_mass(), on(TWO_MASS.problem, closed_form(10.0, 2, starts, STEPS))
-    ours, theirs = (fp.simulate(p, TWO_MASS.controllers[controller], seed=0, compiled=False) for p in problems)
+    problems = two_mass(), on(tasks.two_mass.problem, closed_form(10.0, 2, starts, STEPS))
+    ours, theirs = (fp.simulate(p, tasks.two_mass.controllers[controller], seed=0, compiled=False) for p in problems)
     for signal in ("state", "reference", "desired"):
         np.testing.assert_allclose(ours[signal], theirs[signal], rtol=0, atol=1e-11 if signal == "desired" else 1e-12)
 
@@ -137,10 +138,10 @@ def test_stages_of_several_lengths_see_the_motion_of_the_filter(controller):
     starts, steps = {"q1": 2.2, "q2": 5.4}, {"q1": [(0.0, 2.5)], "q2": [(0.0, 5.0)]}
     known = closed_form(10.0, 2, starts, {"q1": [(0.0, 2.2), (0.0, 2.5)], "q2": [(0.0, 5.4), (0.0, 5.0)]})
     runs = []
-    for problem in (two_mass(values=steps, start=starts), on(TWO_MASS.problem, known)):
+    for problem in (two_mass(values=steps, start=starts), on(tasks.two_mass.problem, known)):
         lengths = tuple(1.0 + 0.5 * (k // 3) for k in range(problem.horizon.stages))
         task = replace(problem, horizon=replace(problem.horizon, lengths=lengths), duration=0.1)
-        runs.append(fp.simulate(task, TWO_MASS.controllers[controller], seed=0, compiled=False))
+        runs.append(fp.simulate(task, tasks.two_mass.controllers[controller], seed=0, compiled=False))
     ours, theirs = runs
     assert np.abs(ours["reference"] - ours["reference"][0]).max() > 0.05
     np.testing.assert_allclose(ours["planned"], theirs["planned"], rtol=0, atol=1e-8)
@@ -148,10 +149,10 @@ def test_stages_of_several_lengths_see_the_motion_of_the_filter(controller):
 
 def test_a_horizon_knows_announced_set_points_and_no_others():
     """Announced steps at nodes of the horizon equal the trajectory; unannounced ones move nothing before their time."""
-    controller, starts = TWO_MASS.controllers["RHC+FPI"], {"q1": 2.2, "q2": 5.4}
+    controller, starts = tasks.two_mass.controllers["RHC+FPI"], {"q1": 2.2, "q2": 5.4}
     steps = {"q1": [(0.0, 2.2), (0.25, 2.4)], "q2": [(0.0, 5.4), (0.25, 5.2)]}
     announced = two_mass(values=steps, announced=True)
-    known = on(TWO_MASS.problem, closed_form(10.0, 2, starts, steps))
+    known = on(tasks.two_mass.problem, closed_form(10.0, 2, starts, steps))
     surprise, still = two_mass(values=steps), two_mass(values=starts)
     a, b, c, d = (fp.simulate(p, controller, seed=0, compiled=False) for p in (announced, known, surprise, still))
     np.testing.assert_allclose(a["state"], b["state"], rtol=0, atol=1e-12)
@@ -174,10 +175,10 @@ def test_changed_equals_rebuilt_without_another_build(controller, compiled, monk
     # The first horizon ends at 0.2 s: scale and first plan of both are those of the same nominal motion.
     others = {"q1": [(0.0, 2.2), (0.22, 2.5)], "q2": [(0.0, 5.4), (0.25, 5.1)]}
     quiet = two_mass(values={"q1": 2.2, "q2": 5.4})
-    ready = fp.simulator(quiet, TWO_MASS.controllers[controller], compiled=compiled)
+    ready = fp.simulator(quiet, tasks.two_mass.controllers[controller], compiled=compiled)
     first, changed = ready.run(seed=0), ready.run(seed=0, setpoints=others)
     assert len(builds) == int(compiled)
-    rebuilt = fp.simulate(two_mass(values=others), TWO_MASS.controllers[controller], seed=0, compiled=compiled)
+    rebuilt = fp.simulate(two_mass(values=others), tasks.two_mass.controllers[controller], seed=0, compiled=compiled)
     np.testing.assert_array_equal(changed["command"], rebuilt["command"])
     np.testing.assert_array_equal(changed["reference"], rebuilt["reference"])
     assert np.abs(changed["command"] - first["command"]).max() > 0.1
@@ -188,7 +189,7 @@ def test_changed_equals_rebuilt_without_another_build(controller, compiled, monk
 def test_stepper_agrees_with_the_loop(announced):
     """Stepped with what the loop saw, and with the set-points when they change, the stepper gives the loop's commands."""
     problem = two_mass(announced=announced)
-    controller = TWO_MASS.controllers["RHC+FPI" if announced else "CTC+FPI (eq 6)"]
+    controller = tasks.two_mass.controllers["RHC+FPI" if announced else "CTC+FPI (eq 6)"]
     run = fp.simulate(problem, controller, seed=0, compiled=False)
     stepper = fp.Stepper(problem, controller, compiled=False)
     memory, step = stepper.start(), problem.horizon.step
@@ -205,7 +206,7 @@ def test_a_step_without_set_points_keeps_the_old_ones():
     """Refused set-points leave all old ones in force, are counted, and have a reason."""
     problem = two_mass(values={"q1": 2.2, "q2": 5.4})
     problem = replace(problem, limits=replace(problem.limits, states={"q1": (1.0, 3.0)}))
-    stepper = fp.Stepper(problem, TWO_MASS.controllers["CTC"], compiled=False)
+    stepper = fp.Stepper(problem, tasks.two_mass.controllers["CTC"], compiled=False)
     sample = 0.0, problem.start_state, np.zeros(2), stepper.start()
     stepper.step(*sample, setpoints={"q1": 2.5})
     assert stepper.setpoints == {"q1": 2.5, "q2": 5.4}
@@ -238,7 +239,7 @@ def test_a_step_without_set_points_keeps_the_old_ones():
     ],
 )
 def test_bad_set_points_of_a_run(setpoints, error, words):
-    ready = fp.simulator(two_mass(), TWO_MASS.controllers["CTC"], compiled=False)
+    ready = fp.simulator(two_mass(), tasks.two_mass.controllers["CTC"], compiled=False)
     with pytest.raises(error, match=words):
         ready.run(seed=0, setpoints=setpoints)
 
@@ -254,17 +255,19 @@ def test_bad_references():
             two_mass(**changes)
     with pytest.raises(InvalidProblem, match="start: coordinate 'q5' is unknown"):
         fp.Setpoint(STEPS, rate=1.0, start={"q5": 0.0})
-    limited = replace(TWO_MASS.problem.limits, states={"q1": (2.0, 2.3)})
+    limited = replace(tasks.two_mass.problem.limits, states={"q1": (2.0, 2.3)})
     with pytest.raises(InvalidProblem, match=r"'q1' is 2\.4, outside its limits of 2 to 2\.3"):
         replace(two_mass(), limits=limited)
     replace(two_mass(), limits=replace(limited, soft={"q1": 1.0}))  # a limit with a price may be passed
     with pytest.raises(InvalidName, match="a Trajectory, has no set-points"):
-        fp.simulate(TWO_MASS.problem, TWO_MASS.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": 1.0})
+        fp.simulate(
+            tasks.two_mass.problem, tasks.two_mass.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": 1.0}
+        )
 
 
 def test_functions_of_time():
     """A function of time is sampled in every cycle; steps are the function that jumps."""
-    ready = fp.simulator(two_mass(), TWO_MASS.controllers["CTC+FPI (eq 6)"], compiled=False)
+    ready = fp.simulator(two_mass(), tasks.two_mass.controllers["CTC+FPI (eq 6)"], compiled=False)
     functions = {n: lambda t, s=s: [v for at, v in s if at <= t + 1e-9][-1] for n, s in STEPS.items()}
     sampled, stepped = ready.run(seed=0, setpoints=functions), ready.run(seed=0)
     np.testing.assert_array_equal(sampled.log, stepped.log)
@@ -274,7 +277,11 @@ def test_functions_of_time():
 def test_run_and_file_record_what_was_in_force(tmp_path):
     """Signal 'setpoint' has it cycle by cycle, the facts have it as steps; the terminal shows it."""
     run = fp.simulate(
-        two_mass(), TWO_MASS.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": [(0.0, 2.2), (0.0505, 2.3)]}
+        two_mass(),
+        tasks.two_mass.controllers["CTC"],
+        seed=0,
+        compiled=False,
+        setpoints={"q1": [(0.0, 2.2), (0.0505, 2.3)]},
     )
     run.save(tmp_path / "run.npz")
     again = load_run(tmp_path / "run.npz")
@@ -289,7 +296,7 @@ def test_run_and_file_record_what_was_in_force(tmp_path):
 def test_live_rate_of_the_filter(name, compiled):
     """Changed equals rebuilt bit by bit, also with a plan whose reference rests over the first horizon."""
     steps = {"q1": [(0.0, 2.2), (0.21, 2.4)], "q2": 5.4}
-    controller = TWO_MASS.controllers[name]
+    controller = tasks.two_mass.controllers[name]
     ready = fp.simulator(two_mass(values=steps), controller, compiled=compiled, live=["reference.rate"])
     changed = ready.run(seed=0, settings={"reference.rate": 7.3})
     rebuilt = fp.simulate(two_mass(values=steps, rate=7.3), controller, seed=0, compiled=compiled)
@@ -299,13 +306,13 @@ def test_live_rate_of_the_filter(name, compiled):
 
 def test_a_live_rate_moves_the_first_horizon():
     """The optimiser's scale and the first plan follow the rate, as those of a loop that is built with it."""
-    ready = fp.simulator(two_mass(), TWO_MASS.controllers["RHC"], compiled=False, live=["reference.rate"])
+    ready = fp.simulator(two_mass(), tasks.two_mass.controllers["RHC"], compiled=False, live=["reference.rate"])
     changed = ready.run(seed=0, settings={"reference.rate": 7.3})
-    rebuilt = fp.simulate(two_mass(rate=7.3), TWO_MASS.controllers["RHC"], seed=0, compiled=False)
+    rebuilt = fp.simulate(two_mass(rate=7.3), tasks.two_mass.controllers["RHC"], seed=0, compiled=False)
     size = np.abs(rebuilt["command"]).max()
     np.testing.assert_allclose(changed["command"], rebuilt["command"], rtol=0, atol=1e-11 * size)
     with pytest.raises(InvalidName, match=r"reference"):
-        fp.simulator(two_mass(), TWO_MASS.controllers["CTC"], compiled=False, live=["referense.rate"])
+        fp.simulator(two_mass(), tasks.two_mass.controllers["CTC"], compiled=False, live=["referense.rate"])
 
 
 def test_slots_need_the_order_of_their_chain():
@@ -321,9 +328,11 @@ def test_a_higher_filter_makes_a_step_smooth():
     steps = {"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": 5.4}
     jumps = []
     for order in (2, 3):
-        run = fp.simulate(two_mass(values=steps, order=order), TWO_MASS.controllers["CTC"], seed=0, compiled=False)
+        run = fp.simulate(
+            two_mass(values=steps, order=order), tasks.two_mass.controllers["CTC"], seed=0, compiled=False
+        )
         jumps.append(abs(np.diff(run["command.Q1"])[99]))
-    mass = TWO_MASS.problem.plant.parameters["m1"].approximate
+    mass = tasks.two_mass.problem.plant.parameters["m1"].approximate
     assert jumps[0] == pytest.approx(mass * 10.0**2 * 0.2, rel=0.02)
     assert jumps[1] < 0.02 * jumps[0]
 
@@ -374,7 +383,7 @@ def test_unannounced_steps_of_two_mass():
     steps = {"q1": [(0.0, 2.2), (1.0, 2.4), (2.0, 2.2)], "q2": [(0.0, 5.4), (1.0, 5.6), (2.0, 5.4)]}
     problem, errors, jumps = two_mass(3.0, values=steps, rate=6.0), {}, {}
     for name in ("RHC", "RHC+FPI"):
-        run = fp.simulate(problem, TWO_MASS.controllers[name], seed=0)
+        run = fp.simulate(problem, tasks.two_mass.controllers[name], seed=0)
         late = run.time > 0.9
         errors[name] = np.abs(run["error"][late]).max(axis=0)
         jumps[name] = np.abs(np.diff(run["command"][late], axis=0)).max()
@@ -404,19 +413,21 @@ def test_a_stepper_names_set_points_of_outputs():
 
 def test_plans_towards_set_points_have_no_gap():
     """The nominal motion knows steps that the plans did not know: their cost is not compared with an optimum along it."""
-    problem, controller = two_mass(0.03), TWO_MASS.controllers["RHC"]
+    problem, controller = two_mass(0.03), tasks.two_mass.controllers["RHC"]
     run = fp.simulate(problem, controller, seed=0, compiled=False)
     assert measure_optimality(problem, controller, run, compiled=False) is None
-    along = on(TWO_MASS.problem, TWO_MASS.problem.reference, 0.03)
+    along = on(tasks.two_mass.problem, tasks.two_mass.problem.reference, 0.03)
     assert measure_optimality(along, controller, fp.simulate(along, controller, seed=0, compiled=False), compiled=False)
 
 
 def test_other_references_are_given_nothing():
     """A loop along a trajectory reads no set-points and has no block of the reference's own."""
-    loop = close_loop(TWO_MASS.problem, TWO_MASS.controllers["RHC+FPI"])
+    loop = close_loop(tasks.two_mass.problem, tasks.two_mass.controllers["RHC+FPI"])
     assert "setpoints" not in loop.reads
-    assert TWO_MASS.problem.reference.block(TWO_MASS.problem.plant, 20, 1e-3) is None
-    run = fp.simulate(on(TWO_MASS.problem, TWO_MASS.problem.reference, 0.01), TWO_MASS.controllers["CTC"], seed=0)
+    assert tasks.two_mass.problem.reference.block(tasks.two_mass.problem.plant, 20, 1e-3) is None
+    run = fp.simulate(
+        on(tasks.two_mass.problem, tasks.two_mass.problem.reference, 0.01), tasks.two_mass.controllers["CTC"], seed=0
+    )
     assert "setpoint" not in run.layout
     assert "setpoints" not in run.settings
 
