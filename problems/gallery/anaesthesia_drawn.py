@@ -41,7 +41,8 @@ Each is the least and the most of three seeds of the noise:
     cascade in mg/l, tuned here         0.0 to 0.0    26.4 to 27.0  86.2 to 86.4  15 to 17
 
 No controller passes, with at least 90, 37 and 97, and none that was tuned here does. Two people no controller can serve: with the
-pump's largest target, 12 mg/l, from the beginning on, D066 is in the range after half an hour and D078 never, at 64. For the others
+pump's largest target, 12 mg/l, from the beginning on, D066 is in the range after half an hour and D078 never, at 64. So nobody can
+pass on the second half. For the others
 `python benchmarks/patients.py anaesthesia_drawn --reasons` gives everybody one thing as the controllers believe it. Of fifty, those
 in the range for less than 90 % of the time, and the lowest bis, with the PID law that was tuned here and seed 0:
 

@@ -35,7 +35,8 @@ into the gap. A plan with the wrong model lowers the signs some minutes too late
 With the demands of the source, up to 1500 veh/h at the ramp, the signs stay beyond what is driven and save nothing. In the
 published run they cost 0.1 veh h: it spends 102.08 in 100 steps, and the metered one 101.98. There the signs stood at the speeds
 of the start, and five rates are ahead. The same program, with zeros as the first guess, has the published rates and signs, within
-0.02. Its solver ends the first plan after 500 iterations, short of a minimum, and begins with a rate of 0.35 that nothing asks for.
+0.02. Its solver ends the first plan after 500 iterations, short of a minimum, and begins with a rate of 0.35 that nothing asks for:
+by the source's own cost of seven minutes that plan is at 37.863 veh h, and an open ramp with standing signs at 37.815, the minimum.
 From where plans begin here, IPOPT spends 0.09 veh h less than the published run in 96 steps, with the ramp open until minute six.
 """
 

@@ -244,7 +244,7 @@ def test_the_published_signs_are_no_minimum() -> None:
 def test_the_program_of_the_source_has_its_signs_and_rates() -> None:
     """States and inputs of a horizon, zeros as the first guess, and IPOPT, as there; its first plan ends after 500 iterations."""
     plant = over(task("freeway_coordinated").problem.plant, T)
-    program, iterations = program_of_source(plant), list[int]()
+    program, iterations, costs = program_of_source(plant), list[int](), list[float]()
     parameters = with_demands(plant, 100 + STEPS)
     state, last = np.array(task("freeway_coordinated").problem.start_state), np.array([1.0, 78.0, 72.5])
     guess: Any = 0.0
@@ -254,11 +254,33 @@ def test_the_program_of_the_source_has_its_signs_and_rates() -> None:
         found = program(x0=guess, p=np.concatenate([state[:ROAD], last, ahead]), **bounds_of_source())
         guess, count = found["x"].full().ravel(), (STEPS + 1) * ROAD
         iterations.append(program.stats()["iter_count"])
+        costs.append(float(found["f"]))
         last = guess[count : count + 3]
         assert last == pytest.approx(wanted, abs=0.02)
         for row in parameters[k : k + 6]:
             state = np.ravel(stepper(plant)(state, last, row).full())
     assert iterations[0] == 500
+    assert costs[0] == pytest.approx(37.8634, abs=1e-3)
+
+
+def test_the_first_plan_of_the_source_is_no_minimum() -> None:
+    """Its program, from an open ramp and signs that stand: another plan costs .05 veh h less in seven minutes, a part in 800.
+
+    So the cost hardly tells the two apart, and rates that differ by .65 are as good.
+    """
+    plant = over(task("freeway_coordinated").problem.plant, T)
+    parameters, start = with_demands(plant, STEPS), np.array(task("freeway_coordinated").problem.start_state)
+    standing = np.array([1.0, 78.0, 72.5])
+    states = [start]
+    for row in parameters[:STEPS]:
+        states.append(np.ravel(stepper(plant)(states[-1], standing, row).full()))
+    guess = np.concatenate([np.array(states)[:, :ROAD].ravel(), np.tile(standing, RATES)])
+    given = np.concatenate([start[:ROAD], standing, parameters[:STEPS].ravel()])
+    program = program_of_source(plant)
+    found = program(x0=guess, p=given, **bounds_of_source())
+    assert program.stats()["success"]
+    assert float(found["f"]) == pytest.approx(37.8151, abs=1e-3)
+    assert found["x"].full()[-3 * RATES :].ravel() == pytest.approx(np.tile(standing, RATES), abs=0.05)
 
 
 ROAD, STEPS, RATES = (
@@ -441,6 +463,25 @@ def test_a_pi_law_is_as_good() -> None:
         for variant, number in zip(variants, numbers, strict=True):
             run = fp.simulate(variant, shipped[name], seed=0, compiled=False)
             assert fp.measure(variant, run).rms_error["emission"] == pytest.approx(float(number), abs=0.06), name
+    cascade = shipped["static map+FPI"]
+    larger = replace(cascade, deformation=fp.Affine(gain=-3.5))
+    for variant, error in zip(variants, (1.1, 2.9, 6.7), strict=True):
+        run = fp.simulate(variant, larger, seed=0, compiled=False)
+        assert fp.measure(variant, run).rms_error["emission"] == pytest.approx(error, abs=0.06)
+
+
+@pytest.mark.parametrize("law", ["iteration", "PI"])
+def test_both_gains_have_room(law: str) -> None:
+    """Nothing swings with the smaller of the two multiples in the description, and the light does with the larger one."""
+    problem, cascade = task("freeway").problem, task("freeway").controllers["static map+FPI"]
+    laws: dict[str, list[Any]] = {
+        "iteration": [replace(cascade, deformation=fp.Affine(gain=-2.5 * times)) for times in (1.0, 2.8, 3.2)],
+        "PI": [fp.PID({"emission": 0.006 * times}, {"emission": 0.4 * times}) for times in (1.0, 2.0, 3.0)],
+    }
+    runs = [fp.simulate(problem, one, seed=0, compiled=False) for one in laws[law]]
+    own, near, beyond = (fp.measure(problem, run).total_variation["r"] for run in runs)
+    assert near == pytest.approx(own, rel=0.05)
+    assert beyond > 10 * own
 
 
 class Road:

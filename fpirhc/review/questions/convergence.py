@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -188,14 +189,8 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     if left_out:
         text += f", beside those of the states that move by themselves, {float(loops.radii.max()):.6g}"
     numbers = {"radius": worst, "smallest_radius": float(radii.min())}
-    deformation = controller.deformation
-    if not deformation.iteration.constant or loops.learns:
-        what = (
-            f"{type(controller).__name__} changes its model"
-            if loops.learns
-            else f"{_changing(deformation)} changes its map"
-        )
-        change = f"{what} on line; the factor is that of the first cycle."
+    if changing := _changing_on_line(controller, loops):
+        change = f"{changing} on line; the factor is that of the first cycle."
         return Answer(CONVERGES, Verdict.UNKNOWN, text, change, numbers)
     if growth.min() > _SURE:
         return Answer(
@@ -215,10 +210,23 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
 
 
 def _converges(case: Case) -> Answer:
-    """The verdict; where there is no linear loop, runs decide."""
+    """The verdict; where there is no linear loop, or only that of the first cycle, runs decide."""
     if not case.loops.loops:
         return by_run(case, CONVERGES, f"no linear loop: {case.loops.reason}")
-    return converges(case.grid, case.controller, case.loops, case.doubts)
+    answer = converges(case.grid, case.controller, case.loops, case.doubts)
+    changing = _changing_on_line(case.controller, case.loops)
+    if not changing:
+        return answer
+    ran = by_run(case, CONVERGES, f"{answer.evidence} in the first cycle; {changing} on line")
+    return replace(ran, numbers={**answer.numbers, **ran.numbers})
+
+
+def _changing_on_line(controller: Controller, loops: Loops) -> str:
+    """What changes while the controller runs, for the beginning of a sentence; empty where nothing does."""
+    if loops.learns:
+        return f"{type(controller).__name__} changes its model"
+    constant = controller.deformation.iteration.constant
+    return "" if constant else f"{_changing(controller.deformation)} changes its map"
 
 
 def _changing(deformation: Deformation) -> str:

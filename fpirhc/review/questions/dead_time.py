@@ -7,6 +7,7 @@ dead time is made longer and shorter by 1, 2, 5, ... cycles, for all inputs toge
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from fpirhc.review.grid import is_late, scaled
 from fpirhc.review.prediction import CYCLES
 from fpirhc.review.question import SEE_CONVERGENCE, Answer, Case, ControllerQuestion, Verdict, judged
 from fpirhc.review.questions.margins import margins
+from fpirhc.review.questions.reality import real_loops
+from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.trials import ErrorPair, errors_of
@@ -106,22 +109,57 @@ def bears_latency(case: Case) -> Answer | None:
     late = is_late(case.problem) or (pairing is not None and pairing.cycles != 0)
     if late or not deformation.adapts or not loops.loops or loops.radii.max() >= 1:
         return None
-    inputs = range(len(case.problem.plant.inputs))
-    radii = [_radius(case, [*inputs], cycles) for cycles in range(1, _LATENCY + 1)]
+    model = [loops.loops[k] for k in {0, int(np.argmax(loops.radii))}]
+    answer = _latency_of(case, model, "")
+    real = _real_pair(case, case.controller)
+    beside = _latency_of(case, real, "with the reality, ") if real else answer
+    return beside if beside.numbers["borne"] < answer.numbers["borne"] else answer
+
+
+def _latency_of(case: Case, loops: Sequence[LinearLoop], whose: str) -> Answer:
+    """The answer of some loops.
+
+    Args:
+        whose: beginning of the evidence for loops with the reality; empty for those of the model.
+    """
+    radii = [_later(case, loops, cycles) for cycles in range(1, _LATENCY + 1)]
     borne = next((k for k, radius in enumerate(radii) if radius >= 1), _LATENCY)
     numbers = {"borne": float(borne)}
     if borne == _LATENCY:
-        text = f"{_LATENCY} cycles later, the slowest mode is multiplied by {radii[-1]:.6g} per cycle"
+        text = f"{whose}{_LATENCY} cycles later, the slowest mode is multiplied by {radii[-1]:.6g} per cycle"
         return Answer(UNSTATED, Verdict.YES, text, "", numbers)
     later = "1 cycle" if borne == 0 else f"{borne + 1} cycles"
-    text = f"{later} later, the slowest mode is multiplied by {radii[borne]:.6g} per cycle; it bears {borne}"
-    share = _share_that_bears(case)
+    text = f"{whose}{later} later, the slowest mode is multiplied by {radii[borne]:.6g} per cycle; it bears {borne}"
     measure = "measure the latency and state it, Problem(dead_time=...)"
+    share = None if whose else _share_that_bears(case)
     if share is None:
-        lower = "Lower the gain" if case.by_gain is None else "No lower gain bears them"
+        lower = "Lower the gain" if _may_help(case, whose) else "No lower gain bears them"
         return Answer(UNSTATED, Verdict.CAUTION, text, f"{lower}; {measure}.", numbers)
     change = f"{share:.2g} times the gain bears them, in this loop of the model; or {measure}."
     return Answer(UNSTATED, Verdict.CAUTION, text, change, {**numbers, "share": share})
+
+
+def _may_help(case: Case, whose: str) -> bool:
+    """Whether a lower gain may bear what this one does not: with the reality, where the loop without adaptation does."""
+    if not whose:
+        return case.by_gain is None
+    bare = _real_pair(case, without_deformation(case.controller))
+    return bool(bare) and max(_later(case, bare, cycles) for cycles in range(1, _LATENCY + 1)) < 1
+
+
+def _real_pair(case: Case, controller: Controller) -> list[LinearLoop]:
+    """The loop with the reality where it is slowest; none without a reality that has one, and where it grows by itself."""
+    try:
+        loops = real_loops(case.grid, controller) if case.grid.real is not None else []
+    except (FpirhcError, np.linalg.LinAlgError):
+        return []
+    slowest = max(loops, key=lambda one: one.radius, default=None)
+    return [slowest] if slowest is not None and slowest.radius < 1 else []
+
+
+def _later(case: Case, loops: Sequence[LinearLoop], cycles: int) -> float:
+    """Largest |pole| with all commands later by so many cycles."""
+    return max(one.delayed(range(len(case.problem.plant.inputs)), cycles).radius for one in loops)
 
 
 def _share_that_bears(case: Case) -> float | None:

@@ -21,7 +21,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import LoopsByGain, largest_product
 from fpirhc.review.prediction import NominalRuns
-from fpirhc.review.question import SEE_CONVERGENCE, Answer, Case, ControllerQuestion, Verdict
+from fpirhc.review.question import SEE_CONVERGENCE, Answer, Case, ControllerQuestion, Verdict, by_run
 from fpirhc.review.questions.margins import keeps_margins
 from fpirhc.review.questions.right_model import RIGHT_MODEL, leaves_right_model_alone
 from fpirhc.review.questions.speed import fast_enough, gain_times, plan_keeps_up
@@ -396,7 +396,17 @@ def _gain(case: Case) -> Answer | None:
     answer = _converging(case, gain_admissible(deformation, own, boxed, limit, advice), advice)
     if answer.verdict == Verdict.UNKNOWN and advice.why_not == OUTSIDE:
         return replace(answer, change="fpirhc probe measures them and recommends a gain.")
-    return answer
+    return _helping(case, answer)
+
+
+def _helping(case: Case, answer: Answer) -> Answer:
+    """The answer, or yes where a run with the gain in use, inside its limits, is better, though the recommended one did harm."""
+    null = case.answer(RIGHT_MODEL)
+    inside = 0 < answer.numbers["gain"] / answer.numbers["limit"] < 1 if answer.verdict == Verdict.UNKNOWN else False
+    if not inside or (null is not None and null.verdict == Verdict.NO):
+        return answer
+    ran = by_run(case, GAIN, answer.evidence)
+    return replace(ran, numbers={**answer.numbers, **ran.numbers}) if ran.verdict == Verdict.YES else answer
 
 
 def _converging(case: Case, answer: Answer, advice: Recommended) -> Answer:
