@@ -463,7 +463,7 @@ def test_a_pi_law_is_as_good() -> None:
         for variant, number in zip(variants, numbers, strict=True):
             run = fp.simulate(variant, shipped[name], seed=0, compiled=False)
             assert fp.measure(variant, run).rms_error["emission"] == pytest.approx(float(number), abs=0.06), name
-    cascade = shipped["static map+FPI"]
+    cascade: Any = shipped["static map+FPI"]
     larger = replace(cascade, deformation=fp.Affine(gain=-3.5))
     for variant, error in zip(variants, (1.1, 2.9, 6.7), strict=True):
         run = fp.simulate(variant, larger, seed=0, compiled=False)
@@ -473,7 +473,8 @@ def test_a_pi_law_is_as_good() -> None:
 @pytest.mark.parametrize("law", ["iteration", "PI"])
 def test_both_gains_have_room(law: str) -> None:
     """Nothing swings with the smaller of the two multiples in the description, and the light does with the larger one."""
-    problem, cascade = task("freeway").problem, task("freeway").controllers["static map+FPI"]
+    problem = task("freeway").problem
+    cascade: Any = task("freeway").controllers["static map+FPI"]
     laws: dict[str, list[Any]] = {
         "iteration": [replace(cascade, deformation=fp.Affine(gain=-2.5 * times)) for times in (1.0, 2.8, 3.2)],
         "PI": [fp.PID({"emission": 0.006 * times}, {"emission": 0.4 * times}) for times in (1.0, 2.0, 3.0)],

@@ -41,7 +41,7 @@ def test_a_latency_is_borne_as_the_reality_bears_it(of_the_ball):
     one = of_the_ball[UNSTATED]
     assert (one.verdict, one.numbers["borne"]) == ("caution", 1.0)
     assert one.change.startswith("No lower gain bears them; ")
-    task, errors = fp.load_problem("ball_on_plate"), []
+    task, errors = fp.load_problem("ball_on_plate"), list[float]()
     for cycles in (0, 3):
         late = fp.DeadTime(inputs=dict.fromkeys(("across", "along"), cycles * task.problem.period))
         problem = replace(task.problem, dead_time=late, duration=8.0)
