@@ -295,7 +295,8 @@ def _require_wired(reads: Layout, memory: Layout, blocks: Sequence[Block], delay
     sizes = {s.name: s.size for s in (*memory.signals, *reads.signals)}
     for block in blocks:
         for s in block.inputs.signals:
-            _require_size(f"block '{block.name}'", s, s.name, sizes)
+            if sizes.get(s.name) != s.size:
+                _require_size(f"block '{block.name}'", s, s.name, sizes)
         for s in block.writes.signals:
             if s.name in sizes:
                 raise InvalidName(f"block '{block.name}' writes '{s.name}', which is already written")

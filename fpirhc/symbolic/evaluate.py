@@ -11,6 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from operator import is_
 from typing import Generic, NoReturn, Protocol, TypeVar, cast
 
 import casadi as ca
@@ -173,7 +174,7 @@ class Latest(threading.local, Generic[T]):
             build: function without arguments.
         """
         for objects, others, result in tuple(self._known):
-            alike = len(objects) == len(same) and all(a is b for a, b in zip(objects, same, strict=True))
+            alike = len(objects) == len(same) and all(map(is_, objects, same))
             if alike and _equal(others, equal):
                 return result
         result = build()

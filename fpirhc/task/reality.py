@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 
 import casadi as ca
@@ -246,11 +247,15 @@ class Reality(Checked):
 
     def shows(self, coordinate: str) -> bool:
         """Whether it has a coordinate or an output at which one of the model is judged."""
-        return self.true_name(coordinate) in _quantities_of(self.plant)
+        return self.true_name(coordinate) in self._shown_quantities
 
     def true_name(self, coordinate: str) -> str:
         """Return its coordinate at which a coordinate of the model is judged."""
-        return coordinate if coordinate in _quantities_of(self.plant) else self.seen.get(coordinate, coordinate)
+        return coordinate if coordinate in self._shown_quantities else self.seen.get(coordinate, coordinate)
+
+    @cached_property
+    def _shown_quantities(self) -> dict[str, str]:
+        return _quantities_of(self.plant)
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
         """Raise if the reality cannot move from its start, or the integrator cannot follow it there.

@@ -514,6 +514,10 @@ class Road:
 def test_a_body_outside_is_the_same_freeway() -> None:
     """Reset and step in place of the symbolic reality: the same commands. Without a lag nothing depends on the start before it."""
     problem = replace(task("freeway").problem, duration=1.0)
+    roomy = replace(
+        problem.plant, ranges={"w2": (0.0, 1000.0)}
+    )  # else the gate of a body doubts a queue of 500 vehicles
+    problem = replace(problem, plant=roomy)
     outside = replace(problem, reality=fp.ExternalPlant(Road(problem), measures={"w2": "veh", "emission": "kg/h"}))
     cascade = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-1.0), fp.ThroughModel(lag=0.0))
     one, other = (fp.simulate(p, cascade, seed=0, compiled=False) for p in (problem, outside))

@@ -47,12 +47,12 @@ def plain() -> fp.Stepper:
 def test_it_says_what_it_is():
     one = plain()
     assert one.compiled is False
-    assert repr(one) == f"Stepper({PROBLEM.name}, ComputedTorque, virtual machine)"
+    assert repr(one) == "Stepper(problem, ComputedTorque, virtual machine)"
     assert one.why_failed == one.why_refused == ""
     assert one.refused == 0
     assert one.deadline is None
     assert "command" in one.signals
-    assert repr(stepper(controller=named_in_task(CONTROLLER, "mine"))).startswith(f"Stepper({PROBLEM.name}, mine, ")
+    assert repr(stepper(controller=named_in_task(CONTROLLER, "mine"))).startswith("Stepper(problem, mine, ")
     assert fp.Stepper(PROBLEM, CONTROLLER).compiled == (find_compiler() is not None)
 
 

@@ -108,5 +108,7 @@ def test_an_uncertainty_is_checked_with_the_dead_time_that_the_problem_fills_in(
 
 
 def test_a_plant_in_place_of_a_reality_is_told_how_to_write_one(tank):
-    with pytest.raises(InvalidField, match=r"Problem.reality: expected a Reality .*; write fp.Reality\(plant=...\)$"):
+    with pytest.raises(
+        InvalidField, match=r"Problem.reality: expected a Reality .*; write fp.Reality\(plant=...\) or "
+    ):
         replace(tank.problem, reality=tank.problem.reality.plant)

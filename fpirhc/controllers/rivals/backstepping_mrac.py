@@ -13,7 +13,7 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.rivals.reference_model import decay_gains, model_block
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import Mistakes
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes
@@ -37,11 +37,16 @@ class BacksteppingMRAC(Controller):
 
     Raises:
         InvalidField: a rate that is not positive.
+        InvalidValue: no rates.
     """
 
     model_rate: Positive
     rates: Sequence[Positive]
     deformation: Deformation
+
+    def __post_init__(self) -> None:
+        if not self.rates:
+            raise InvalidValue(f"BacksteppingMRAC(rates={self.rates!r}): expected positive numbers, 1/s")
 
     def check(self, problem: Problem) -> None:
         """Raise if the rates do not fit the relative orders.
