@@ -75,9 +75,9 @@ void @name@_reset(@name@_controller* c) {
   casadi_real *memory = (casadi_real*)&c->memory, *command = (casadi_real*)out, before = memory[BEFORE];
   long missed = in->time - before > (casadi_real)1.5 * PERIOD ? missed_cycles(in->time, before) : 0;
   long dropped = missed > MISSED ? missed - MISSED : 0, k;
-  @name@_inputs lost = *in;
-  ((casadi_real*)&lost)[@first@] = (casadi_real)NAN;
   for (k = dropped; k < missed; ++k) {
+    @name@_inputs lost = *in;
+    ((casadi_real*)&lost)[@first@] = (casadi_real)NAN;
     lost.time = before + (casadi_real)(k + 1) * PERIOD;
     if (cycle(c, &lost, command) && FAILS) return hold(c, in->time, command);
   }

@@ -299,12 +299,14 @@ class Cluster:
         size, running = 1, 0
         pool = self._dask.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
         while True:
-            while running < self._room() and (chunk := list(itertools.islice(jobs, size))):
+            threads = sum(self._client.nthreads().values())  # asked once for every answer: workers may come and go
+            while running < 2 * max(1, threads) and (chunk := list(itertools.islice(jobs, size))):
                 pool.add(self._client.submit(run_jobs, self._opening, self._content, self._greeting, chunk, pure=False))
                 running += 1
             if not running:
                 return
-            self._wait_for_workers()
+            if not threads:
+                self._wait_for_workers()
             future, result = next(pool)
             running -= 1
             if future.status != "finished":
@@ -316,18 +318,12 @@ class Cluster:
 
     def _wait_for_workers(self) -> None:
         """Warn where nobody takes the tasks; a cluster may begin workers when it has tasks, or bring back those it lost."""
-        if self._client.nthreads():
-            return
         try:
             self._client.wait_for_workers(1, timeout=_WAIT)
         except TimeoutError:
             address = self._client.scheduler.address
             text = f"the cluster at {address} has no workers; the study waits for them: dask worker {address}"
             warnings.warn(text, RuntimeWarning, stacklevel=users_level())
-
-    def _room(self) -> int:
-        """Number of tasks that are sent before an answer has come; workers may come and go."""
-        return 2 * max(1, sum(self._client.nthreads().values()))
 
 
 def _lost(what: str, why: Any) -> WorkerDied:
