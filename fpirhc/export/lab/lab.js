@@ -43,6 +43,7 @@ worker.onmessage = ({ data }) => {
   if (data.ready) return changed();
   if (data.error) return say("sentence", "This page cannot run: " + data.error);
   times.push(performance.now() - began);
+  if (times.length > 50) times.shift();
   window.answers = data.answers; // for who looks with the browser's tools
   window.shownNumber = data.number;
   draw(data.answers);
@@ -95,7 +96,7 @@ function draw(answers) {
   moving?.load(answers.map((one, k) => ({ name: DATA.loops[k].name, color: colors[k], step: DATA.motion.step, width: one.frameWidth, numbers: one.frames })));
   say("sentence", verdict(answers));
   say("factors", answers.map(contraction).filter(Boolean).join(". "));
-  const sorted = [...times].slice(-50).sort((a, b) => a - b), worst = sorted[Math.ceil(0.95 * sorted.length) - 1];
+  const sorted = [...times].sort((a, b) => a - b), worst = sorted[Math.ceil(0.95 * sorted.length) - 1];
   say("rate", answers.map((a, k) => DATA.loops[k].name + " " + a.took.toFixed(0) + " ms").join(", ") +
     " for " + DATA.cycles + " cycles; from move to picture " + sorted[(sorted.length - 1) >> 1].toFixed(0) + " ms (95 %: " + worst.toFixed(0) + " ms)");
 }
@@ -127,10 +128,18 @@ function contraction({ factors }, k) {
   return "Contraction factor of " + DATA.loops[k].name + ": at most " + short(largest) + ", " + said + factors.length + " cycles of the run";
 }
 
+// The address, once the sliders rest: a browser keeps every address that it has shown, and some refuse a hundred in half a minute.
+let resting = 0;
+function link(moved) {
+  clearTimeout(resting);
+  const parts = moved.map(([p, v]) => encodeURIComponent(p) + "=" + v);
+  resting = setTimeout(() => history.replaceState(null, "", parts.length ? "#" + parts.join("&") : location.pathname + location.search), 250);
+}
+
 // The address, and the same in Python
 function remember() {
   const moved = DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : [[s.path, now[k]]]));
-  history.replaceState(null, "", moved.length ? "#" + moved.map(([p, v]) => encodeURIComponent(p) + "=" + v).join("&") : location.pathname + location.search);
+  link(moved);
   const among = (test) => moved.filter(([p]) => test(p));
   const sides = /^(exact|approximate)\.(.*)/, late = /^dead_time\.inputs\.(.*)/, points = /^setpoints\.(.*)\.(\d+)$/;
   const scaled = (p) => DATA.sliders.some((s) => s.path === p && s.rows.some((one) => one.scaled));
