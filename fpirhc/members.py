@@ -186,7 +186,7 @@ FORMER = {  # names of earlier versions, and names that have left the top level
     "Informed": "ExactModel",
     "InteriorPoint": "Ipopt",
     "floquet": "controllers.slots.slotted.floquet_radius",
-    "linear_around": "simulation.linearise.asked_loop.AskedLoop",
+    "linear_around": "simulation.linearise.linearisation.Linearisation",
     "LqrTerminal": "LQRTerminal",
     "LyapunovMrac": "LyapunovMRAC",
     "LyapunovView": "simulation.lyapunov_view.LyapunovView",

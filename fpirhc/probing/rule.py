@@ -34,7 +34,9 @@ from fpirhc.plant.plant import Plant
 from fpirhc.probing.identification import End, Estimates
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing, Sensor
-from fpirhc.simulation.linearise.asked_loop import AskedLoop, linear
+from fpirhc.simulation.linearise.asked_loop import AskedLoop
+from fpirhc.simulation.linearise.linear_map import linear
+from fpirhc.simulation.linearise.linearisation import Linearisation
 from fpirhc.simulation.model_as_plant import behind_actuators
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
@@ -579,24 +581,24 @@ class _Loop:
     def __init__(self, problem: Problem, controller: Controller, shape: tuple[int, ...]) -> None:
         self._radii: dict[tuple[float | None, bytes], float] = {}
         self._quiet: dict[float | None, np.ndarray] = {}
-        self._loop: AskedLoop | None = None
+        self._linear: Linearisation | None = None
         try:
-            self._loop = AskedLoop(problem, controller)
+            self._linear = Linearisation(AskedLoop(problem, controller))
         except FpirhcError:  # it cannot be composed
             return
-        first, names = self._loop.loop.memory.slice("_exact").start, list(problem.real_plant.parameters)
+        first, names = self._linear.asked.loop.memory.slice("_exact").start, list(problem.real_plant.parameters)
         self._places = [first + names.index(gain_name(i, j)) for i, j in np.ndindex(shape)]
 
     def radius(self, gain: float | None, gains: np.ndarray) -> float:
         """Return the radius for a gain of the map and the gains of the plant; infinite where the loop does not run."""
-        if self._loop is None:
+        if self._linear is None:
             return math.inf
         key = gain, gains.tobytes()
         if key not in self._radii:
             try:
-                changed = self._memory(self._loop, gain).copy()
+                changed = self._memory(self._linear.asked, gain).copy()
                 changed[self._places] = gains.ravel()
-                self._radii[key] = self._loop.at(changed).radius
+                self._radii[key] = self._linear.at(changed).radius
             except FpirhcError:
                 self._radii[key] = math.inf
         return self._radii[key]

@@ -25,8 +25,10 @@ from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, NoAnswer, NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each, is_late, scaled
-from fpirhc.simulation.linearise.asked_loop import AskedLoop, near_fixed_point
+from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linear_loop import NEUTRAL, LinearLoop
+from fpirhc.simulation.linearise.linear_map import near_fixed_point
+from fpirhc.simulation.linearise.linearisation import Linearisation
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import kind
 from fpirhc.task.problem import Problem
@@ -117,6 +119,7 @@ class Points:
     def __init__(self, grid: ReviewGrid, controller: Controller, problem: Problem | None = None) -> None:
         """Compose the loop of a controller `near_fixed_point`, of the grid's problem or of the same one with its reality."""
         self.grid, self.asked = grid, AskedLoop(problem or grid.problem, controller)
+        self._linear = Linearisation(self.asked)
         self._loops: dict[tuple[int, int], LinearLoop] = {}
         self._quiets: dict[tuple[int, int], np.ndarray] = {}
         self._ideals: dict[int, LinearLoop] = {}
@@ -124,7 +127,7 @@ class Points:
     def at(self, place: int, draw: int = 0) -> LinearLoop:
         """Return the linear loop at a point, with the parameters of a draw; draw 0 are the exact ones."""
         if (place, draw) not in self._loops:
-            self._loops[place, draw] = self.asked.at(self.quiet(place, draw))
+            self._loops[place, draw] = self._linear.at(self.quiet(place, draw))
         return self._loops[place, draw]
 
     def drawn(self, own: Loops) -> dict[tuple[int, int], LinearLoop]:
@@ -155,23 +158,23 @@ class Points:
 
     def between(self, place: int, draw: int, gains: tuple[float, float], *, held: bool) -> tuple[LinearLoop, ...]:
         """Return the linear loops of two gains of the map at a point, in the same coordinates; held: plans are held for ever."""
-        return self.asked.between(self.quiet(place, draw), gains, held=held)
+        return self._linear.between(self.quiet(place, draw), gains, held=held)
 
     def ideal(self, place: int) -> LinearLoop:
         """Return the linear loop at a point where the plant is the model."""
         if place not in self._ideals:
             believed = self.asked.controller.plant_model(self.grid.problem).parameters(self.grid.problem.plant)
             quiet = self._quiet(place, self.grid.states[place], self.grid.needed(believed)[place], believed)
-            self._ideals[place] = self.asked.at(quiet)
+            self._ideals[place] = self._linear.at(quiet)
         return self._ideals[place]
 
     def noisy(self, place: int, correlation: np.ndarray) -> LinearLoop:
-        """Return the linear loop at a point behind the noise of the sensors, see `AskedLoop.noisy`."""
-        return self.asked.noisy(self.quiet(place), correlation)
+        """Return the linear loop at a point behind the noise of the sensors, see `Linearisation.noisy`."""
+        return self._linear.noisy(self.quiet(place), correlation)
 
     def shaken(self, place: int, corners: Sequence[tuple[float, float]]) -> tuple[LinearLoop, ...]:
-        """Return the linear loops at a point behind noise of the response that the map sees, see `AskedLoop.shaken`."""
-        return self.asked.shaken(self.quiet(place), corners)
+        """Return the linear loops at a point behind noise of the response that the map sees, see `Linearisation.shaken`."""
+        return self._linear.shaken(self.quiet(place), corners)
 
     def quiet(self, place: int, draw: int = 0) -> np.ndarray:
         """Return the memory at a point, with the parameters of a draw."""
@@ -182,7 +185,7 @@ class Points:
             at = self._quiet(*where)
             if self._gentle is not None:
                 try:
-                    self._loops[place, draw] = self.asked.at(at)
+                    self._loops[place, draw] = self._linear.at(at)
                 except NotSupported:
                     at = self.asked.with_gain(self._quiet(*where, self._gentle), self._own)
             self._quiets[place, draw] = at

@@ -6,6 +6,7 @@ from fpirhc.describe import describe, identity
 from fpirhc.review.prediction import NominalRuns
 from fpirhc.simulation import loop
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
+from fpirhc.simulation.linearise.linearisation import Linearisation
 from fpirhc.simulation.linearise.slopes import Step
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.symbolic import block
@@ -29,7 +30,7 @@ def test_controllers_that_differ_in_their_deformation_share_what_a_review_builds
     loops = counted(monkeypatch, loop, "_closed")
     plans = counted(monkeypatch, replanning, "first_memory")
     asked = counted(monkeypatch, AskedLoop, "__init__")
-    linear = counted(monkeypatch, AskedLoop, "_among")
+    linear = counted(monkeypatch, Linearisation, "_among")
     steps = counted(monkeypatch, Step, "into")
     fp.review(task.problem, pair, mismatch=0.0, seed=0)
     assert len(plans) == 1  # exact parameters are numbers of the plant, and no other horizon
@@ -61,7 +62,7 @@ def test_what_differs_in_nothing_is_the_same_problem():
 def test_plants_from_the_box_are_asked_of_controllers_that_adapt_alone(monkeypatch):
     """Without a deformation no question is about them: three points of the reference, and one with a right model."""
     task = fp.load_problem("two_mass")
-    linear = counted(monkeypatch, AskedLoop, "_among")
+    linear = counted(monkeypatch, Linearisation, "_among")
     fp.review(task.problem, {"RHC": task.controllers["RHC"]}, mismatch=20.0, seed=0)
     assert len(linear) == 4
 

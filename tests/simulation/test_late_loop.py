@@ -13,6 +13,7 @@ from fpirhc.review.questions.margins import margins
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.late_loop import Late, LateLoop
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
+from fpirhc.simulation.linearise.linearisation import Linearisation
 
 PERIOD, STATES, LONGEST = 0.01, 4, 15
 
@@ -117,7 +118,8 @@ def test_a_line_of_a_loop_is_found_in_its_memory():
     loop = AskedLoop(problem, control)
     memory = loop.run(loop.start(), 300).memories[-1]
     [line] = [np.flatnonzero([name in column for column in loop.loop.memory.columns]) for name in ("lessons",)]
-    whole, short = loop.at(memory), loop.late_at(memory, [line])
+    asked = Linearisation(loop)
+    whole, short = asked.at(memory), asked.late_at(memory, [line])
     assert len(whole.dynamics) - len(short.cycles[0].dynamics) > 55
     rounding = 2e-5  # three poles of the law lie together, which rounding parts
     assert short.radius == pytest.approx(whole.radius, abs=rounding)
@@ -134,7 +136,7 @@ def test_entries_that_do_more_than_wait_are_refused():
     loop = AskedLoop(replace(task.problem, disturbances={}), task.controllers["RHC"])
     line = np.flatnonzero(["plan_inputs" in column and "Q1@" in column for column in loop.loop.memory.columns])
     with pytest.raises(NotSupported, match="do not only wait"):
-        loop.late_at(loop.run(loop.start(), 50).memories[-1], [line])
+        Linearisation(loop).late_at(loop.run(loop.start(), 50).memories[-1], [line])
 
 
 def test_gain_margin_of_a_long_period_is_that_of_the_learning():
@@ -142,7 +144,7 @@ def test_gain_margin_of_a_long_period_is_that_of_the_learning():
     task = fp.load_problem("mrac_pendulum")
     problem = replace(task.problem, disturbances={})
     loop = AskedLoop(problem, task.controllers["repetitive control"])
-    linear = loop.at(loop.run(loop.start(), 200).memories[-1])
+    linear = Linearisation(loop).at(loop.run(loop.start(), 200).memories[-1])
     assert 0.999 < linear.radius < 1
     gain = margins(linear, 0)[0]
     assert gain == pytest.approx(2 / (0.4 * 1.65), rel=0.05)

@@ -12,6 +12,7 @@ import fpirhc as fp
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
+from fpirhc.simulation.linearise.linearisation import Linearisation
 
 SHIPPED = [
     "two_mass:CTC+FPI (eq 6)",
@@ -35,7 +36,7 @@ def test_a_deviation_of_the_state_is_carried_on_as_by_the_step_itself(name):
     state = loop.loop.memory.slice("_state_before")
     settled = loop.run(loop.start(), 300)
     memory = settled.memories[300]
-    linear = loop.at(memory)
+    linear = Linearisation(loop).at(memory)
     sizes = 1e-4 * np.abs(settled.memories[:, state]).max(axis=0)
     count, periods, runs = len(linear.cycles), 3, []
     for sign in (1, -1):  # on both sides, so that what bends cancels
@@ -54,7 +55,7 @@ def test_poles_of_a_tracking_law_are_those_of_its_continuous_loop():
     """On a mass that the model knows (d/dt + L)^3 governs the integrated error: e^(-L T) three times."""
     problem = mass()
     loop = AskedLoop(problem, fp.ComputedTorque(fp.Exponential(rate=5.0)))
-    linear = loop.at(loop.run(loop.start(exact=problem.plant.approximate), 10).memories[5])
+    linear = Linearisation(loop).at(loop.run(loop.start(exact=problem.plant.approximate), 10).memories[5])
     slow = np.sort(np.abs(linear.poles))[-3:]
     assert np.prod(slow) == pytest.approx(np.exp(-15.0 * problem.period), rel=2e-3)
     assert slow == pytest.approx(np.exp(-5.0 * problem.period), rel=2e-2)
@@ -64,7 +65,7 @@ def test_a_loop_whose_plans_wait_is_asked_over_a_whole_period():
     """The poles of plans every ten cycles are not those of plans in every cycle: between plans nothing is fed back."""
     loop = asked("two_mass:RHC")
     settled = loop.run(loop.start(), 100)
-    assert len(loop.at(settled.memories[100]).cycles) == loop.repeats == 10
+    assert len(Linearisation(loop).at(settled.memories[100]).cycles) == loop.repeats == 10
     assert asked("two_mass:CTC").repeats == 1
 
 
@@ -115,7 +116,7 @@ def test_noise_and_quantum_are_no_part_of_the_linear_loop():
     radii = []
     for problem in (task.problem, rough):
         loop = AskedLoop(problem, controller)
-        radii.append(loop.at(loop.run(loop.start(), 200).memories[200]).radius)
+        radii.append(Linearisation(loop).at(loop.run(loop.start(), 200).memories[200]).radius)
     assert radii[1] == radii[0]
 
 
@@ -124,11 +125,11 @@ def test_other_parameters_are_another_memory_and_no_other_build():
     task = fp.load_problem("two_mass")
     plant = task.problem.plant
     loop = asked("two_mass:CTC")
-    own = loop.at(loop.run(loop.start(exact=plant.approximate), 50).memories[50])
+    own = Linearisation(loop).at(loop.run(loop.start(exact=plant.approximate), 50).memories[50])
     rebuilt = AskedLoop(
         replace(task.problem, plant=with_exact_parameters(plant, plant.approximate)), task.controllers["CTC"]
     )
-    other = rebuilt.at(rebuilt.run(rebuilt.start(), 50).memories[50])
+    other = Linearisation(rebuilt).at(rebuilt.run(rebuilt.start(), 50).memories[50])
     assert np.sort(np.abs(own.poles)) == pytest.approx(np.sort(np.abs(other.poles)), rel=1e-9, abs=1e-9)
 
 
@@ -137,7 +138,7 @@ def test_a_gain_that_a_run_refuses_has_poles_too():
     for deformation in (fp.Affine(gain=-2 * 1.59), fp.Affine(gain=0.5)):
         loop = AskedLoop(mass(), fp.ComputedTorque(fp.Exponential(rate=1.0), deformation))
         factor = 1 - deformation.effective_gain() * 1.5
-        poles = loop.at(loop.run(loop.start(), 3).memories[2]).poles
+        poles = Linearisation(loop).at(loop.run(loop.start(), 3).memories[2]).poles
         assert np.abs(poles - factor).min() < 2e-2
 
 

@@ -27,8 +27,8 @@ from fpirhc.review.loops import Points, points_of, spectrum_near, thinned, usabl
 from fpirhc.review.prediction import TRIED
 from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict
 from fpirhc.sensing.base import response_names
-from fpirhc.simulation.linearise.asked_loop import behind_noise
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
+from fpirhc.simulation.linearise.linear_map import behind_noise
 from fpirhc.simulation.trials import Trials, harm_in
 from fpirhc.summary import in_percent, line, number, table
 from fpirhc.task.problem import Problem

@@ -51,7 +51,7 @@ class Late:
 
 @dataclass(frozen=True, eq=False)
 class LateLoop(LinearLoop):
-    """A loop of one cycle, whose matrices are those of what acts at once; build it with `AskedLoop.at`."""
+    """A loop of one cycle, whose matrices are those of what acts at once; build it with `Linearisation.at`."""
 
     late: tuple[Late, ...] = ()  # what acts later
 
