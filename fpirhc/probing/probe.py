@@ -37,8 +37,9 @@ class Probe(FoundByName):
 
     Args:
         gain: lambda by response and model response, both by controlled quantity: 1 where the model is right.
-        dead_time: by input, in control cycles beyond the one that every loop has.
-        lag: by input, the dominant one, in the problem's unit of time.
+        dead_time: by input, in control cycles beyond the one that every loop has: all of it, with that of the measurement, and also
+            where the problem states some.
+        lag: by input, the dominant one, in the problem's unit of time; all of it too.
         noise: by controlled quantity, rms of the measured response.
         drift: by controlled quantity, rms change of what the model does not have, per square root of the unit of time.
         deformation: the adaptation to use; None: no adaptation.

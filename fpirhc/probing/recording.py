@@ -141,8 +141,9 @@ def _run(
     problem: Problem, bare: Controller, amplitude: tuple[float, ...], cycles: int, seed: int
 ) -> tuple[Run, Record]:
     excitation = Excitation(amplitude, cycles, seed)
+    at_once = ModelReferenced(excitation, cycles=0.0, lag=0.0)  # all lateness is identified, the stated one too
     with any_gain():  # nothing is iterated, so the sign of the plant's gain does not matter
-        run = simulate(problem, bare.with_deformation(ModelReferenced(excitation)), seed=seed, compiled=False)
+        run = simulate(problem, bare.with_deformation(at_once), seed=seed, compiled=False)
     modelled, measured = (np.column_stack([run[pair[k]] for pair in excitation._names]) for k in (0, 1))
     held = np.asarray(run["foreign_held"]).ravel() if "foreign_held" in run.layout.names else np.zeros(len(measured))
     clipped = float(np.mean(np.asarray(run["clipped"]) > 0)) if len(measured) else 0.0

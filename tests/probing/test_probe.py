@@ -60,6 +60,27 @@ def test_the_intervals_hold_over_bodies():
     assert all(counts[name] > 91 for name in ("gain", "dead time", "lag"))
 
 
+@pytest.mark.parametrize(
+    ("body", "stated"),
+    [
+        ({"dead": 2, "lag": 0.05}, {"body": {"dead_time": {"u": 2 * PERIOD}, "lag": {"u": 0.05}}}),
+        ({"lag": 0.05}, {"problem": {"dead_time": fp.DeadTime(inputs={"u": 2 * PERIOD})}}),
+        ({"lag": 0.05}, {"problem": {"dead_time": fp.DeadTime(measurement=2 * PERIOD)}}),
+    ],
+)
+def test_lateness_that_is_stated_is_found_as_if_it_were_not(monkeypatch, body, stated):
+    """The plant as estimated has all of it: margins on a plant without it would let through what destroys the loop."""
+    monkeypatch.setattr(Rule, "shortlist", lambda _: {})
+    problem = replace(body_problem(1.0, noise=0.05, **body), duration=2.0)
+    reality = replace(problem.reality, **stated.get("body", {}))
+    found = fp.probe(replace(problem, reality=reality, **stated.get("problem", {})), RHC, cycles=150)
+    assert found.dead_time["u"].value == 2
+    assert found.lag["u"].low <= 0.05 <= found.lag["u"].high
+    assert found.problem is not None
+    assert found.problem.dead_time.inputs == {"u": pytest.approx(2 * PERIOD)}
+    assert found.problem.dead_time.measurement == 0
+
+
 def test_an_interval_of_lags_ends_between_searched_ones():
     """A likelihood that is sharper than the grid leaves one of its lags; its interval has a width all the same."""
     random = np.random.default_rng(4)
