@@ -29,6 +29,7 @@ An exact model that does not know a disturbance, or has one iteration per plan, 
 
 Problems that are judged by another figure than an error and have no baseline are not here: `anaesthesia_people`,
 `anaesthesia_drawn`, `anaesthesia_monitor`, `diabetes`, `diabetes_announced` and `diabetes_order_five` have tables of their own.
+Problems whose plant is a simulator of another package are in [a table of their own](simulators.md).
 
 | problem | quantity | plain | with FPI | best rival | exact model | winner | why |
 |---|---|---|---|---|---|---|---|

@@ -4,7 +4,7 @@ One input, two coordinates: time slots
 
 A crane's cart is pushed by one force, and cart and load cannot both be prescribed at
 once. Time slots take turns: for a while the cart follows its reference and the load
-swings as it likes, then the load is damped and the cart drifts. Neither slot alone is
+swings freely, then the load is damped and the cart drifts. Neither slot alone is
 asymptotically stable; their alternation is, and this is known before the run. Slots
 need no optimiser; where there is one, a receding horizon with both coordinates in its
 cost is faster on this plant.

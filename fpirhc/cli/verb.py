@@ -159,7 +159,7 @@ class ExitCode(IntEnum):
     meaning: str
 
     FINISHED = 0, "the command finished"
-    ANSWERED_NO = 1, "review answered no"
+    ANSWERED_NO = 1, "review answered no, or probe proposes no adaptation"
     BAD_INPUT = 2, "bad input: a name, a value, a problem file, or an option"
     NOT_WRITABLE = 3, "a file or folder cannot be written, or holds results of something else"
     ENDED_EARLY = 4, "a run ended early (its reason is named), or a plan did not converge"

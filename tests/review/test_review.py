@@ -161,7 +161,7 @@ def test_feedback_of_a_plan_is_that_of_the_riccati_equation():
 
 
 def test_a_good_problem_is_ready():
-    """Every answer about a mild mismatch is yes, in the form that the problem wants and in the plain one, whose run is as good."""
+    """Every answer about a mild mismatch is yes, in the form that suits the problem and in the plain one, whose run is as good."""
     problem, plain = mass(limits=fp.Limits(inputs={"u": (-20.0, 20.0)})), torque()
     answers_by_question = answers(problem, replace(plain, deformation=fp.ModelReferenced(plain.deformation)))
     assert {a.verdict for a in answers_by_question.values()} == {"yes"}

@@ -46,8 +46,8 @@ _EXAMPLES = (
         "fpirhc compare two_mass --scenarios 10000 --mismatch 20 --cluster tcp://10.0.0.1:8786",
         "on the workers of a Dask cluster (pip install 'fpirhc[cluster]'); local: a cluster of this machine",
     ),
-    ("fpirhc compare my_arm.py --cases all --headline settling.q1", "by another number than the error"),
-    ("fpirhc compare my_arm.py --cases all", "every case of the problem file; the worst one is named"),
+    ("fpirhc compare anaesthesia --cases all", "every case of the problem file; the worst one is named"),
+    ("fpirhc compare anaesthesia --cases all --headline settling.bis", "by another number than the error"),
     ("fpirhc compare anaesthesia --cases elderly 'patient 0*' --processes 2", "cases by name, or by group"),
 )
 _NOTES = """

@@ -57,7 +57,7 @@ VERB = Verb(
     ),
     notes="""
 The plant of the record moved under other commands, so this is no closed loop: it shows what a controller makes of real
-measurements, before it is trusted with the machine. Where the record has the commands that were sent, the controller believes
-in every cycle that these acted.
+measurements, before it is trusted with the machine. Where the record has the commands that were sent, the controller is
+given these as the commands that acted.
 """,
 )

@@ -158,10 +158,10 @@ VERB = Verb(
         ('fpirhc run two_mass "RHC+FPI"', "one run, saved as .npz and .png"),
         (
             'fpirhc run two_mass "RHC+FPI" --set deformation.gain=-1.2',
-            "another gain; other numbers of it need no compiler",
+            "another gain; other numbers of it share one compiled loop",
         ),
         ('fpirhc run two_mass "RHC+FPI" --set exact.m1=1.4 --set start.q1=2', "another plant and another start"),
-        ('fpirhc run my_arm.py "RHC+FPI" --case heavy', "the problem in a case of its file"),
+        ('fpirhc run anaesthesia "CTC+FPI" --case "patient 02"', "the problem in a case of its file"),
         (
             'fpirhc run two_mass "RHC+FPI" --scenario 14 --mismatch 20',
             "a scenario of compare --scenarios, with every signal",

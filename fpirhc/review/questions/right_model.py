@@ -1,4 +1,4 @@
-"""Does adaptation pay, does it leave a right model alone, and is its form the one that the problem wants?
+"""Does adaptation pay, does it leave a right model alone, and does its form suit the problem?
 
 The null test: with the model as the plant adaptation must not do harm. Errors are predicted along the model's own run
 (`prediction`); where a prediction does not say, runs do. The iteration takes whatever moves the response within a cycle for an
@@ -37,7 +37,7 @@ from fpirhc.simulation.trials import SLIGHT, ErrorPair
 from fpirhc.summary import beside
 from fpirhc.task.problem import Problem
 
-FORM = "Is it the form of the iteration that the problem wants?"
+FORM = "Does the form of the iteration suit the problem?"
 SIMILAR = 1.1  # ratio of errors, up to which two forms are equally good
 LATE = 1.0  # cycles of an estimator's delay, beyond which what the model is wrong by is known too late
 
