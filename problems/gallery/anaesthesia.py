@@ -118,4 +118,8 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("CTC", "CTC+FPI")
+tuning = {
+    "CTC": {"tracking.rate": fp.LogSpan(0.5, 5.0)},  # 1/min
+    "CTC+FPI": {"tracking.rate": fp.LogSpan(0.5, 5.0), "deformation.gain": fp.LogSpan(-6.0, -0.5)},
+}
 cases = fp.Cases.from_csv("anaesthesia_patients.csv")  # the curves of 44 patients, with this man's kinetics
