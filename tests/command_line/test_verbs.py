@@ -24,6 +24,7 @@ from fpirhc.cli.verb import OF_EVERY_VERB, ExitCode, shipped
 from fpirhc.probing.probe import Probe, probe
 from fpirhc.probing.rule import Rule
 from fpirhc.problem_files.shipped import shipped_problems
+from fpirhc.scaffold import create_problem
 from fpirhc.studies.open_loop import optimiser_choices
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -168,22 +169,51 @@ def test_the_command_of_a_report_reproduces_its_options(name):
         assert options == again
 
 
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory):
+    """The task of a file that `fpirhc new` has just written."""
+    problem, *_ = create_problem("my_arm", tmp_path_factory.mktemp("fresh"))
+    return fp.load_problem(problem)
+
+
 @pytest.mark.parametrize("verb", VERBS, ids=lambda v: v.name)
-def test_examples_are_valid_commands(verb):
-    """Each is one that the parser of its command accepts, with problems and optimisers that exist."""
+def test_examples_are_valid_commands(verb, fresh):
+    """Each is one that the parser of its command accepts; what it names is there, in a file of `fpirhc new` too."""
     for line, _ in verb.examples:
-        program, name, *rest = shlex.split(line)
-        assert program == "fpirhc"
-        options = vars(shipped()[name].parser().parse_args(rest))
-        problems = [options["problem"]] if "problem" in options else options.get("problems", [])
-        assert all(p in shipped_problems() or p.startswith("my_") for p in problems)
-        assert set(options.get("optimisers") or ()) <= {*optimiser_choices(), "all"}
-        controllers = [
-            *(options.get("controllers") or ()),
-            *([options["controller"]] if "controller" in options else ()),
-        ]
-        for problem in set(problems) & set(shipped_problems()):
-            assert set(controllers) <= set(fp.load_problem(problem).controllers)
+        names_what_is_there(line, {"my_arm.py": fresh})
+
+
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "_build" not in p.parts)]
+LINES = {
+    page: re.findall(r"^    (?:\$ )?(fpirhc .+)$", page.read_text(encoding="utf-8"), re.MULTILINE) for page in PAGES
+}
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if LINES[p] and p.stem != "command-line"], ids=lambda p: p.stem)
+def test_command_lines_on_a_page_are_valid(page):
+    """As the examples of a help; files of a page's own are not read."""
+    for line in LINES[page]:
+        names_what_is_there(line, {})
+
+
+def names_what_is_there(line, tasks):
+    """Require that the parser accepts a command line, and that controllers, cases, ranges and optimisers that it names exist."""
+    program, name, *rest = shlex.split(line, comments=True)
+    assert program == "fpirhc"
+    verb = shipped()[name]
+    options = vars(verb.options(rest))
+    assert set(options.get("optimisers") or ()) <= {*optimiser_choices(), "all"}
+    problems = [options["problem"]] if "problem" in options else options.get("problems", [])
+    assert all(p in shipped_problems() or p == "FILE" or p.endswith(".py") for p in problems)
+    one = options.get("controller")
+    for task in (tasks.get(p) or fp.load_problem(p) for p in problems if p in tasks or p in shipped_problems()):
+        assert {*(options.get("controllers") or ()), *([one] if one else ())} <= set(task.controllers)
+        patterns = [*(options.get("cases") or ()), *filter(None, [options.get("case")])]
+        assert not patterns or task.cases.matching(patterns)
+        assert name != "tune" or task.tuning
+        metric, _, of = (options.get("headline") or "rms_error").partition(".")
+        assert metric in {m.name for m in task.metrics}
+        assert of in ("", *task.problem.judged_names)
 
 
 @pytest.mark.parametrize("name", ["compare", "solve"])
