@@ -247,9 +247,6 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
     return {name.strip(): column for name, column in zip(head, table.T, strict=True)}
 
 
-_SENT = "_command_before"  # what a controller remembers of its last command
-
-
 @dataclass(frozen=True, eq=False)
 class Replay:
     """The commands of a controller over a recording."""
@@ -287,8 +284,9 @@ def replay(problem: Problem, controller: Controller, recording: Path) -> Replay:
     """Return what a controller would have commanded over a recording.
 
     Columns of the CSV file are "time", what the problem's controller is given ("q1", "q1'", "q1''", or what its sensors show), and
-    the inputs that were sent, where they are known. A response ("q1''") without a column is the difference of its lower
-    derivative. An empty entry is a sample that was lost: the cycle is skipped, as it would have been.
+    the inputs that were sent, where they are known; every memory of the last command is then the recorded one. A response ("q1''")
+    without a column is the difference of its lower derivative. An empty entry is a sample that was lost: the cycle is skipped, as
+    it would have been.
 
     Args:
         problem: the task.
@@ -303,14 +301,15 @@ def replay(problem: Problem, controller: Controller, recording: Path) -> Replay:
     stepper = Stepper(problem, controller, compiled=False)
     inputs = tuple(problem.plant.inputs)
     measured, recorded = _table(columns, problem, stepper.measures, recording.name)
-    places = stepper.memory.slice(_SENT) if _SENT in stepper.memory else slice(0, 0)
+    places = [stepper.memory.slice(name) for name in stepper.memory.holding(problem.plant.input.name)]
     memory, commands, statuses = stepper.start(), np.empty((len(measured), len(inputs))), Counter[str]()
     for k, row in enumerate(measured):
         command, memory = stepper.step_measured(float(columns["time"][k]), row, memory)
         commands[k] = command
         statuses[Status(int(stepper.trace()["status"].item())).name] += 1
         if recorded is not None and np.isfinite(recorded[k]).all():
-            memory[places] = recorded[k]
+            for place in places:
+                memory[place] = recorded[k]
     return Replay(columns["time"], inputs, commands, recorded, dict(statuses))
 
 
@@ -325,7 +324,7 @@ def _table(
         if one not in columns and lower in columns:
             values[one] = np.diff(columns[lower], prepend=columns[lower][:1]) / period
     lacking(columns, [one for one in measures if one not in values], mistakes, ", which the controller is given")
-    present = [one for one in inputs if one in columns]
+    present = [one for one in inputs if one in columns and np.isfinite(columns[one]).any()]
     if present and len(present) < len(inputs):
         mistakes.add(
             f"it has the commands of {', '.join(present)} alone; expected those of {', '.join(inputs)}, or of none"

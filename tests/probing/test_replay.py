@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 import tasks
@@ -61,6 +63,50 @@ def test_a_model_referenced_form_answers_to_the_commands_that_were_sent(tmp_path
     assert blind.differences() == {}
     sent = np.column_stack([columns[n] for n in tasks.two_mass.problem.plant.inputs])
     assert np.abs(told.commands - sent).max() < np.abs(blind.commands - sent).max()
+
+
+MASS = fp.Plant({"q": "m"}, {"u": "N"}, {"m": fp.Parameter(1.2, 1.0, "kg")}, lambda q, v, u, p: {"q": u.u / p.m})
+MOTION = fp.Problem(MASS, fp.Trajectory(lambda t: {"q": ca.sin(t)}), {"q": 0.0, "q'": 1.0}, period=0.01, duration=2.0)
+CTC = fp.ComputedTorque(fp.Exponential(rate=3.0))
+KALMAN = fp.Sensing(measured=["q", "q''"], observer=fp.KalmanFilter(measured={"q": 1e-3}, noise={"q": 1.0}))
+BELIEVERS = {
+    "estimator": (MOTION, fp.Estimating(CTC, fp.DisturbanceKalman({"q": 3.0}, {"q": 1e-3, "q'": 1e-3}))),
+    "predictor": (replace(MOTION, dead_time=fp.DeadTime(inputs={"u": 0.02})), fp.Predicted(CTC, inputs=0.02)),
+    "observer": (replace(MOTION, sensing=KALMAN), CTC),
+}
+
+
+@pytest.mark.parametrize("name", BELIEVERS)
+def test_what_believes_a_command_believes_the_recorded_one(tmp_path, name):
+    """Two records that differ in their commands alone: whatever predicts or estimates from commands answers to the difference."""
+    columns = {"time": np.arange(20) * 0.01, **{n: np.zeros(20) for n in ("q", "q'", "q''")}}
+    write(tmp_path / "still.csv", {**columns, "u": np.zeros(20)})
+    write(tmp_path / "pushed.csv", {**columns, "u": np.full(20, 3.0)})
+    still, pushed = (replay(*BELIEVERS[name], tmp_path / file) for file in ("still.csv", "pushed.csv"))
+    assert abs(pushed.commands - still.commands)[-1, 0] > 0.1
+
+
+def test_an_estimator_does_not_wind_up_on_the_record_of_another_law(tmp_path):
+    """A stiff law holds a load of 2 N: the estimator finds it from the recorded commands, and winds up by its own."""
+    loaded = replace(MOTION, disturbances={"u": fp.Step(at=0.0, size=2.0)})
+    run = fp.simulate(loaded, fp.ComputedTorque(fp.Exponential(rate=15.0)), seed=0, compiled=False)
+    seen = {"q": run["state.q"], "q'": run["state.q'"], "q''": run["realised.q"]}
+    write(tmp_path / "run.csv", {"time": run.time, "u": run["command.u"], **seen})
+    rms, _, _ = replay(*BELIEVERS["estimator"], tmp_path / "run.csv").differences()["u"]
+    assert rms < 0.15
+
+
+def test_a_skipped_cycle_repeats_the_recorded_command(tmp_path):
+    columns = {"time": np.arange(5) * 0.01, "u": np.full(5, 7.0), **{n: np.zeros(5) for n in ("q", "q'", "q''")}}
+    columns["q"][3] = np.nan
+    write(tmp_path / "run.csv", columns)
+    assert replay(MOTION, CTC, tmp_path / "run.csv").commands[3, 0] == 7.0
+
+
+def test_an_empty_column_of_commands_is_no_record(tmp_path):
+    columns = {"time": np.arange(5) * 0.01, "u": np.full(5, np.nan), **{n: np.zeros(5) for n in ("q", "q'", "q''")}}
+    write(tmp_path / "run.csv", columns)
+    assert replay(MOTION, CTC, tmp_path / "run.csv").differences() == {}
 
 
 def test_a_lost_sample_skips_its_cycle(tmp_path):
