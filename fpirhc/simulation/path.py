@@ -403,15 +403,16 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
 
 
 def _seen_block(problem: Problem, shown: Shown) -> Block:
-    """Block -> the state and the response that are measured in place of the true ones."""
-    state = problem.truth.function(shown[0][0].elements, seen=True)
-    response = problem.truth.function(response_names(problem.plant), seen=True)
+    """Block -> the state, the outputs and the response that are measured in place of the true ones."""
+    motion, response = shown
+    functions = {one.name: problem.truth.function(one.elements, seen=True) for one in motion}
+    functions[response.name] = problem.truth.function(response_names(problem.plant), seen=True)
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
-        return {shown[0][0].name: state(*now), shown[1].name: response(*now)}
+        return {name: function(*now) for name, function in functions.items()}
 
-    return Block("seen", Layout(_real_signals(problem)), Layout((*shown[0], shown[1])), step)
+    return Block("seen", Layout(_real_signals(problem)), Layout((*motion, response)), step)
 
 
 def _real_signals(problem: Problem) -> tuple[Signal, ...]:

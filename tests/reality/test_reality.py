@@ -176,6 +176,32 @@ def test_slow_sensor_is_seen_in_place_of_an_output():
         assert np.array_equal(one[name], other[name]), name
 
 
+@pytest.mark.parametrize("sensing", [fp.Sensing(), fp.Sensing(estimator=fp.PositionDifference())])
+def test_a_sensor_in_place_of_an_output_stands_beside_the_model_s_own_state(sensing):
+    """State, output and response are all shown: the state as it is, the other two as the sensor has them."""
+    model = fp.Plant(
+        coordinates={"a": "m"},
+        inputs={"u": "m/s"},
+        order=1,
+        parameters=parameters(),
+        response=lambda q, u, p: {"a": p.b * u.u - q.a},
+        outputs={"y": fp.Output("m", lambda q, p: 2 * q.a)},
+    )
+    sensed = replace(
+        model,
+        coordinates={"a": "m", "s": "m"},
+        response=lambda q, u, p: {"a": p.b * u.u - q.a, "s": (2 * q.a - q.s) / TAU + u.u},
+        controlled=("y",),
+    )
+    reality = fp.Reality(sensed, seen={"y": "s"})
+    shared: dict[str, Any] = {"plant": model, "reality": reality, "horizon": None, "cost": None, "sensing": sensing}
+    result = run(task(**shared, start={"a": 0.05}), CONTROLLERS["plain form"])
+    assert np.array_equal(result["state.a"], result["reality_state.a"])
+    assert np.array_equal(result["output.y"], result["reality_state.s"])
+    assert np.allclose(result["plant_output.y"], 2 * result["reality_state.a"])
+    assert not np.allclose(result["output.y"], result["plant_output.y"], atol=1e-3)
+
+
 def test_states_of_its_own_settle_or_are_given():
     """An actuator begins at the input before the first cycle, a sensor at what it measures, and a named state where it is put."""
     actuated = task(reality=fp.Reality(lagged()), input_before={"u": 3.0})
