@@ -21,6 +21,7 @@ from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.straight import condensed
 from fpirhc.simulation.clock import most_missed
 from fpirhc.simulation.stepper import Stepper
+from fpirhc.symbolic.driver import works_alone
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.symbolic.native import native
@@ -159,7 +160,7 @@ def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, i
     texts, files = generate(function), []
     sizes = {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", texts[0])}
     text, sizes["w"] = _without_wrapper(texts[0], sizes["w"])
-    if function.is_a("SXFunction") and text != texts[0]:  # scalar code has variables of its own
+    if works_alone(function) and text != texts[0]:
         text, sizes = condensed(text), {"arg": function.n_in(), "res": function.n_out(), "iw": 1, "w": 1}
     texts = (text, *texts[1:])
     for text in texts:

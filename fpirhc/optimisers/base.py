@@ -334,7 +334,10 @@ def plan_library(ocp: OptimalControl, name: str, driver: Driver, memory: int) ->
     It has one argument more than a step, a number that its text reads as `LAST`: one library serves a loop and plans in open loop.
     """
     results = [ca.MX.zeros(*size) for size in ((ocp.input.size, ocp.stages), (5, 1), (memory, 1))]
-    return native(ca.Function(registered(name, driver), [*call_arguments(ocp, memory), ca.MX.sym("last")], results))
+    arguments = [*call_arguments(ocp, memory), ca.MX.sym("last")]
+    if not driver.fits:
+        return Native(ca.Function(name, arguments, results), False, "its model calls Functions")
+    return native(ca.Function(registered(name, driver), arguments, results))
 
 
 def with_last(ocp: OptimalControl, library: ca.Function, last: int) -> ca.Function:

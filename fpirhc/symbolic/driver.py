@@ -78,6 +78,11 @@ class Driver:
     in_place: tuple[int, int] | None = None
     side_by_side: bool = True  # whether the text keeps to `WORDS`
 
+    @property
+    def fits(self) -> bool:
+        """Whether its loops can call the leaves: one that calls a table of `ca.interpolant` needs memory for its work."""
+        return all(map(works_alone, self.leaves.values()))
+
     def source(self) -> str:
         """Return the whole C file, in which the entry is called ENTRY."""
         generator = ca.CodeGenerator("fpirhc_leaves", {"with_header": False, "with_mem": False})
@@ -98,17 +103,26 @@ class Driver:
 
 
 def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
-    """Return `build(unique name)` with this driver as its body in C; the same body has the same Function."""
-    unique = registered(name, driver)
+    """Return `build(unique name)` with this driver as its body in C, where it fits; the same body has the same Function."""
+    unique = registered(name, driver) if driver.fits else _unique(name, driver.source())
     return _LATEST.of((), (unique,), lambda: build(unique))
 
 
 def registered(name: str, driver: Driver) -> str:
     """Return the unique name of a driver: a Function of this name has it as its body in C."""
     source = driver.source()
-    unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    unique = _unique(name, source)
     _drivers[unique] = driver, source
     return unique
+
+
+def _unique(name: str, source: str) -> str:
+    return f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+
+
+def works_alone(function: ca.Function) -> bool:
+    """Return whether the C of a Function needs no memory for its work: scalar code without calls has variables of its own."""
+    return bool(function.is_a("SXFunction")) and not function.find_functions()
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import casadi as ca
 
 from fpirhc.errors import NoCode
 from fpirhc.symbolic.dataflow import Callee
-from fpirhc.symbolic.driver import SIGNATURE, entry_of, file_of, is_driver, of_type, renamed
+from fpirhc.symbolic.driver import SIGNATURE, entry_of, file_of, is_driver, of_type, renamed, works_alone
 from fpirhc.symbolic.flat_code import HEAD, FlatCode
 
 NAME = "fpirhc_native"  # stands for the exported name, which is made of the key
@@ -86,7 +86,7 @@ class _Leaves:
         unique = f"{name}_{len(self._leaves)}" if name in (*self._leaves, NAME) else name
         # a renamed one may need more than the Function itself
         leaf = self._leaves[unique] = function if unique == name else renamed(function, unique)
-        plain = leaf.is_a("SXFunction")  # its code has variables of its own
+        plain = works_alone(leaf)
         pointers = (leaf.n_in(), leaf.n_out()) if plain else (leaf.sz_arg(), leaf.sz_res())
         return Callee(f"leaf_{unique}", pointers, 0 if plain else leaf.sz_w())
 
