@@ -27,11 +27,11 @@ class Master:
         self.variables = {v.name: v for v in described.modelVariables}
         self.begin()
 
-    def begin(self) -> None:
-        """Begin at time 0."""
+    def begin(self, time: float = 0.0) -> None:
+        """Begin at a time."""
         if not self.new:
-            self.unit.setupExperiment(startTime=0.0)
-        self.unit.enterInitializationMode()
+            self.unit.setupExperiment(startTime=time)
+        self.unit.enterInitializationMode(**({"startTime": time} if self.new else {}))
         self.unit.exitInitializationMode()
 
     def set(self, names: list[str], values: np.ndarray) -> None:

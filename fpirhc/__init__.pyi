@@ -28,7 +28,7 @@ from .deformation.wrappers.haar import Haar
 from .deformation.wrappers.self_paired import DelayWatched, SelfPaired
 from .deformation.wrappers.tuned import Tuned
 from .errors import FpirhcError, HarmfulAdaptation
-from .export.target import Processor
+from .export.processor import Processor
 from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.horizon import Horizon

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from fpirhc.errors import CompileError, NotInstalled, package
-from fpirhc.symbolic.native import find_compiler
+from fpirhc.symbolic.native import find_compiler, why_no_compiler
 
 # No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.
 _FLAGS = ("-std=c99", "-O2", "-s", "-ffp-contract=off")
@@ -69,7 +69,7 @@ def own_compiler() -> str:
     own = find_compiler()
     if own is None:
         raise NotInstalled(
-            "a program of this machine needs a C compiler: install gcc or clang, or name one by FPIRHC_CC"
+            f"a program of this machine needs a C compiler: {why_no_compiler()}; install gcc or clang, or name one by FPIRHC_CC"
         )
     return own
 
@@ -117,7 +117,10 @@ def _object(folder: Path, file: str, place: str, flags: Sequence[str]) -> Path:
 
 
 def _done(command: Sequence[str], otherwise: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise CompileError(f"{otherwise}: '{command[0]}' cannot be started: {error.strerror}") from None
     if done.returncode != 0:
         raise CompileError(f"{otherwise}: {done.stderr.strip()[-2000:]}")
 

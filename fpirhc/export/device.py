@@ -40,7 +40,15 @@ _C_WORDS = frozenset(
         true false""",
     )
 )
-_FILES = frozenset(("processor", "board", "example"))  # C files that are not the controller's own
+# Files beside the controller's own, headers of C whose place it would take, and targets that CMake and make have
+_FILES = frozenset(
+    re.findall(
+        r"\w+",
+        """processor board example replay samples layout sizes controller all install clean help package test
+        assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef stdint stdio
+        stdlib string tgmath time wchar wctype""",
+    )
+)
 _LONGEST = 40  # characters of a name
 
 

@@ -87,7 +87,7 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
         return Native(function, True, "")
     compiler = find_compiler()
     if compiler is None:
-        return Native(function, False, _why_no_compiler())
+        return Native(function, False, why_no_compiler())
     try:
         note = _note(function, compiler, flags, calls)
         known = _noted(note) if note else None
@@ -126,7 +126,8 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="fpirhc-", ignore_cleanup_errors=True)
 
 
-def _why_no_compiler() -> str:
+def why_no_compiler() -> str:
+    """Return why `find_compiler` finds none."""
     setting = os.environ.get("FPIRHC_CC", "")
     if setting.lower() == "none":
         return "compilation is turned off (FPIRHC_CC=none)"
@@ -268,7 +269,7 @@ def shared_library(sources: Sequence[str], flags: Sequence[str] = (), libraries:
     """
     compiler = find_compiler()
     if compiler is None:
-        raise CompileError(_why_no_compiler())
+        raise CompileError(why_no_compiler())
     units, link = [_unit(source, compiler, flags) for source in sources], (compiler, *flags, *_LINK)
     key = hashlib.sha256("\0".join((*(unit.key for unit in units), *link, *libraries)).encode()).hexdigest()[:32]
     path = cache_folder() / f"{key}{_suffix()}"

@@ -17,7 +17,8 @@ import pytest
 import fpirhc as fp
 from fpirhc.errors import InvalidName, NotSupported, OutputError
 from fpirhc.export.device import Device, default_name, identifiers
-from fpirhc.export.target import device_of, target_called, targets, with_faults, write
+from fpirhc.export.samples import with_faults
+from fpirhc.export.target import device_of, target_called, targets, write
 from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.symbolic.program import generate
@@ -171,6 +172,29 @@ def test_a_device_refuses_wrong_settings_and_never_leaves_the_limits_of_the_buil
     assert float(command) == float(traced) == device.problem.limits.inputs["Q1"][1]
     assert third == "1 -0.75"
     assert fourth == "0"
+
+
+PAIR = r"""
+#include "arm.h"
+#include <stdio.h>
+int main(void) {
+  static arm_controller c;
+  arm_init(&c);
+  printf("%d%d", arm_set(&c, ARM_SET_DEFORMATION_WEIGHTS_0, 0.8), arm_set(&c, ARM_SET_DEFORMATION_WEIGHTS_1, 0.6));
+  return 0;
+}
+"""
+
+
+@needs_compiler
+def test_two_weights_of_a_list_are_no_interval(tmp_path):
+    """The first may be above the second, as Python takes them."""
+    problem, _ = two_mass()
+    controller = fp.ComputedTorque(fp.Exponential(6.0), fp.Affine(gain=-0.2, weights=(0.9, 0.5)))
+    live = ("deformation.weights.0", "deformation.weights.1")
+    write(device_of(problem, controller, "CTC", name="arm", live=live, cycles=1), target_called("c"), tmp_path)
+    (tmp_path / "set.c").write_text(PAIR)
+    assert output(built(tmp_path, main="set.c")) == "11"
 
 
 def test_a_number_that_must_follow_from_a_setting_is_not_left_behind():
@@ -347,7 +371,7 @@ def two_mass() -> tuple[Any, Any]:
     return task.problem, task.controllers
 
 
-@pytest.mark.parametrize("name", ["2nd", "a b", "int", "processor", "", "x" * 41, "ü"])
+@pytest.mark.parametrize("name", ["2nd", "a b", "int", "processor", "replay", "test", "math", "", "x" * 41, "ü"])
 def test_a_name_that_c_does_not_take_is_refused(name):
     problem, controllers = two_mass()
     with pytest.raises(InvalidName, match=r"cannot be the name of a controller in C.*Did you mean"):

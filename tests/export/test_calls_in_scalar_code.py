@@ -38,4 +38,6 @@ def test_a_plant_with_a_table_runs_as_in_the_virtual_machine_and_leaves_its_memo
     np.testing.assert_allclose(runs[1]["command"], runs[0]["command"], rtol=1e-9)
     device = device_of(PROBLEM, controller, "table", name="table", cycles=100)
     write(device, target_called("c"), tmp_path)
-    assert "differ in a bit: command 0, memory 0, trace 0" in output(built(tmp_path, *SANITIZED), tmp_path / "samples.bin")
+    assert "differ in a bit: command 0, memory 0, trace 0" in output(
+        built(tmp_path, *SANITIZED), tmp_path / "samples.bin"
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import re
 import shutil
 import struct
@@ -10,16 +11,19 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 import fpirhc as fp
+import fpirhc.export.processor
 from fpirhc.cli.main import main
 from fpirhc.errors import InvalidField, InvalidValue, OutputError
 from fpirhc.export.cortex import Image
 from fpirhc.export.device import Device
-from fpirhc.export.target import Processor, device_of, target_called, write
+from fpirhc.export.processor import Processor
+from fpirhc.export.target import device_of, target_called, write
 from fpirhc.symbolic.native import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -153,6 +157,82 @@ def test_a_wrong_program_is_named_before_the_run(make, error, message):
     problem = replace(fp.load_problem("two_mass").problem, duration=0.05, measure_from=0.0)
     with pytest.raises(error, match=message):
         fp.simulate(problem, make(), seed=0)
+
+
+class Board:
+    """A port of a board that leaves the sixth sample without an answer until it is opened again."""
+
+    opened: ClassVar[list[Board]] = []
+
+    def __init__(self) -> None:
+        self.lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self.samples, self.closed = 0, False
+        if self.opened:
+            self.lines.put(ZEROS.encode() + b"\n")
+        self.opened.append(self)
+
+    def write(self, data: bytes, /) -> None:
+        self.samples += data[:1] == b"s"
+        answer = {b"h": "h arm 7 2", b"r": "r"}.get(data[:1], ZEROS).encode() + b"\n"
+        if len(self.opened) > 1 or self.samples < 6:
+            self.lines.put(answer)
+
+    def flush(self) -> None: ...
+
+    def readline(self) -> bytes:
+        return self.lines.get()
+
+    def close(self) -> None:
+        self.closed = True
+        self.lines.put(b"")
+
+
+def test_a_port_is_closed_after_a_late_answer_and_the_next_run_opens_it_again(monkeypatch):
+    """The answer that comes late is no answer to the next question."""
+    monkeypatch.setattr(Board, "opened", [])
+    problem = replace(fp.load_problem("two_mass").problem, duration=0.02, measure_from=0.0)
+    controller = Processor(Board, deadline=0.2)
+    with pytest.warns(RuntimeWarning, match="gave no answer in 0.2 s"):
+        assert len(fp.simulate(problem, controller, seed=0).time) == 5
+    assert len(fp.simulate(problem, controller, seed=0).time) == 20
+    assert [port.closed for port in Board.opened] == [True, False]
+
+
+def test_a_session_with_many_programs_leaves_few_of_them_running(monkeypatch):
+    started = []
+
+    class Noted(subprocess.Popen):
+        def __init__(self, *arguments: Any, **named: Any) -> None:
+            super().__init__(*arguments, **named)
+            started.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Noted)
+    monkeypatch.setattr(fpirhc.export.processor, "_MOST", 2)
+    problem = replace(fp.load_problem("two_mass").problem, duration=0.005, measure_from=0.0)
+    first, *others = (Processor(talking(cycles=100 + k)) for k in range(4))
+    for controller in (first, *others):
+        assert len(fp.simulate(problem, controller, seed=0).time) == 5
+    assert [one.poll() is None for one in started] == [False, False, True, True]
+    assert len(fp.simulate(problem, first, seed=0).time) == 5
+
+
+@needs_compiler
+def test_a_program_is_told_how_many_numbers_a_wide_sample_has(tmp_path):
+    """A hundred and three: more than two digits."""
+    names = [f"x{k}" for k in range(34)]
+    plant = fp.Plant(
+        coordinates=dict.fromkeys(names, "m"),
+        inputs={f"F{k}": "N" for k in range(34)},
+        order=2,
+        response=lambda q, v, u, p: {name: u[f"F{name[1:]}"] / p.m for name in names},
+        parameters={"m": fp.Parameter(1.2, 1.0, "kg")},
+    )
+    reference = fp.Trajectory(lambda t: dict.fromkeys(names, 0 * t))
+    problem = fp.Problem(plant, reference, start=dict.fromkeys(names, 0.1), period=1e-2, duration=0.05)
+    controller = fp.ComputedTorque(fp.Exponential(5.0))
+    device = device_of(problem, controller, "wide", name="wide", cycles=1)
+    write(device, target_called("c"), tmp_path)
+    assert answers([program(tmp_path)], "h\n") == ["h wide 103 34"]
 
 
 @needs_compiler

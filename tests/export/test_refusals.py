@@ -31,14 +31,21 @@ two_mass RHC+FPI --to cortex-m =>
 two_mass RHC+FPI --to fmu =>
     the target fmu needs fmpy, which is not installed: pip install 'fpirhc[fmu]'
 two_mass RHC+FPI --check =>
-    a program of this machine needs a C compiler: install gcc or clang, or name one by FPIRHC_CC
+    a program of this machine needs a C compiler: compilation is turned off (FPIRHC_CC=none); install gcc or clang, or name one
+    by FPIRHC_CC
 two_mass RHC+FPI --to library =>
-    a shared library needs a C compiler: install gcc or clang, or pip install 'fpirhc[compiler]'
+    a shared library needs a C compiler: compilation is turned off (FPIRHC_CC=none); install gcc or clang, or pip install
+    'fpirhc[compiler]'
 two_mass RHC+FPI --out full =>
     'full' is not an empty folder, and nothing in it is replaced; choose another one with --out
 two_mass RHC+FPI --name 2nd =>
     '2nd' cannot be the name of a controller in C: expected at most 40 letters, digits and underscores, a letter first, and no
     word of C or of the files beside it. Did you mean 'c_2nd'?
+two_mass RHC+FPI --name replay =>
+    'replay' cannot be the name of a controller in C: expected at most 40 letters, digits and underscores, a letter first, and no
+    word of C or of the files beside it. Did you mean 'c_replay'?
+anaesthesia CTC+FPI --to ros2_control =>
+    ros2_control updates a whole number of times per second, and the period is 5 s: the nearest one is 1 s
 two_mass RHC+FPI --bare --live deformation.gain =>
     --bare has no live settings, since nothing checks them: leave out 'deformation.gain' or --bare
 two_mass RHC+FPI --to arduino --libm own =>
@@ -74,3 +81,27 @@ def test_what_is_refused_says_why_and_what_to_do(row, tmp_path, monkeypatch, cap
     assert code == (3 if "full" in words else 2)
     assert not (tmp_path / "new").exists()
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize(
+    ("compiler", "words", "reason"),
+    [
+        ("broken", "--to library", "no library for {here}: '{compiler}' cannot be started: No such file or directory"),
+        (
+            "absent",
+            "--check",
+            "the C compiler '{compiler}', asked for by FPIRHC_CC, was not found; install gcc or clang",
+        ),
+    ],
+)
+def test_a_compiler_that_does_not_work_is_named_and_no_folder(compiler, words, reason, tmp_path, monkeypatch, capsys):
+    """One whose interpreter is not there cannot be started, which is no fault of the folder."""
+    path = tmp_path / compiler
+    if compiler == "broken":
+        path.write_text("#!/no/such/interpreter\n")
+        path.chmod(0o700)
+    monkeypatch.setenv("FPIRHC_CC", str(path))
+    monkeypatch.setattr(binaries, "find_spec", lambda _: None)
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "two_mass", "CTC+FPI (eq 6)", *words.split(), "--out", "new", "--cycles", "1"]) == 2
+    assert reason.format(here=binaries._here(), compiler=path) in capsys.readouterr().err

@@ -132,6 +132,22 @@ def test_a_state_that_is_kept_comes_back_and_a_reset_begins_anew(target, tmp_pat
         assert cycles(0, 20) == before
 
 
+@needs_compiler
+@pytest.mark.parametrize("target", ["fmu", "fmu2"])
+def test_what_is_read_before_the_start_is_not_the_command_of_the_start(target, tmp_path):
+    """The reference is another one at t = 5 s."""
+    _, path = exported("torque", tmp_path, target)
+    said = []
+    with master(path) as unit:
+        for early in (True, False):
+            unit.unit.reset()
+            if early:
+                unit.get(unit.names("output"))
+            unit.begin(5.0)
+            said.append(unit.get(unit.names("output")).tolist())
+    assert said[0] == said[1]
+
+
 def test_without_a_compiler_a_unit_holds_its_sources_and_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(binaries, "find_compiler", lambda: None)
     exported("torque", tmp_path, "fmu")

@@ -253,6 +253,36 @@ def test_a_plant_whose_time_is_in_years_has_no_plugin(tmp_path):
         write(device, target_called("ros2_control"), tmp_path / "out")
 
 
+@pytest.mark.parametrize(
+    ("period", "unit", "paced"),
+    [
+        (1e-3, "s", ("TICKS = 1000;", "#define TICKS 1UL\n#define TICK 0.001")),
+        (2.5e-3, "s", ("TICKS = 2500;", "#define TICKS 3UL\n#define TICK 0.0008333333333333334")),
+        (0.5, "ms", ("TICKS = 500;", "#define TICKS 1UL\n#define TICK 0.0005")),
+        (0.05, "min", ("TICKS = 3000000;", "#define TICKS 3000UL\n#define TICK 0.001")),
+    ],
+)
+def test_examples_for_boards_keep_the_pace_of_the_controller(period, unit, paced, monkeypatch):
+    """An Arduino counts microseconds, and the system tick of a Cortex-M whole shares of a period, of at most a millisecond."""
+    monkeypatch.setattr("fpirhc.export.targets.cortex_m.arm_programs", lambda *_: {})
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    plant = fp.Plant(
+        coordinates={"x": "m"},
+        inputs={"F": "N"},
+        order=2,
+        response=lambda q, v, u, p: {"x": u.F / p.m},
+        parameters={"m": fp.Parameter(1.2, 1.0, "kg")},
+        time_unit=unit,
+    )
+    problem = fp.Problem(
+        plant, fp.Trajectory(lambda t: {"x": 0 * t}), start={"x": 0.1}, period=period, duration=5 * period
+    )
+    device = device_of(problem, fp.ComputedTorque(fp.Exponential(0.1 / period)), "CTC", name="arm", cycles=1)
+    arduino, cortex = (target_called(one).files(device) for one in ("arduino", "cortex-m"))
+    assert f"const unsigned long {paced[0]}" in str(arduino["examples/arm/arm.ino"])
+    assert paced[1] in str(cortex["example.c"])
+
+
 @needs_compiler
 def test_a_library_answers_as_the_stepper_bit_by_bit(tmp_path):
     """Arrays in and out by ctypes, two controllers side by side, a setting by its number."""

@@ -2,8 +2,7 @@
 
 #include <@name@.h>
 
-const unsigned long MICROSECONDS_PER_UNIT = 1000000; /* of @NAME@_PERIOD, which is in @unit@ */
-const unsigned long TICKS = (unsigned long)(@NAME@_PERIOD * MICROSECONDS_PER_UNIT + 0.5);
+const unsigned long TICKS = @ticks@; /* microseconds of @NAME@_PERIOD, which is in @unit@ */
 
 static @name@_controller controller;
 static @name@_inputs in;
@@ -22,6 +21,10 @@ void loop() {
   unsigned long begun = micros(), took;
   if ((long)(begun - due) < 0) return;
   due += TICKS;
+  if (cycle > @NAME@_CYCLES) { /* a float resolves no later time; begin anew where it suits your task better */
+    @name@_reset(&controller);
+    cycle = 0;
+  }
   in.time = cycle++ * @NAME@_PERIOD;
   read_sample(&in);
   @name@_step(&controller, &in, &out);

@@ -17,7 +17,7 @@ from pathlib import Path
 from fpirhc.errors import CompileError, InvalidValue, NotSupported
 from fpirhc.export.device import Device
 from fpirhc.export.target import Target, device_of
-from fpirhc.export.targets.c import filled, layout_of, sources
+from fpirhc.export.targets.c import IN_FLOAT, filled, layout_of, seconds, sources
 
 _SHORT_CALLS = "-Wl,--relax"  # calls of what is near take two bytes less
 _FLAGS = (
@@ -81,14 +81,33 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     if sizes and all(lacking.values()):
         least = "; ".join(f"{board} lacks {what}" for board, what in lacking.items())
         raise NotSupported(f"'{device.title}' fits no board: {least}. Use {_smaller(device)}")
-    sketch = filled(device, "arduino.ino", unit=device.problem.plant.time_unit)
+    sketch = filled(device, "arduino.ino", unit=device.problem.plant.time_unit, ticks=str(_ticks(device)))
     return {
         "library.properties": _properties(device),
         **{f"src/{file}": text for file, text in own.items()},
         f"examples/{device.name}/{device.name}.ino": sketch,
         "layout.json": json.dumps(layout_of(device), indent=1),
-        "sizes.txt": "".join(_line(board, size) for board, size in sizes.items()) or "avr-gcc is not installed\n",
+        "sizes.txt": "".join([*_sizes(sizes), _clock(device)]),
     }
+
+
+def _sizes(sizes: Mapping[_Board, _Size]) -> list[str]:
+    return [_line(board, size) for board, size in sizes.items()] or ["avr-gcc is not installed\n"]
+
+
+def _clock(device: Device) -> str:
+    hours = IN_FLOAT * seconds(device, "the target arduino") / 3600
+    return f"In float a time tells its cycle for {IN_FLOAT} cycles, {hours:.3g} h: then the example begins anew at time 0.\n"
+
+
+def _ticks(device: Device) -> int:
+    """The period in microseconds."""
+    ticks = round(1e6 * seconds(device, "the target arduino"))
+    if not 1 <= ticks < 2**31:  # half of what the counter of microseconds holds
+        raise InvalidValue(
+            f"the period of {1e-6 * ticks:g} s is none that the clock of an Arduino counts: expected 1 us to 35 min"
+        )
+    return ticks
 
 
 def _own(device: Device) -> dict[str, str]:

@@ -14,9 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from fpirhc.controllers.gate import HELD
+from fpirhc.errors import InvalidValue
 from fpirhc.export.binaries import own_compiler, program
 from fpirhc.export.device import Device, identifiers, literal
-from fpirhc.export.target import Target, recorded
+from fpirhc.export.samples import recorded
+from fpirhc.export.target import Target
+from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.clock import LONGEST, MEMORY
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.status import Status
@@ -26,6 +29,7 @@ from fpirhc.symbolic.live import PREFIX
 
 _FEW = 12  # entries of a signal that are named in C; longer ones are arrays
 _WIDTH = 120
+IN_FLOAT = 2**22  # cycles from time 0 on, in float: a time is known to an eighth of a period
 _TYPES = """#ifndef casadi_real
 #define casadi_real double
 #endif
@@ -85,6 +89,16 @@ def filled(device: Device, file: str, **more: str) -> str:
     return template(file, {"name": device.name, "NAME": device.name.upper(), "title": device.title, **more})
 
 
+def seconds(device: Device, where: str) -> float:
+    """Return the period in seconds, for a target that runs in real time."""
+    unit = device.problem.plant.time_unit
+    if unit not in SECONDS:
+        raise InvalidValue(
+            f"{where} runs in real time: a period in {', '.join(SECONDS)} was expected, got one in {unit}"
+        )
+    return float(device.problem.period) * SECONDS[unit]
+
+
 def template(file: str, words: Mapping[str, str], package: str = "fpirhc.export.targets") -> str:
     """Return a template of a package with its words between @ filled in."""
     text = resources.files(package).joinpath(file).read_text(encoding="utf-8")
@@ -119,6 +133,8 @@ def _header(device: Device) -> str:
         "#endif",
         "",
         f"#define {upper}_PERIOD {float(device.problem.period)!r} /* {device.problem.plant.time_unit} */",
+        f"/* Cycles from time 0 on, beyond which a time in float no longer tells its cycle: {name}_reset, and time 0, before. */",
+        f"#define {upper}_CYCLES (sizeof(casadi_real) == sizeof(float) ? {IN_FLOAT}UL : 4294967294UL)",
         *[f"#define {upper}_{key} {value} /* numbers */" for key, value in counts.items()],
         "",
         f"typedef enum {{\n{_list(f'{upper}_{s.name} = {int(s)}' for s in Status)}\n}} {name}_status;",
@@ -253,7 +269,7 @@ def _setter(device: Device) -> str:
     if not device.bounds:
         return ""
     paths = list(device.bounds)
-    other = [_other_end(path, paths) for path in paths]
+    other = [_other_end(path, device) for path in paths]
     places = [device.settings.slice(PREFIX + path).start for path in paths]
     low, high = (np.array([ends[k] for ends in device.bounds.values()]) for k in (0, 1))
     tables = of_type("\n".join([_table("LOWEST", low), _table("HIGHEST", high)])).replace(OF_TYPE, "")
@@ -277,12 +293,19 @@ int {device.name}_set({device.name}_controller* c, {device.name}_setting setting
 """
 
 
-def _other_end(path: str, paths: list[str]) -> int:
-    """K + 1 for the lower end of an interval whose upper end is setting k, -k - 1 for its upper end, else 0."""
+def _other_end(path: str, device: Device) -> int:
+    """K + 1 for the lower end of an interval whose upper end is setting k, -k - 1 for its upper end, else 0.
+
+    Two numbers are an interval, and no list of gains, where Python's check lets neither pass the other: their bounds say so.
+    """
     owner, _, end = path.rpartition(".")
-    if end == "0" and f"{owner}.1" in paths:
-        return paths.index(f"{owner}.1") + 1
-    return -paths.index(f"{owner}.0") - 1 if end == "1" and f"{owner}.0" in paths else 0
+    paths, (low, high) = list(device.bounds), (f"{owner}.0", f"{owner}.1")
+    if end not in ("0", "1") or low not in paths or high not in paths:
+        return 0
+    numbers = device.stepper.numbers
+    if device.bounds[low][1] > numbers[high] or device.bounds[high][0] < numbers[low]:
+        return 0
+    return paths.index(high) + 1 if path == low else -paths.index(low) - 1
 
 
 def _table(name: str, values: np.ndarray) -> str:

@@ -6,14 +6,17 @@ The programs answer lines over semihosting, see `processor.c`: in QEMU, in a deb
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from fpirhc.export.binaries import arm_programs
 from fpirhc.export.device import Device
-from fpirhc.export.target import Target, recorded
-from fpirhc.export.targets.c import filled, layout_of, sources
+from fpirhc.export.samples import recorded
+from fpirhc.export.target import Target
+from fpirhc.export.targets.c import filled, layout_of, seconds, sources
+from fpirhc.plant.motion import SECONDS
 
 
 def _files(device: Device) -> Mapping[str, str | bytes]:
@@ -25,11 +28,20 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         **own,
         **around,
         "board.ld": script,
-        "example.c": filled(device, "example.c", unit=device.problem.plant.time_unit),
+        "example.c": filled(device, "example.c", unit=device.problem.plant.time_unit, pace=_pace(device)),
         "layout.json": json.dumps(layout_of(device), indent=1),
         "samples.bin": recorded(device),
         **{(f"{name}_{file}" if file.endswith(".elf") else f"lib{name}_{file}"): data for file, data in made.items()},
     }
+
+
+def _pace(device: Device) -> str:
+    """Lines with the system ticks of a period, each of at most a millisecond, and the length of one."""
+    unit = device.problem.plant.time_unit
+    if unit not in SECONDS:
+        return f'#error "the period is in {unit}: define TICKS, the system ticks in a period, and TICK, the seconds of one"'
+    ticks = max(1, math.ceil(1e3 * seconds(device, "the target cortex-m") * (1 - 1e-9)))
+    return f"#define TICKS {ticks}UL\n#define TICK {seconds(device, 'the target cortex-m') / ticks!r}"
 
 
 def _processor(folder: Path, name: str) -> Sequence[str]:

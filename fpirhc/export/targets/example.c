@@ -6,11 +6,12 @@
 #endif
 #include BOARD_HEADER
 
+#include <stdint.h>
+
 #include "@name@.h"
 
-#define TICKS_PER_SECOND 1000
-#define SECONDS_PER_UNIT 1 /* of @NAME@_PERIOD, which is in @unit@ */
-#define TICKS ((unsigned long)(@NAME@_PERIOD * SECONDS_PER_UNIT * TICKS_PER_SECOND + 0.5))
+/* System ticks in @NAME@_PERIOD, which is in @unit@, and the seconds of one. */
+@pace@
 
 void read_sample(@name@_inputs* in);          /* all but the time */
 void write_command(const @name@_command* out);
@@ -25,19 +26,23 @@ void SysTick_Handler(void) {
 }
 
 int main(void) {
-  unsigned long cycle = 0;
+  unsigned long cycle = 0, begun = 0;
   @name@_inputs in;
   @name@_command out;
   @name@_init(&controller);
   CoreDebug->DEMCR |= CoreDebug_DEMCR_TRCENA_Msk;
   DWT->CTRL |= DWT_CTRL_CYCCNTENA_Msk;
-  SysTick_Config(SystemCoreClock / TICKS_PER_SECOND);
+  SysTick_Config((uint32_t)(SystemCoreClock * TICK + 0.5));
   for (;;) {
     unsigned long began, took;
     while (due == cycle) __WFI();
     cycle = due; /* cycles that were missed are made up for by the next step, from its time */
     read_sample(&in);
-    in.time = (casadi_real)cycle * (casadi_real)@NAME@_PERIOD;
+    if (cycle - begun > @NAME@_CYCLES) { /* no later time is resolved, which matters in float; begin anew where it suits you better */
+      @name@_reset(&controller);
+      begun = cycle;
+    }
+    in.time = (casadi_real)(cycle - begun) * (casadi_real)@NAME@_PERIOD;
     began = DWT->CYCCNT;
     @name@_step(&controller, &in, &out);
     took = DWT->CYCCNT - began;

@@ -41,7 +41,7 @@ fmi2Status fmi2SetDebugLogging(fmi2Component instance, fmi2Boolean on, size_t nu
 fmi2Status fmi2SetupExperiment(fmi2Component instance, fmi2Boolean tolerances, fmi2Real tolerance, fmi2Real start, fmi2Boolean stops,
                                fmi2Real stop) {
   (void)tolerances, (void)tolerance, (void)stops, (void)stop;
-  ((unit*)instance)->s.start = (casadi_real)start;
+  start_at(&((unit*)instance)->s, start);
   return fmi2OK;
 }
 

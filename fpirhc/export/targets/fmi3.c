@@ -45,7 +45,7 @@ fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t num
 fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolerances, fmi3Float64 tolerance, fmi3Float64 start,
                                        fmi3Boolean stops, fmi3Float64 stop) {
   (void)tolerances, (void)tolerance, (void)stops, (void)stop;
-  ((unit*)instance)->s.start = (casadi_real)start;
+  start_at(&((unit*)instance)->s, start);
   return fmi3OK;
 }
 

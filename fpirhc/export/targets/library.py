@@ -10,6 +10,7 @@ from fpirhc.export.binaries import ENDINGS, shared_libraries
 from fpirhc.export.device import Device
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, sources
+from fpirhc.symbolic.native import why_no_compiler
 
 
 def _files(device: Device) -> Mapping[str, str | bytes]:
@@ -23,7 +24,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     made = {f"{name}_{at}{ENDINGS[at.split('-')[1]]}": data for at, data in shared_libraries(own).items()}
     if not made:
         raise NotInstalled(
-            "a shared library needs a C compiler: install gcc or clang, or pip install 'fpirhc[compiler]'"
+            f"a shared library needs a C compiler: {why_no_compiler()}; install gcc or clang, or pip install 'fpirhc[compiler]'"
         )
     return {**own, **made, "layout.json": json.dumps(layout_of(device), indent=1)}
 

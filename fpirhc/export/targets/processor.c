@@ -29,9 +29,10 @@ static void say_number(double value) {
 }
 
 static void say_whole(int value) {
+  int unit = 1;
+  while (value / unit >= 10) unit *= 10;
   put(' ');
-  if (value >= 10) put('0' + value / 10 % 10);
-  put('0' + value % 10);
+  for (; unit; unit /= 10) put('0' + value / unit % 10);
 }
 
 static int last;

@@ -45,8 +45,7 @@ class Controller : public controller_interface::ControllerInterface {
   Return on_init() override {
     auto_declare<std::vector<std::string>>("state_interfaces", {@states@});
     auto_declare<std::vector<std::string>>("command_interfaces", {@commands@});
-@declared@    @name@_init(&controller_);
-    return Return::SUCCESS;
+@declared@    return Return::SUCCESS;
   }
 
   controller_interface::InterfaceConfiguration state_interface_configuration() const override { return named("state_interfaces"); }
@@ -58,6 +57,7 @@ class Controller : public controller_interface::ControllerInterface {
     if (std::abs(rate - 1) > 1e-6) return failed("the update rate must be one cycle per period");
     if (named("state_interfaces").names.size() != @NAME@_INPUTS - 1) return failed("state_interfaces: expected @given@ names");
     if (named("command_interfaces").names.size() != @NAME@_COMMANDS) return failed("command_interfaces: expected @sent@ names");
+    @name@_init(&controller_);  // settings begin from those of the build, in whose order they are accepted
 @set@    return Return::SUCCESS;
   }
 

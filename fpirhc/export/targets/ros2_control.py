@@ -9,7 +9,7 @@ from xml.sax.saxutils import escape
 from fpirhc.errors import InvalidValue
 from fpirhc.export.device import Device, identifiers
 from fpirhc.export.target import Target
-from fpirhc.export.targets.c import filled, layout_of, sources
+from fpirhc.export.targets.c import filled, layout_of, seconds, sources
 from fpirhc.plant.motion import SECONDS
 
 _DERIVATIVES = ("position", "velocity", "acceleration", "jerk")
@@ -17,11 +17,7 @@ _DERIVATIVES = ("position", "velocity", "acceleration", "jerk")
 
 def _files(device: Device) -> Mapping[str, str | bytes]:
     name, own = device.name, sources(device)
-    unit = device.problem.plant.time_unit
-    if unit not in SECONDS:
-        raise InvalidValue(
-            f"ros2_control runs in real time: a period in {', '.join(SECONDS)} was expected, got one in {unit}"
-        )
+    _check_rate(seconds(device, "ros2_control"))
     states, commands = _states(device), [f"{one}/effort" for one in device.problem.plant.inputs]
     controller = filled(
         device,
@@ -32,7 +28,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         set=_set(device),
         given=str(len(states)),
         sent=str(len(commands)),
-        seconds=repr(SECONDS[unit]),
+        seconds=repr(SECONDS[device.problem.plant.time_unit]),
     )
     words = {"sources": " ".join(file for file in own if file.endswith(".c")), "text": escape(device.title)}
     return {
@@ -46,6 +42,16 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
 
 
 TARGET = Target("ros2_control", "package with a plugin of the controller manager", _files)
+
+
+def _check_rate(period: float) -> None:
+    """Raise for a period that no update rate of a controller manager has: a whole number of cycles per second."""
+    rate = max(1, round(1 / period))
+    if abs(rate * period - 1) > 1e-6:
+        raise InvalidValue(
+            f"ros2_control updates a whole number of times per second, and the period is {period:g} s: the nearest one is "
+            f"{1 / rate:.6g} s"
+        )
 
 
 def _states(device: Device) -> list[str]:

@@ -32,6 +32,12 @@ static void begin(cycle_state* s) {
 /* The time is counted in cycles, so that it is that of a run to the last bit. */
 static casadi_real now(const cycle_state* s) { return s->start + (casadi_real)s->cycle * @NAME@_PERIOD; }
 
+/* What was computed for another time is computed again. */
+static void start_at(cycle_state* s, double time) {
+  s->start = (casadi_real)time;
+  s->fresh = 0;
+}
+
 static void evaluate(cycle_state* s) {
   if (s->fresh) return;
   s->c.memory = s->before;

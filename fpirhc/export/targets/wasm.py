@@ -7,7 +7,8 @@ from collections.abc import Mapping
 
 from fpirhc.export.binaries import web_module
 from fpirhc.export.device import Device, identifiers
-from fpirhc.export.target import Target, recorded
+from fpirhc.export.samples import recorded
+from fpirhc.export.target import Target
 from fpirhc.export.targets.c import data_of, filled, layout_of, sources
 
 
