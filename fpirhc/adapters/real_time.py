@@ -2,18 +2,21 @@
 
 A bus is a link: it is opened, takes the values of the inputs, and gives those of the measurements with their ages. A bad status
 is an exception of the link, and a value that is too old is one of the device: both are bad answers, see `ExternalPlant`.
+A bad answer lasts its cycle, and a cycle that ends more than a period late is one too: no burst of commands makes up for it.
 A bus without time stamps has a counter in their place: the values are as old as the time for which it stands still.
 """
 
 from __future__ import annotations
 
 import time as wall
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
 
+from fpirhc.adapters.names import require
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -32,15 +35,38 @@ class RealTime:
 
     clock: Callable[[], float] = wall.monotonic
     sleep: Callable[[float], None] = wall.sleep
-    _begin: float = 0.0
+    _zero: float | None = None  # the wall time at which the run has time 0
 
     def begin(self) -> None:
-        """Now is time 0 of the run."""
-        self._begin = self.clock()
+        """The next cycle is the first; what is built before it has no cycle."""
+        self._zero = None
 
-    def wait_until(self, time: float) -> None:
-        """Return at this time of the run, at once where it has passed."""
-        self.sleep(max(self._begin + time - self.clock(), 0.0))
+    @contextmanager
+    def cycle(self, time: float, period: float) -> Iterator[None]:
+        """Do what stands in the body, and return at the end of the cycle that has begun at this time of the run.
+
+        Raises:
+            InvalidProblem: the cycle ended more than a period late; the run goes on from now.
+        """
+        if self._zero is None:
+            self._zero = self.clock() - time
+        try:
+            yield
+        finally:
+            late = self._late(self._zero + time + period, period)
+        require(
+            late <= period,
+            f"the cycle of {period:g} s ended {late:.3g} s late; choose a longer period, or a quicker bus or controller",
+        )
+
+    def _late(self, end: float, period: float) -> float:
+        """Wait for the end; where it is missed by a period, commands until now would else go out at one instant."""
+        assert self._zero is not None
+        self.sleep(max(end - self.clock(), 0.0))
+        late = self.clock() - end
+        if late > period:
+            self._zero += late
+        return late
 
 
 class Link(Protocol):
@@ -147,8 +173,8 @@ class _Device:
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
         """Write the command, and read at the end of the cycle."""
-        self._link.write(command)
-        self._clock.wait_until(time + self._setup.period)
+        with self._clock.cycle(time, self._setup.period):
+            self._link.write(command)
         return self._measured()
 
     def _measured(self) -> np.ndarray:

@@ -61,18 +61,18 @@ class _Twin:
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
         """Hold the heaters for a cycle."""
+        self._heat(command)
+        self._lab.update(time + self._period)
+        return self._measured()
+
+    def _heat(self, command: np.ndarray) -> None:
         for name, value in zip(self._model.inputs, command, strict=True):
             getattr(self._lab, name)(float(value))
-        self._wait(time + self._period)
-        return self._measured()
 
     def _begun(self) -> Any:
         lab = self._tclab.tclab.TCLabModel(synced=False)
         lab.tstart = lab.tlast = 0.0
         return lab
-
-    def _wait(self, time: float) -> None:
-        self._lab.update(time)
 
     def _measured(self) -> np.ndarray:
         return np.array([getattr(self._lab, name) for name in self._model.output.elements])
@@ -92,5 +92,8 @@ class _Board(_Twin):
         self._now.begin()
         return lab
 
-    def _wait(self, time: float) -> None:
-        self._now.wait_until(time)
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Hold the heaters until the cycle is over."""
+        with self._now.cycle(time, self._period):
+            self._heat(command)
+        return self._measured()

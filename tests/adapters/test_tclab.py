@@ -91,9 +91,13 @@ def test_the_board_is_asked_when_its_cycle_is_over(monkeypatch):
     monkeypatch.setattr(tclab, "TCLab", Board)
     body: Any = tclab_body(LAB, period=PERIOD, board=RealTime(lambda: now[0], sleep)).body
     body.reset(0)
-    now[0] += 0.5  # the controller's own time
     body.step(0.0, np.array([50.0, 0.0]))
-    assert now[0] == pytest.approx(102.0)
+    now[0] += 0.5  # the controller's own time
+    body.step(2.0, np.array([50.0, 0.0]))
+    assert now[0] == pytest.approx(104.0)
+    now[0] += 5.0
+    with pytest.raises(InvalidProblem, match=r"the cycle of 2 s ended 3 s late"):
+        body.step(4.0, np.array([50.0, 0.0]))
     first = body._lab
     now[0] = 100.0
     body.reset(0)
