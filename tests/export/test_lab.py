@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.cli.verbs.lab import page_in
 from fpirhc.contraction.spectrum import factors_along, response_jacobians
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import InvalidValue, NotSupported
@@ -244,6 +246,23 @@ def test_a_page_runs_its_own_scripts_and_webassembly_alone(short, monkeypatch):
     assert "<title>&lt;b&gt;&amp;: lab</title>" in text
     assert text.count("</script>") == 3
     assert "@" not in resources.files("fpirhc.export.lab").joinpath("lab.js").read_text()
+
+
+def test_every_loop_has_a_colour_however_many_there_are(short, monkeypatch):
+    """UPlot draws no line without one; there are ten colours."""
+    monkeypatch.setattr(LabLoop, "module", b"")
+    text = page(replace(short, loops=short.loops[:1] * 12))
+    [listed] = re.findall(r'"colors":(\[[^]]*\])', text)
+    colours = json.loads(listed)
+    assert colours[10:] == colours[:2]
+
+
+@pytest.mark.parametrize(
+    ("out", "path"),
+    [("results", "results/two_mass-lab.html"), ("new/", "new/two_mass-lab.html"), ("my.html", "my.html")],
+)
+def test_a_place_without_an_ending_is_a_folder_also_where_it_is_not_there_yet(out, path):
+    assert page_in(Path(out), "two_mass") == Path(path)
 
 
 @pytest.mark.slow

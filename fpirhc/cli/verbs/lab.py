@@ -16,7 +16,9 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--controllers", nargs="+", metavar="NAME", help=text)
     text = "settings with a slider (default: gains, rates, limits of inputs, dead times, the reference); parameters always have one"
     parser.add_argument("--live", nargs="+", default=[], metavar="PATH", help=text)
-    parser.add_argument("--out", metavar="FILE", help="the page, or a folder for it (default: results)")
+    parser.add_argument(
+        "--out", metavar="FILE", help="the page, such as page.html, or a folder for it (default: results)"
+    )
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -24,8 +26,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
 
     task = load_problem(options.problem)
-    path = Path(options.out or "results")
-    path = path / f"{task.name}-lab.html" if path.is_dir() or not options.out else path
+    path = page_in(Path(options.out or "results"), task.name)
     output_folder(path.parent)
     lab = lab_of(task, options.problem, options.controllers or (), options.live)
     write_lab(lab, path)
@@ -34,6 +35,11 @@ def _run(options: argparse.Namespace) -> ExitCode:
         print(f"no slider for {number}: {why}")
     print(f"wrote {path}")
     return ExitCode.FINISHED
+
+
+def page_in(place: Path, name: str) -> Path:
+    """Return the path of a problem's page: the place where it is a file, which has an ending, else a file in this folder."""
+    return place if place.suffix and not place.is_dir() else place / f"{name}-lab.html"
 
 
 VERB = Verb(

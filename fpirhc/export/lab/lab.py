@@ -363,7 +363,7 @@ def page(lab: Lab) -> str:
         "cycles": problem.cycles,
         "measured": problem.measure_from,
         "worker": _own("worker.js"),
-        "colors": list(PALETTE),
+        "colors": [PALETTE[k % len(PALETTE)] for k in range(len(lab.loops))],
         "loops": [_loop_data(loop) for loop in lab.loops],
         "sliders": [
             {
