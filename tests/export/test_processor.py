@@ -201,7 +201,7 @@ def test_a_port_is_closed_after_a_late_answer_and_the_next_run_opens_it_again(mo
 def test_a_session_with_many_programs_leaves_few_of_them_running(monkeypatch):
     started = []
 
-    class Noted(subprocess.Popen):
+    class Noted(subprocess.Popen[bytes]):
         def __init__(self, *arguments: Any, **named: Any) -> None:
             super().__init__(*arguments, **named)
             started.append(self)
