@@ -15,7 +15,8 @@ Value = TypeVar("Value")
 def describe(value: Any) -> Any:
     """Return `value` as data for JSON; a dataclass becomes {"is": its class, field: ...}, a function its name.
 
-    A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing. One with
+    A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing. So is one with
+    {"setting": "apart"}, which decides what a study draws and no single run; `fpirhc.content` has it. One with
     {"setting": "where given"} is left out while it is empty or its default: a setting that came later makes no earlier baseline
     stale.
     """
@@ -77,7 +78,7 @@ def _named(value: Any) -> Iterator[object]:
 
 def _is_setting(one: Field[Any], content: object) -> bool:
     kind = one.metadata.get("setting", True)
-    return bool(content) and _differs(one, content) if kind == "where given" else bool(kind)
+    return bool(content) and _differs(one, content) if kind == "where given" else kind is True
 
 
 def as_written(value: Any) -> str:

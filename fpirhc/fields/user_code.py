@@ -101,7 +101,7 @@ def explained(error: BaseException) -> str:
 
 def place_in_users_code(error: BaseException) -> str:
     """Return "file.py, line 12: source" of the innermost line of a user's file; empty where there is none."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if _is_users(f.filename)]
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if is_users(f.filename)]
     if not frames:
         return ""
     return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}"
@@ -137,7 +137,7 @@ def _at(error: BaseException) -> str:
 
 
 def _line_of(error: BaseException) -> str:
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if _is_users(f.filename)]
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if is_users(f.filename)]
     return "" if not frames else linecache.getline(frames[-1].filename, frames[-1].lineno or 0)
 
 
@@ -230,13 +230,13 @@ def users_level() -> int:
 def _users_frame(frame: FrameType | None) -> tuple[int, FrameType | None]:
     """The innermost frame of a user's code from this one on, and how many calls it is away."""
     depth = 0
-    while frame is not None and not _is_users(frame.f_code.co_filename):
+    while frame is not None and not is_users(frame.f_code.co_filename):
         frame, depth = frame.f_back, depth + 1
     return depth, frame
 
 
-def _is_users(filename: str) -> bool:
-    """Whether a file of code belongs neither to the package nor to the libraries around it."""
+def is_users(filename: str) -> bool:
+    """Return whether a file of code belongs neither to the package nor to the libraries around it."""
     if filename.startswith(_PACKAGE) and not filename.startswith(_PROBLEMS):
         return False
     return filename.endswith(".py") and not filename.startswith(_LIBRARIES)

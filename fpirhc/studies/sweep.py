@@ -26,8 +26,9 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, of_problem
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.objective import Objective, objective
-from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, fingerprint, is_of_judgements
+from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, is_of_judgements
 from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number

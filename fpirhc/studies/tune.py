@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.describe import describe
 from fpirhc.errors import InvalidProblem, InvalidValue, package
 from fpirhc.fields.checked import Checked, FoundByName, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
@@ -23,15 +24,9 @@ from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.pairwise import harm_of_adaptation
 from fpirhc.studies.objective import Objective, objective
-from fpirhc.studies.scenarios.bench import (
-    SIDE_BY_SIDE,
-    Conditions,
-    Trials,
-    fingerprint,
-    is_of_judgements,
-    scenario_numbers,
-)
+from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, is_of_judgements, scenario_numbers
 from fpirhc.studies.scenarios.draws import TUNING
+from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import Ledger, begun_with
 from fpirhc.studies.tuned_file import as_python
 from fpirhc.studies.view import Progress
@@ -166,6 +161,7 @@ def tune(
         "optuna": optuna.__version__,
         "metric": aim.name,
         **({"population": population} if population > 1 else {}),
+        "tuning": describe(task.tuning),
     }
     with Ledger(folder / LEDGER, header, TrialFields) as ledger:
         entries = tuple(

@@ -83,7 +83,7 @@ class ExternalPlant(Checked):
     dead_time: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
     lag: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
 
-    make: Make | None = field(default=None, metadata={"setting": False})
+    make: Make | None = field(default=None, metadata={"setting": "apart"})
     parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
     period: Positive | None = field(default=None, metadata={"setting": False})
 

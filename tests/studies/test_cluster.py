@@ -18,9 +18,10 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.errors import FpirhcError, InvalidValue, NotSupported, WorkerDied
 from fpirhc.studies.scenarios import cluster
-from fpirhc.studies.scenarios.bench import Conditions, fingerprint
+from fpirhc.studies.scenarios.bench import Conditions
 from fpirhc.studies.scenarios.cluster import Cluster, run_jobs
 from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
 from fpirhc.symbolic.native import machine_facts
 

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
-import json
 import math
-import platform
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import Controller
-from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
@@ -35,7 +30,6 @@ from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario
 from fpirhc.studies.view import finite_alone
 from fpirhc.task.problem import Problem
 
-FORMAT = 6  # of records
 _BLOCK = 64  # scenarios that run side by side
 SIDE_BY_SIDE = 64  # scenarios from which it pays to compile a loop for lanes
 
@@ -53,26 +47,6 @@ class Conditions:
     side_by_side: bool = (
         False  # whether runs are side by side where they can be: equal to rounding, see `Bench.records`
     )
-
-
-def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
-    """Return the facts on which results depend; results with other facts are never mixed with these."""
-    settings = json.dumps([describe(task.problem), describe(task.controllers)])
-    return {
-        "format": FORMAT,
-        "problem": task.name,
-        "problem file": _hash(task.path.read_bytes()),
-        "settings": _hash(settings.encode()),
-        "cases": _hash(json.dumps(describe(task.cases)).encode()),
-        "metrics": _hash(json.dumps([metric.name for metric in task.metrics]).encode()),
-        **asdict(conditions),
-        **{name: version(name) for name in ("fpirhc", "casadi", "numpy")},
-        "machine": platform.machine(),
-    }
-
-
-def _hash(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -294,11 +294,16 @@ def _checksum(text: bytes) -> str:
 
 def _refusal(path: Path, header: dict[str, Any], wanted: dict[str, Any]) -> str:
     names = [n for n in dict.fromkeys([*wanted, *header]) if header.get(n) != wanted.get(n)]
-    facts = "; ".join(f"{n} was {_short(header.get(n))}, is {_short(wanted.get(n))}" for n in names)
+    facts = "; ".join(f"{n} {_fact('was', header, n)}, {_fact('is', wanted, n)}" for n in names)
     return (
         f"'{path}' holds results of something else, and results are never mixed: {facts}. "
         "Give another folder with --out, or remove the file"
     )
+
+
+def _fact(verb: str, header: Mapping[str, Any], name: str) -> str:
+    """What a header says of a fact, which one of another version may not know."""
+    return f"{verb} {_short(header[name])}" if name in header else f"{verb} not stated"
 
 
 def _short(value: object) -> str:

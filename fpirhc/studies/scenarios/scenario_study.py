@@ -28,13 +28,13 @@ from fpirhc.studies.scenarios.bench import (
     Bench,
     Conditions,
     RecordFields,
-    fingerprint,
     is_of_judgements,
     scenario_numbers,
     scenarios,
 )
 from fpirhc.studies.scenarios.cluster import Cluster, Workers
 from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import Ledger, Records, begun_with, header_of
 from fpirhc.studies.scenarios.paired import Summary, noun, summarise, verdict
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison

@@ -16,7 +16,8 @@ from typing import Any, TextIO
 
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.problem_file import load_problem
-from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
+from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.tuned_file import with_tuned
 
 Job = tuple[Sequence[int], str]  # numbers of scenarios, name of the controller
