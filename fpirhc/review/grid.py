@@ -276,6 +276,7 @@ class ReviewGrid:
     real: Problem | None = None
     # whether a run moves something else than the model's plant, so that its exact parameters move nothing
     elsewhere: bool = False
+    states_dead_time: str = "Problem(dead_time=...)"  # where a user states the dead time of what a run moves
 
     @property
     def outside(self) -> bool:
@@ -343,7 +344,7 @@ _REFERENCES: Latest[Evaluator] = Latest(4)  # at so many times
 def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     """Return the points and draws of a review. `mismatch`: range of the exact parameters, percent, see `fpirhc.plant.plant`."""
     elsewhere, known = problem.reality is not None, problem.of_equations
-    real = known if known.reality else None
+    real, stated_in = known if known.reality else None, problem.moves.states_dead_time
     problem = problem.of_model
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _POINTS)
@@ -360,7 +361,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
         inner = ()
     else:
         states[:, list(inner)] = own
-    return ReviewGrid(problem, times, states, responses, rows, inner, mismatch, real, elsewhere)
+    return ReviewGrid(problem, times, states, responses, rows, inner, mismatch, real, elsewhere, stated_in)
 
 
 def _draws(

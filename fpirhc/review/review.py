@@ -49,6 +49,7 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     """
     controllers = {name: with_lateness(problem, one) for name, one in controllers.items()}
     grid = review_grid(behind_stated_lag(problem), mismatch, seed)
+    grid = replace(grid, states_dead_time=problem.moves.states_dead_time)  # behind its lag the model stands for a body
     general = _present(asked(question, grid) for question in known_questions(ProblemQuestion))
     runs = NominalRuns(grid.problem)
     with compiled_plans():

@@ -8,7 +8,7 @@ What moves is a reality, the model itself with its exact parameters, or a body o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
 
@@ -58,8 +58,8 @@ def sensing_blocks(problem: Problem, other: Response | None, *, predicts: bool) 
 
 def acting_blocks(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
-    mover, plant, late = moving(problem), problem.plant, problem.dead_time
-    queued = [name for name in plant.inputs if name in late.queued and name not in mover.late]
+    mover, plant, late = moving(problem), problem.plant, problem.dead_time.simulated
+    queued = [name for name in plant.inputs if name in late.queued]
     if not queued:
         return [mover.advance(disturbed, plant.input)]
     waits = [late.wait(name, problem.period) if name in queued else Queue(0.0) for name in plant.inputs]
@@ -133,9 +133,6 @@ class Mover(ABC):
     """Whether what it shows may be wrong, so that the loop looks for what is not plausible."""
     sent: ClassVar[tuple[str, ...]]
     """Signals that the step returns to it."""
-
-    late: Collection[str] = ()
-    """Inputs whose dead time it has itself."""
 
     parameters: str = "_exact"
     """Signal of the parameters with which it moves in a cycle."""
@@ -277,7 +274,7 @@ class Body(Mover):
     def __init__(self, problem: Problem, body: ExternalPlant) -> None:
         super().__init__(problem)
         self._body = body
-        self.measures, self.late = body.measures, tuple(body.dead_time)
+        self.measures = body.measures
 
     def exchange(self, seed: int) -> Exchange:
         return _Conversation(self.problem, self._body, seed)

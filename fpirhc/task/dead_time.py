@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import casadi as ca
 
@@ -37,12 +38,51 @@ class DeadTime(Checked):
             same, and also serves problems without dead time.
         longest: longest dead time, by input or "measurement", that a run may set; there is then a queue even where the dead time is
             zero. Twice the dead time where it is not named.
+        outside: the part of `inputs` that an external plant has itself, so that it is not simulated. `Problem` fills it in from
+            `ExternalPlant(dead_time=...)`.
     """
 
     inputs: Mapping[str, NotNegative] = field(default_factory=dict)
     measurement: NotNegative = 0.0
     before: Mapping[str, Finite] = field(default_factory=dict)
     longest: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
+    outside: Mapping[str, float] = field(default_factory=dict, kw_only=True, repr=False, metadata={"setting": False})
+
+    @cached_property
+    def simulated(self) -> DeadTime:
+        """The dead time that a run adds: all but the part that the external plant has."""
+        if not self.outside:
+            return self
+        inputs, longest = (
+            {n: time - self.outside.get(n, 0.0) for n, time in times.items()} for times in (self.inputs, self.longest)
+        )
+        return replace(self, inputs=inputs, longest={n: t for n, t in longest.items() if t > 0}, outside={})
+
+    @cached_property
+    def all_simulated(self) -> DeadTime:
+        """The same dead time where a plant of equations stands for the external one, so that a run adds all of it."""
+        return replace(self, outside={}) if self.outside else self
+
+    def behind(self, outside: Mapping[str, float], mistakes: Mistakes) -> DeadTime:
+        """Return it with the dead time of an external plant in place of that of the last one; what is simulated stays.
+
+        Args:
+            outside: dead time by input; empty: there is no external plant, or it states none.
+            mistakes: gets an input whose dead time is stated twice, and differently.
+        """
+        if dict(outside) == dict(self.outside):
+            return self
+        own = {n: time for n, time in self.simulated.inputs.items() if time or n not in self.outside}
+        twice = {} if self.outside else {n: time for n, time in own.items() if n in outside}
+        for name, time in twice.items():
+            if time != outside[name]:
+                mistakes.add(
+                    f"dead_time: of input '{name}' the external plant states {outside[name]!r}, and the problem {time!r}; state it "
+                    "once, ExternalPlant(dead_time=...) for what the body has, DeadTime(inputs=...) for what is simulated before it"
+                )
+        added = {n: time for n, time in own.items() if n not in twice}
+        known = {n: added.get(n, 0.0) + outside.get(n, 0.0) for n in {**outside, **added}}
+        return replace(self, inputs=known, outside=dict(outside))
 
     @property
     def queued(self) -> tuple[str, ...]:
@@ -82,6 +122,12 @@ class DeadTime(Checked):
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("before: input", self.before, plant.inputs)
         mistakes.unknown("longest: input or measurement", self.longest, (*plant.inputs, MEASUREMENT))
+        for name, least in self.outside.items():
+            if nominal(self.inputs.get(name, 0.0)) < least - _WHOLE * period:
+                mistakes.add(
+                    f"'{name}' is {nominal(self.inputs.get(name, 0.0)):g} {unit}, less than the {least:g} {unit} that the external "
+                    "plant states; state less there, ExternalPlant(dead_time=...)"
+                )
         for name, value in nominal({**self.inputs, MEASUREMENT: self.measurement}).items():
             if value > MOST * period:
                 mistakes.add(

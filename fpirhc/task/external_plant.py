@@ -11,7 +11,7 @@ import time as wall
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NoReturn, Protocol, TypeVar
+from typing import ClassVar, NoReturn, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -65,7 +65,8 @@ class ExternalPlant(Checked):
         clock: function that returns the wall time, s.
         dead_time: by input, in the model's unit of time: how late the body acts. Controllers and reviews know it as that of the
             problem; the body has it already, so it is not simulated.
-        lag: by input, in the model's unit of time: the time constant with which the body follows a command. As `dead_time`.
+        lag: by input, in the model's unit of time: the time constant with which the body follows a command. `ModelReferenced` and
+            reviews know it, and no other controller; it is not simulated either.
         make: function (parameters, seed) -> body, called before every reset with the exact values of `parameters` by name.
         period: time that a step of the body takes, in the model's unit of time; problems of another one are refused. None: any.
         parameters: of the body. Scenarios draw their exact values as those of a plant; a controller knows none of them.
@@ -86,6 +87,9 @@ class ExternalPlant(Checked):
     make: Make | None = field(default=None, metadata={"setting": "apart"})
     parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
     period: Positive | None = field(default=None, metadata={"setting": False})
+
+    states_dead_time: ClassVar[str] = "ExternalPlant(dead_time=...)"
+    """Where a user states the dead time of its inputs: the body has it, and a run does not add it."""
 
     def __post_init__(self) -> None:
         if (self.body is None) == (self.make is None):

@@ -58,7 +58,7 @@ class Problem(Checked):
         disturbances: by name of the input, coordinate or output to which they add; a name of both a coordinate of the moving plant
             and an output is the coordinate's, and adds to its response. Where an input and a coordinate share a name, they are
             "input NAME" and "coordinate NAME".
-        dead_time: of inputs and measurement. A controller may assume another one.
+        dead_time: of inputs and measurement, with that of an `ExternalPlant` added. A controller may assume another one.
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
         cost: of such a plan.
@@ -105,8 +105,7 @@ class Problem(Checked):
         known = self.plant, self.reality, self.period, self.integrator, self.horizon, self.sensing
         for name, value in settled_maps(*known, mistakes).items():
             object.__setattr__(self, name, value)
-        if self.moves.dead_time:
-            object.__setattr__(self, "dead_time", _stated_once(self.dead_time, self.moves.dead_time, mistakes))
+        object.__setattr__(self, "dead_time", self.dead_time.behind(self.moves.dead_time, mistakes))
         mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
@@ -261,13 +260,14 @@ class Problem(Checked):
         there = {disturbed_place(name, inputs): one for name, one in self.disturbances.items()}
         disturbances = {keys[place]: one for place, one in there.items() if place in keys}
         signals = signals_of(self.plant, self.signals)
-        return replace(self, reality=None, disturbances=disturbances, signals=signals)
+        late = self.dead_time.all_simulated
+        return replace(self, reality=None, disturbances=disturbances, signals=signals, dead_time=late)
 
     @cached_property
     def of_equations(self) -> Problem:
         """The problem as far as equations tell it: where an object outside moves, the model moves in its place."""
         known = self.reality and self.reality.symbolic
-        return self if known is self.reality else replace(self, reality=known)
+        return self if known is self.reality else replace(self, reality=known, dead_time=self.dead_time.all_simulated)
 
     def finer(self, factor: int) -> Problem | None:
         """Return the problem with so many times the integrator steps of what moves; None where that has no finer integrator."""
@@ -435,16 +435,6 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
         low, high = plant.ranges.get(name, (-math.inf, math.inf))
         if not low <= value <= high:
             mistakes.add(f"start: '{name}' is {value:g}, outside its physical range of {low:g} to {high:g}")
-
-
-def _stated_once(own: DeadTime, outside: Mapping[str, float], mistakes: Mistakes) -> DeadTime:
-    """The dead time with that of an external plant, which is the one that controllers know."""
-    if own.inputs and dict(own.inputs) != dict(outside):
-        mistakes.add(
-            f"dead_time: the external plant states {dict(outside)!r}, and the problem {dict(own.inputs)!r}; state it once, "
-            "ExternalPlant(dead_time=...) for what the body has, DeadTime(inputs=...) for what is to be simulated before it"
-        )
-    return replace(own, inputs=outside)
 
 
 def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -50,6 +51,9 @@ class Reality(Checked):
     start: Mapping[str, Finite] = field(default_factory=dict)
     integrator: Integrator | None = None
     seen: Mapping[str, str] = field(default_factory=dict)
+
+    states_dead_time: ClassVar[str] = "Problem(dead_time=...)"
+    """Where a user states the dead time of its inputs."""
 
     @property
     def symbolic(self) -> Reality:

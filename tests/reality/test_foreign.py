@@ -14,7 +14,7 @@ import pytest
 from test_reality import CONTROLLERS, PAIRS, SENSING, TAU, lagged, run, task
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.path import moving
@@ -147,6 +147,37 @@ def test_a_dead_time_is_stated_once_and_by_name():
         task(dead_time=fp.DeadTime(inputs={"u": 0.005}), reality=body)
     with pytest.raises(InvalidProblem, match="input 'v' is unknown"):
         task(reality=replace(body, dead_time={"v": 0.002}))
+
+
+def test_a_dead_time_of_the_body_goes_with_the_body():
+    """Another body brings its own, the model in its place has it simulated, and what is simulated before a body stays."""
+    stated = task(reality=fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002}))
+    slower = replace(stated, reality=replace(stated.reality, dead_time={"u": 0.003}))
+    assert slower.dead_time.inputs == {"u": 0.003}
+    assert replace(stated, reality=replace(stated.reality, dead_time={})).dead_time.inputs == {}
+    assert replace(stated, reality=None).dead_time.inputs == {}
+    assert stated.of_equations.dead_time.simulated.inputs == stated.of_model.dead_time.simulated.inputs == {"u": 0.002}
+    more = replace(stated, dead_time=replace(stated.dead_time, inputs={"u": 0.003}))
+    assert more.dead_time.simulated.inputs == {"u": pytest.approx(0.001)}
+    assert replace(more, reality=slower.reality).dead_time.inputs == {"u": pytest.approx(0.004)}
+    with pytest.raises(InvalidProblem, match=r"'u' is 0\.001 s, less than the 0.002 s that the external plant states"):
+        replace(stated, dead_time=replace(stated.dead_time, inputs={"u": 0.001}))
+
+
+def test_the_lateness_of_a_run_is_that_of_the_body_and_what_is_simulated_before_it():
+    """One cycle of the loop before two of the body, and three of the loop before a body without."""
+    late = task(reality=fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002}))
+    late = replace(late, dead_time=replace(late.dead_time, inputs={"u": 0.003}))
+    alone = outside(task(dead_time=fp.DeadTime(inputs={"u": 0.003})))
+    one, other = (run(p, CONTROLLERS["computed torque"]) for p in (late, alone))
+    assert np.abs(one["plant_state"] - other["plant_state"]).max() < 1e-12
+
+
+def test_one_input_is_late_in_the_body_and_another_before_it():
+    """Both are known, and one is simulated."""
+    late = fp.DeadTime(inputs={"w": 0.01}).behind({"u": 0.002}, Mistakes("problem"))
+    assert late.inputs == {"u": 0.002, "w": 0.01}
+    assert late.simulated.queued == ("w",)
 
 
 @pytest.mark.parametrize("clock", [lambda: None, lambda: "noon", lambda: float("nan")])

@@ -15,6 +15,8 @@ import pytest
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidProblem
+from fpirhc.review.questions.dead_time import UNSTATED
+from fpirhc.studies.operating_limits import _latency
 
 PERIOD, LATE, LAG = 1e-2, 3, 0.05
 
@@ -126,6 +128,31 @@ def test_review_judges_the_stated_lag():
     assert answers[12.0].verdict == "no"
     assert answers[12.0].numbers["room"] == pytest.approx(2 * 12 * LAG)
     assert answers[1.0].verdict != "no"
+
+
+@pytest.mark.parametrize("facts", [{}, {"lag": {"u": 0.01}}], ids=["nothing", "a lag"])
+def test_latency_of_a_body_is_advised_to_be_stated_where_it_is_not_simulated(facts):
+    """Stated in the problem it would be added to what the body has."""
+    controllers = {"c": law(fp.Affine(gain=-0.9))}
+    answers = fp.review(problem(**facts), controllers, mismatch=0.0, seed=0).answers
+    advice = [a.change for a in answers if a.question == UNSTATED]
+    assert advice
+    assert all("state it, ExternalPlant(dead_time=...)" in one for one in advice)
+
+
+def test_a_search_for_the_latency_that_is_borne_adds_to_that_of_the_body():
+    """The body keeps its own, and what is tried is simulated before it."""
+    late = _latency(problem(dead_time={"u": LATE * PERIOD})).at(2 * PERIOD).dead_time
+    assert late.inputs == {"u": pytest.approx((LATE + 2) * PERIOD)}
+    assert late.simulated.inputs == {"u": pytest.approx(2 * PERIOD)}
+
+
+def test_a_review_does_not_say_that_a_stated_latency_is_unknown():
+    one = problem(dead_time={"u": 2 * PERIOD})
+    answers = fp.review(one, {"c": law(fp.ModelReferenced(fp.Affine(gain=-0.3)))}, mismatch=0.0, seed=0).answers
+    (gain,) = (a for a in answers if a.question == "Is the map's gain admissible?")
+    assert gain.evidence.endswith("because the model knows no lag of the plant outside")
+    assert gain.change == "fpirhc probe measures it and recommends a gain."
 
 
 @pytest.mark.parametrize(

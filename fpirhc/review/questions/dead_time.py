@@ -130,7 +130,7 @@ def _latency_of(case: Case, loops: Sequence[LinearLoop], whose: str) -> Answer:
         return Answer(UNSTATED, Verdict.YES, text, "", numbers)
     later = "1 cycle" if borne == 0 else f"{borne + 1} cycles"
     text = f"{whose}{later} later, the slowest mode is multiplied by {radii[borne]:.6g} per cycle; it bears {borne}"
-    measure = "measure the latency and state it, Problem(dead_time=...)"
+    measure = f"measure the latency and state it, {case.grid.states_dead_time}"
     share = None if whose else _share_that_bears(case)
     if share is None:
         lower = "Lower the gain" if _may_help(case, whose) else "No lower gain bears them"

@@ -18,7 +18,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, innermost
 from fpirhc.errors import FpirhcError
-from fpirhc.review.grid import review_grid
+from fpirhc.review.grid import is_late, review_grid
 from fpirhc.review.loops import LoopsByGain, largest_product
 from fpirhc.review.prediction import NominalRuns
 from fpirhc.review.question import SEE_CONVERGENCE, Answer, Case, ControllerQuestion, Verdict, by_run
@@ -35,7 +35,7 @@ _ALONG, _DRAWN = 9, 8  # loops that are looked at
 FAR = 10.0  # times a map's own gain, up to which a limit on targets is sought
 _LEAST = 1e-3  # of the smallest other limit, down to which a stable gain is sought
 _STEPS, _BISECTIONS = 24, 12
-OUTSIDE = "the model knows no lag and no latency of the plant outside"
+_OUTSIDE = "the model knows no {} of the plant outside"
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended
     if null is not None and null.verdict == Verdict.NO:
         against = "adaptation does not leave a right model alone"
     elif case.grid.outside:
-        against = OUTSIDE
+        against = _OUTSIDE.format(_not_stated(case.problem)[0])
     else:
         harm = case.harm(deformation.with_effective_gain(size))
         against = f"with {advice.value:.3g}, half of it, {harm}" if harm else ""
@@ -394,9 +394,15 @@ def _gain(case: Case) -> Answer | None:
     limit = largest_product(case.problem, deformation, own.eigenvalues)
     advice = gain_advice(case, boxed, case.answer(RIGHT_MODEL))
     answer = _converging(case, gain_admissible(deformation, own, boxed, limit, advice), advice)
-    if answer.verdict == Verdict.UNKNOWN and advice.why_not == OUTSIDE:
-        return replace(answer, change="fpirhc probe measures them and recommends a gain.")
+    lacks, them = _not_stated(case.problem)
+    if answer.verdict == Verdict.UNKNOWN and advice.why_not == _OUTSIDE.format(lacks):
+        return replace(answer, change=f"fpirhc probe measures {them} and recommends a gain.")
     return _helping(case, answer)
+
+
+def _not_stated(problem: Problem) -> tuple[str, str]:
+    """What nobody states of a plant outside whose lag is not stated, and its pronoun."""
+    return ("lag", "it") if is_late(problem) else ("lag and no latency", "them")
 
 
 def _helping(case: Case, answer: Answer) -> Answer:
