@@ -61,14 +61,16 @@ def modbus_body(
         port: of the server.
         unit: number of the device behind the address.
         alive: register that changes whenever the device has measured.
-        oldest: time for which `alive` may stand still, s; None: any.
+        oldest: time for which `alive` may stand still, s; None: any. It needs `alive`.
         holds: consecutive bad answers that are bridged; see `ExternalPlant`.
         clock: of the cycles; None: the clock on the wall.
 
     Raises:
         NotSupported: pymodbus is not installed.
-        InvalidProblem: a quantity that the model does not have, or an input without register.
+        InvalidProblem: a quantity that the model does not have, an input without register, or `oldest` without `alive`.
     """
+    told = "a register that the device counts up; Modbus has no time stamps"
+    require(oldest is None or alive is not None, f"modbus_body: oldest={oldest} needs alive=Register(...), {told}")
     client = package("pymodbus.client", "outside").ModbusTcpClient(host, port=port)
     setup = Setup("modbus_body", period, oldest, holds, clock, "Register(40)")
     return device(setup, model, measures, inputs, lambda sent, read: _Unit(client, unit, sent, read), alive)

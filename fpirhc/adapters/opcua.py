@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
+from math import inf
 from typing import Any
 
 from fpirhc.adapters.names import adapter, require
@@ -17,6 +18,9 @@ from fpirhc.adapters.real_time import RealTime, Setup, device
 from fpirhc.errors import InvalidValue, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
+
+_FLOATS = ("Float", "Double")
+_WHOLE = ("SByte", "Byte", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")
 
 
 @adapter
@@ -38,8 +42,9 @@ def opcua_body(
         model: the controller's model; the nodes have its units.
         period: of the problem, s.
         measures: quantity of the model -> node that holds it.
-        inputs: input of the model -> node that takes it; all inputs.
-        oldest: age of a source time stamp beyond which a value is bad, s; None: any age.
+        inputs: input of the model -> node that takes it, a float or a whole number, to which values are rounded; all inputs.
+        oldest: age beyond which a value is bad, s, by its source's time stamp, or by the server's where the source gives none;
+            a value without both is bad. None: any age.
         holds: consecutive bad answers that are bridged; see `ExternalPlant`.
         clock: of the cycles; None: the clock on the wall.
 
@@ -73,16 +78,21 @@ class _Session:
         self._client.connect()
         self._sent, self._read = ([self._client.get_node(name) for name in names] for names in self._names)
         self._types = [node.read_data_type_as_variant_type() for node in self._sent]
+        for name, kind in zip(self._names[0], self._types, strict=True):
+            require(
+                kind.name in _FLOATS + _WHOLE,
+                f"{name} holds {kind.name}; an input needs a node of floats or whole numbers",
+            )
 
     def write(self, command: Iterable[float]) -> None:
         """Write every node, as the type that it has."""
         for node, kind, value in zip(self._sent, self._types, command, strict=True):
-            node.write_value(float(value), kind)
+            node.write_value(float(value) if kind.name in _FLOATS else round(float(value)), kind)
 
     def read(self) -> Iterator[tuple[float, float]]:
-        """Values with a good status, and the ages of their source time stamps."""
+        """Values with a good status, and their ages."""
         for node, name in zip(self._read, self._names[1], strict=True):
             value = node.read_data_value(raise_on_bad_status=False)
             require(value.StatusCode.is_good(), f"{name} has the status {value.StatusCode.name}")
-            age = (datetime.now(UTC) - value.SourceTimestamp).total_seconds() if value.SourceTimestamp else 0.0
-            yield float(value.Value.Value), age
+            stamp = value.SourceTimestamp or value.ServerTimestamp
+            yield float(value.Value.Value), (datetime.now(UTC) - stamp).total_seconds() if stamp else inf

@@ -79,7 +79,7 @@ class Link(Protocol):
         """Send the values of the inputs."""
 
     def read(self) -> Iterable[tuple[float, float]]:
-        """Return (value, age in s) of every measurement; age 0 where the bus does not say it."""
+        """Return (value, age in s) of every measurement; age inf where it has no time stamp, 0 where a counter has one."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,7 @@ class _Device:
         still = 0.0 if self._still is None else self._still.age(next(shown)[0])
         for name, (value, age) in zip(self._names, shown, strict=True):
             if oldest is not None and max(age, still) > oldest:
-                raise InvalidProblem(
-                    f"{name} is {max(age, still):.3g} s old, and the oldest that is used is {oldest:g} s"
-                )
+                told = "has no time stamp" if np.isinf(age) else f"is {max(age, still):.3g} s old"
+                raise InvalidProblem(f"{name} {told}, and the oldest that is used is {oldest:g} s")
             values.append(value)
         return np.array(values)

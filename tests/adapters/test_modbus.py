@@ -79,6 +79,12 @@ def test_an_exception_response_and_a_counter_that_stands_still_are_bad_answers(s
     assert reality._answer(reality.body._measured, "step", None).values == pytest.approx([1.2])
 
 
+def test_an_oldest_age_needs_a_counter(served):
+    """Without one every value counted as new, and the statement as kept."""
+    with pytest.raises(InvalidProblem, match=r"^modbus_body: oldest=0.5 needs alive=Register\(...\), a register that"):
+        served.body(oldest=0.5)
+
+
 def test_mistakes_are_named(served):
     with pytest.raises(InvalidProblem) as caught:
         served.body(measures={"hh": LEVEL}, inputs={})

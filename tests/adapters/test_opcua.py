@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
+import numpy as np
 import pytest
 from tank import PERIOD, TANK, Tank, errors
 
@@ -36,7 +38,7 @@ class Server:
         self.names: dict[str, Any] = {"measures": {"h": level}, "inputs": {"q": inflow}}
 
     def body(self, **settings) -> fp.ExternalPlant:
-        return opcua_body(ADDRESS, TANK, period=PERIOD, clock=self.tank.clock, **self.names, **settings)
+        return opcua_body(ADDRESS, TANK, period=PERIOD, clock=self.tank.clock, **(self.names | settings))
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +66,43 @@ def test_a_bad_status_and_an_old_value_are_bad_answers(server):
     assert "s old, and the oldest that is used is 5 s" in reality._answer(reality.body._measured, "step", None).mistake
     server.shown.write_value(1.0)
     assert reality._answer(reality.body._measured, "step", None).values == [1.0]
+
+
+def test_a_value_without_the_sources_time_stamp_has_the_servers_or_is_a_bad_answer(server):
+    """It counted as new for ever."""
+    ua: Any = importlib.import_module("asyncua.ua")
+    reality, loose = server.body(oldest=5.0), server.body()
+    one = ua.DataValue(ua.Variant(1.0, ua.VariantType.Double))
+    server.shown.write_value(one)  # the server stamps it
+    assert reality.first(0) == loose.first(0) == [1.0]
+    space = server.own.aio_obj.iserver.aspace
+    attribute = space._nodes[server.shown.nodeid].attributes[ua.AttributeIds.Value]
+    before = datetime.now(UTC) - timedelta(seconds=600)
+    for stamped, words in (
+        (dataclasses.replace(one, ServerTimestamp=before), "is 600 s old"),
+        (one, "has no time stamp"),
+    ):
+        attribute.value = stamped
+        mistake = reality._answer(reality.body._measured, "step", None).mistake
+        assert f"h {words}, and the oldest that is used is 5 s" in mistake
+        assert loose._answer(loose.body._measured, "step", None).values == [1.0]
+
+
+def test_a_node_of_whole_numbers_is_rounded_to_and_one_of_a_text_is_told(server):
+    """A valve in whole percent took no command, and the message was one of packing bytes."""
+    ua: Any = importlib.import_module("asyncua.ua")
+    objects, space = server.own.nodes.objects, server.own.register_namespace("test")
+    valve = objects.add_variable(ua.NodeId("valve", space), "valve", 0, ua.VariantType.Int16)
+    word = objects.add_variable(ua.NodeId("word", space), "word", "shut")
+    valve.set_writable()
+    bodies = [server.body(inputs={"q": node.nodeid.to_string()}) for node in (valve, word)]
+    bodies[0].first(0)
+    assert bodies[0].read(0.0, np.array([-2.7])).mistake == ""
+    assert valve.read_value() == -3
+    with pytest.raises(
+        InvalidProblem, match=f"ns={space};s=word holds String; an input needs a node of floats or whole numbers"
+    ):
+        bodies[1].first(0)
 
 
 def test_mistakes_are_named(server):
