@@ -95,13 +95,19 @@ def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:
         "every exact parameter lies within PERCENT %% of its value in the problem file, or of its spread, and dead times likewise "
         "(default: 0)"
     )
-    parser.add_argument("--mismatch", type=percent, default=default, metavar="PERCENT", help=text)
+    parser.add_argument("--mismatch", type=mismatch, default=default, metavar="PERCENT", help=text)
 
 
 def percent(text: str) -> float:
     """A percentage, '20%' or '20'."""
     digits = text.strip().removesuffix("%")
     return _number(text, digits, lambda one: 0 <= one < 100, "percent from 0 to below 100, such as 20%")
+
+
+def mismatch(text: str) -> float:
+    """A percentage that may be 100 and more, where every parameter has a spread; the plant says whether it has."""
+    digits = text.strip().removesuffix("%")
+    return _number(text, digits, lambda one: 0 <= one < math.inf, "percent of at least 0, such as 20%")
 
 
 def _number(text: str, digits: str, fits: Callable[[float], bool], expected: str) -> float:

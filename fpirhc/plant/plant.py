@@ -384,8 +384,12 @@ def check_mismatch(plant: Parametric, mismatch: float) -> None:
     all_spread = bool(plant.parameters) and all(p.spread is not None or p.outside for p in plant.parameters.values())
     if not 0 <= mismatch < (math.inf if all_spread else 100):
         raise InvalidValue(
-            f"mismatch {mismatch!r}: expected percent of at least 0 and below 100; a parameter keeps its sign"
-            + ("" if not all_spread else " (100 is the whole spread, more is possible here)")
+            f"mismatch {mismatch:g}: expected percent of at least 0 and below 100, where a parameter keeps its sign"
+            + (
+                " (100 is the whole spread, more is possible here)"
+                if all_spread
+                else "; where all have a spread, 100 is all of it"
+            )
         )
 
 

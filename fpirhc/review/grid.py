@@ -190,13 +190,13 @@ _WHOLE_CYCLE = 1e-9  # of a cycle
 def scaled(problem: Problem, percent: float) -> Problem:
     """Return the problem with all dead times longer by so many percent, rounded away from the true one to whole cycles.
 
-    A fraction of a cycle is interpolated between two commands, which damps requests that alternate.
+    A fraction of a cycle is interpolated between two commands, which damps requests that alternate. The shortest one is none.
     """
     rounded: Callable[[float], int] = math.ceil if percent > 0 else math.floor
     sign = _WHOLE_CYCLE if percent > 0 else -_WHOLE_CYCLE
 
     def changed(time: float) -> float:
-        return rounded(time / problem.period * (1 + percent / 100) - sign) * problem.period
+        return max(rounded(time / problem.period * (1 + percent / 100) - sign), 0) * problem.period
 
     times = problem.dead_time
     inputs = {name: changed(time) for name, time in times.inputs.items()}

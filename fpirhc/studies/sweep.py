@@ -244,7 +244,7 @@ def sweep(
     grid = _Grid(axes, of_cases, seed)
     measured = [m for m in task.metrics if m.name in ("rms_error", aim.metric.name if aim.metric else "")]
     task = replace(task, controllers=chosen, cases=grid.cases, metrics=measured)
-    conditions = Conditions(seed, COMPARING, 0.0, compiled, named=True)
+    conditions = Conditions(seed, COMPARING, 0.0, compiled, named=True, judged=is_of_judgements(aim.metric))
     header = {**fingerprint(task, conditions), "axes": describe(axes), "metric": aim.name}
     with Ledger(folder / LEDGER, header, CellFields) as ledger:
         maps = tuple(_Runner(task, name, grid, conditions, aim, ledger).map(progress) for name in chosen)
@@ -366,13 +366,7 @@ class _Runner:
         cells = math.prod(
             size for size, axis in zip(grid.shape, grid.axes, strict=True) if axis.path not in self._without
         )
-        self._trials = Trials(
-            task,
-            name,
-            list(self._now),
-            replace(conditions, side_by_side=cells >= SIDE_BY_SIDE),
-            judged=is_of_judgements(aim.metric),
-        )
+        self._trials = Trials(task, name, list(self._now), replace(conditions, side_by_side=cells >= SIDE_BY_SIDE))
 
     def map(self, progress: Progress | None) -> SweepMap:
         """Return the map; cells that the ledger has are not run again."""

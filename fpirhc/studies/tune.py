@@ -153,8 +153,16 @@ def tune(
     # A generation is a call of its own, so its runs alone fill a register.
     many = len(numbers) * population >= _REGISTER and trials * len(numbers) >= SIDE_BY_SIDE
     many = begun_with(folder / LEDGER, "side_by_side", many)
-    conditions = Conditions(seed, TUNING, float(percent), compiled, named=cases is not None, side_by_side=many)
     aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
+    conditions = Conditions(
+        seed,
+        TUNING,
+        float(percent),
+        compiled,
+        named=cases is not None,
+        side_by_side=many,
+        judged=is_of_judgements(aim.metric),
+    )
     header = {
         **fingerprint(task, conditions),
         "scenarios": list(numbers),
@@ -232,7 +240,7 @@ def _tuned(
     before = {path: current_setting(task.controllers[name], path) for path in spans}
     # A trial keeps its cost alone, so no other metric is measured.
     needed = [metric for metric in task.metrics if metric.name in ("rms_error", aim.metric.name if aim.metric else "")]
-    runs = Trials(replace(task, metrics=needed), name, tuple(spans), conditions, judged=is_of_judgements(aim.metric))
+    runs = Trials(replace(task, metrics=needed), name, tuple(spans), conditions)
     study = optuna.create_study()
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
     generations = [range(at, min(at + population, trials)) for at in range(0, trials, population)]

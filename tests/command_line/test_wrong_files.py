@@ -369,12 +369,12 @@ run => problem file) and CONTROLLER (name of a controller in the problem file) a
 compare mine.py --seed abc => --seed: expected a whole number of at least 0, got 'abc'.
 compare mine.py --seed => --seed needs a value: --seed K. See fpirhc compare --help.
 compare mine.py --s 3 => the option '--s' may be --seed, --set, --scenarios or --shard; write the whole name.
-compare mine.py --mismatch x => --mismatch: expected percent from 0 to below 100, such as 20%, got 'x'.
+compare mine.py --mismatch x => --mismatch: expected percent of at least 0, such as 20%, got 'x'.
 completion basch => SHELL 'basch' is unknown. Did you mean 'bash'? Valid: bash, zsh, fish, tcsh.
 compare mine.py two_mass => 'two_mass' is a word too many; write fpirhc compare PROBLEM [options]
 compare mine.py --controllers RHC,RHC+FPI => controller 'RHC,RHC+FPI' is unknown ... names are separated by spaces, without commas
 compare mine.py --mismatch 20 => --mismatch needs --scenarios N
-review mine.py --mismatch 120% => --mismatch: expected percent from 0 to below 100, such as 20%, got '120%'.
+review mine.py --mismatch 120% => mismatch 120: expected percent of at least 0 and below 100, where a parameter keeps its sign
 run mine.py fpi => controller 'fpi' is unknown. Did you mean 'RHC+FPI'?
 run mine.py RHC+FPI --set gain=-2 => Did you mean 'optimiser.map.gain' or 'deformation.map.gain'?
 run mine.py RHC+FPI --set deformation.gain=-2 => has no 'gain'. Did you mean 'deformation.map.gain'?
@@ -387,8 +387,8 @@ review folder.py => 'folder.py' is a folder; a problem file ends in .py
 review mine.py --controllers => --controllers needs a value: --controllers NAME. See fpirhc review --help.
 review mine.py --controllers RCH abc =>
     1. controller 'RCH' is unknown. Did you mean 'RHC'? ... 2. controller 'abc' is unknown. Valid: RHC, RHC+FPI.
-review mine.py --mismatch -5 => --mismatch: expected percent from 0 to below 100, such as 20%, got '-5'.
-review mine.py --mismatch nan => --mismatch: expected percent from 0 to below 100, such as 20%, got 'nan'.
+review mine.py --mismatch -5 => --mismatch: expected percent of at least 0, such as 20%, got '-5'.
+review mine.py --mismatch nan => --mismatch: expected percent of at least 0, such as 20%, got 'nan'.
 compare mine.py --headline rms_error => has a number for every coordinate; give one: 'rms_error.NAME'
 compare mine.py --headline rms_error.angel => is unknown. Did you mean 'rms_error.angle'?
 compare mine.py --headline max_error.phi => is unknown. Did you mean 'max_error.angle'? Valid: max_error.angle.
@@ -443,7 +443,7 @@ new 'two mass' => 'two mass' is no name for a problem: it must begin with a lett
 new 2mass => Try 'plant_2mass'; a folder is given by --dir
 list --x => the option '--x' is unknown. Valid: --help, --debug. See fpirhc list --help.
 accept two_mass => --reason is missing. See fpirhc accept --help.
-compare two_mass --scenarios 5 => every scenario would be the same: the problem has no disturbances and no parameter
+compare two_mass --scenarios 5 => every scenario would be the same: the problem has no disturbances, no sensor noise, and no
 accept two_mass --reason x --seeds 1 => --seeds: expected a whole number of at least 2, got '1'.
 export two_mass CTC --out o --cycles -3 => --cycles: expected a whole number of at least 1, got '-3'.
 export two_mass CTC --out o --to fmu --check => --check is there for c, cortex-m, not for fmu

@@ -52,7 +52,7 @@ def opening_of(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """What a worker is told, and the facts that it must find."""
     conditions = Conditions(3, COMPARING, 20.0, False)
     task = fp.load_problem("two_mass")
-    opening = {"path": str(path), "tuned": {}, "conditions": asdict(conditions), "side by side": False, "judged": False}
+    opening = {"path": str(path), "tuned": {}, "conditions": asdict(conditions)}
     return opening, fingerprint(task, conditions)
 
 

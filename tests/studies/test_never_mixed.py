@@ -138,3 +138,28 @@ def test_content_of_a_value_that_holds_itself_has_an_end():
     loop: list[object] = [1]
     loop.append(loop)
     assert digest(loop) != digest([1])
+
+
+def test_a_figure_that_judges_runs_needs_results_that_have_it(task):
+    """Records without the signals that judge a run stay without them."""
+    planned = replace(
+        task.problem,
+        horizon=fp.Horizon(stages=3, step=2e-2),
+        cost=fp.Quadratic(states={"x": 1.0}, deviation={"F": 1e-3}),
+    )
+    task = replace(task, problem=planned)
+    compared(task)
+    with pytest.raises(OutputError, match="judged was false, is true"):
+        compared(task, count=3, headline="cost.total")
+    compared(task, "other", count=1, headline="cost.total")
+    compared(task, "other", count=2, headline="cost.total")
+
+
+def test_a_folder_that_is_refused_begins_no_cluster(task, monkeypatch):
+    """It would stay: nobody closes what never answered."""
+    compared(task)
+    monkeypatch.setattr(
+        "fpirhc.studies.scenarios.scenario_study.Cluster", lambda *_: pytest.fail("a cluster has begun")
+    )
+    with pytest.raises(OutputError, match="seed was 0, is 1"):
+        compared(task, seed=1, cluster="local")

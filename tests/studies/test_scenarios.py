@@ -31,7 +31,7 @@ from fpirhc.plant.plant import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import is_late, scaled
 from fpirhc.studies.scenarios import paired
-from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error
+from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error, scenario_numbers
 from fpirhc.studies.scenarios.cluster import DEATHS, Workers
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger
@@ -471,11 +471,35 @@ def test_adaptation_is_judged_against_the_baseline(task, tmp_path):
     assert difference.low > 0
 
 
-def test_scenarios_that_cannot_differ_are_refused(task, tmp_path):
-    """Without noise and without draws there is one scenario only."""
-    calm = replace(task, problem=replace(task.problem, disturbances={}))
+CALM: dict[str, Any] = {"disturbances": {}}
+LISTENS = {**CALM, "sensing": fp.Sensing({"y": fp.Sensor(fp.Noise(1e-3))})}
+NOTHING_TO_DRAW = {**CALM, "plant": fp.Plant({"y": "m"}, {"u": "V"}, {}, lambda q, u, p: {"y": u.u}, order=1)}
+LATE = {**NOTHING_TO_DRAW, "dead_time": fp.DeadTime({"u": 0.02})}
+
+
+@pytest.mark.parametrize(("changes", "percent"), [(CALM, 0.0), (NOTHING_TO_DRAW, 20.0), (LATE, 0.0)])
+def test_scenarios_that_cannot_differ_are_refused(changes, percent, task, tmp_path):
+    """Without noise and without draws there is one scenario only, whatever the percentage is."""
+    same = replace(task, problem=replace(task.problem, **changes))
     with pytest.raises(InvalidValue, match="every scenario would be the same"):
-        fp.compare_scenarios(calm, count=3, folder=tmp_path, percent=0.0, seed=0)
+        fp.compare_scenarios(same, count=3, folder=tmp_path, percent=percent, seed=0)
+
+
+@pytest.mark.parametrize(("changes", "percent"), [(LISTENS, 0.0), (CALM, 20.0), (LATE, 40.0)])
+def test_scenarios_that_differ_in_one_thing_are_compared(changes, percent, task):
+    """Noise of a sensor, a parameter or a dead time is enough."""
+    other = replace(task, problem=replace(task.problem, **changes))
+    assert list(scenario_numbers(other, 3, percent, None)) == [0, 1, 2]
+
+
+def test_a_hundred_percent_is_the_whole_spread_on_the_command_line(task, capsys):
+    """Where every parameter has one; a parameter without one keeps its sign, and that is said."""
+    command = ["compare", "line.py", "--scenarios", "1", "--no-compile", "--controllers", "CTC", "--mismatch"]
+    assert main([*command, "100"]) == 2
+    assert "mismatch 100: expected percent of at least 0 and below 100, where" in capsys.readouterr().err
+    spread = "spread=fp.Uniform(relative=0.2)"
+    Path("line.py").write_text(LINE.replace("bounds=(0.5, 2.4)", spread).replace('"1/s^2")', f'"1/s^2", {spread})'))
+    assert main([*command, "100"]) == 0
 
 
 def test_a_controller_that_does_not_fit_is_skipped_with_its_reason(task, tmp_path):

@@ -26,7 +26,7 @@ from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import JUDGING, Compiled, Simulator, built, with_judgements
 from fpirhc.studies.comparison.causes import error_left_alone
-from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared
+from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared, draws_differ
 from fpirhc.studies.view import finite_alone
 from fpirhc.task.problem import Problem
 
@@ -47,6 +47,7 @@ class Conditions:
     side_by_side: bool = (
         False  # whether runs are side by side where they can be: equal to rounding, see `Bench.records`
     )
+    judged: bool = False  # whether runs have the signals that judge them, which take longer than the run
 
 
 @dataclass(frozen=True)
@@ -79,21 +80,12 @@ class Bench:
 
     Args:
         live: paths of the settings that `record` may change, by name of the controller.
-        judged: whether runs have the signals that judge them, which take longer than the run.
 
     Raises:
         InvalidProblem, InvalidValue: draws that could leave the parameters' physical bounds.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        conditions: Conditions,
-        live: Mapping[str, Sequence[str]] | None = None,
-        *,
-        judged: bool = False,
-    ) -> None:
-        self._judging = judged
+    def __init__(self, task: Task, conditions: Conditions, live: Mapping[str, Sequence[str]] | None = None) -> None:
         self._live, self._side_by_side = live or {}, conditions.side_by_side and conditions.compiled is not False
         self.apart: dict[str, str] = {}
         self._task, self._conditions = task, conditions
@@ -162,7 +154,7 @@ class Bench:
         if code not in self._lanes:
             shown = [one.title for one in self._pictures(name) if one.keeps]
             why = f"the picture '{shown[0]}' keeps something of every run" if shown else ""
-            why = "the figure is of signals that judge a whole run" if self._judging else why
+            why = "the figure is of signals that judge a whole run" if self._conditions.judged else why
             self._lanes[code] = Lanes(ready, self._task.metrics, why=why)
         lanes = self._lanes[code]
         if lanes.why:
@@ -181,7 +173,7 @@ class Bench:
         try:
             ready = self._simulator(name, scenario)
             run = ready.run(seed=scenario.seed, name=name, variant=scenario.problem, settings=settings)
-            if self._judging:
+            if self._conditions.judged:
                 force = ready.in_force(scenario.problem, settings)
                 run = with_judgements(run, force.problem, force.controller)
         except FpirhcError as error:
@@ -296,20 +288,17 @@ class Trials:
         name: of the controller.
         paths: of the settings.
         conditions: of the scenarios.
-        judged: as of `Bench`.
     """
 
-    def __init__(
-        self, task: Task, name: str, paths: Sequence[str], conditions: Conditions, *, judged: bool = False
-    ) -> None:
+    def __init__(self, task: Task, name: str, paths: Sequence[str], conditions: Conditions) -> None:
         self._task, self._name, self._paths = replace(task, controllers={name: task.controllers[name]}), name, paths
-        self._conditions, self._judged = conditions, judged
+        self._conditions = conditions
         self._rebuilt: tuple[dict[str, float], Bench] | None = None
 
     @cached_property
     def _bench(self) -> Bench:
         live = {self._name: self._paths}
-        return Bench(self._task, self._conditions, live, judged=self._judged)
+        return Bench(self._task, self._conditions, live)
 
     @property
     def apart(self) -> str:
@@ -342,7 +331,7 @@ class Trials:
             changed = with_settings(self._task.controllers[self._name], settings)
             task = replace(self._task, controllers={self._name: changed})
             alone = replace(self._conditions, side_by_side=False)
-            self._rebuilt = dict(settings), Bench(task, alone, judged=self._judged)
+            self._rebuilt = dict(settings), Bench(task, alone)
         return self._rebuilt[1]
 
 
@@ -370,11 +359,19 @@ def scenario_numbers(
         return [task.cases.names.index(name) for name in wanted]
     if count is None or count < 1:
         raise InvalidValue(f"scenarios {count}: expected at least 1")
-    if percent == 0 and not task.problem.disturbances and not same:
+    if not same and not _differ(task.problem, percent):
+        mend = "give --mismatch P" if not percent else "state parameters of the plant, or a dead time"
         raise InvalidValue(
-            "every scenario would be the same: the problem has no disturbances and no parameter is drawn; give --mismatch P"
+            "every scenario would be the same: the problem has no disturbances, no sensor noise, and no parameter or dead time "
+            f"that is drawn; {mend}"
         )
     return range(count)
+
+
+def _differ(problem: Problem, percent: float) -> bool:
+    """Whether scenarios differ: in noise, in what a body outside makes of its seed, or in what is drawn."""
+    noisy = bool(problem.disturbances) or not problem.sensing.ideal or problem.foreign is not None
+    return noisy or draws_differ(problem, percent)
 
 
 def _kept_of(picture: Picture, run: Run) -> Kept:

@@ -60,6 +60,12 @@ def draw(
     return Draw(int(noise.generate_state(1)[0]), exact, _mismatch(model or plant, plant, exact), lateness)
 
 
+def draws_differ(problem: Problem, percent: float) -> bool:
+    """Return whether anything is drawn for scenarios of a comparison: a parameter whose range has a width, or a dead time."""
+    ranges = exact_ranges(problem.moved, percent).values()
+    return any(high > low for low, high in ranges) or (percent > 0 and is_late(problem))
+
+
 def _mismatch(model: Parametric, plant: Parametric, exact: np.ndarray) -> float:
     """The mismatch in the parameters that model and plant share."""
     known = {name: parameter.approximate for name, parameter in model.parameters.items()}

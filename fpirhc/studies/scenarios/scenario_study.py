@@ -108,21 +108,20 @@ def compare_scenarios(
     begun = bool(
         begun_with(folder / LEDGER, "side_by_side", many)
     )  # what was begun one by one is not mixed with the other
-    conditions = Conditions(seed, COMPARING, float(percent), compiled, named=cases is not None, side_by_side=begun)
-    judged = is_of_judgements(figure.metric)
-    bench, header = Bench(task, conditions, judged=judged), fingerprint(task, conditions)
-    opening = {
-        "path": str(task.path.resolve()),
-        "tuned": tuned or {},
-        "conditions": asdict(conditions),
-        "judged": judged,
-    }
-    workers: Workers | Cluster | None = None
-    if cluster is not None:
-        workers = Cluster(cluster, opening, header, processes)
-    elif processes > 1:
-        workers = Workers(__package__ + ".worker", opening, header, processes)
+    conditions = Conditions(
+        seed,
+        COMPARING,
+        float(percent),
+        compiled,
+        named=cases is not None,
+        side_by_side=begun,
+        judged=is_of_judgements(figure.metric),
+    )
+    bench, header = Bench(task, conditions), fingerprint(task, conditions)
+    opening = {"path": str(task.path.resolve()), "tuned": tuned or {}, "conditions": asdict(conditions)}
     with Ledger(folder / LEDGER, header, RecordFields) as ledger:
+        # a folder that is refused begins no cluster
+        workers = _workers(opening, header, processes, cluster)
         records, skipped = _completed(ledger, bench, workers, numbers, names, progress)
     summaries = _summaries(records, seed, task.metrics, figure)
     return ScenarioComparison(
@@ -153,6 +152,15 @@ def compare_scenarios(
             for element in one.metrics.get(metric.name, ())
         },
     )
+
+
+def _workers(
+    opening: Mapping[str, Any], header: Mapping[str, Any], processes: int, cluster: str | None
+) -> Workers | Cluster | None:
+    """Who runs the scenarios; None for this process alone."""
+    if cluster is not None:
+        return Cluster(cluster, opening, header, processes)
+    return Workers(__package__ + ".worker", opening, header, processes) if processes > 1 else None
 
 
 def _to_look_at(

@@ -35,7 +35,7 @@ def study(opening: Mapping[str, Any]) -> Study:
     """Return the study that an opening states: the path of the problem file, tuned settings, conditions."""
     task = with_tuned(load_problem(opening["path"]), opening["tuned"])
     conditions = Conditions(**opening["conditions"])
-    bench = Bench(task, conditions, judged=opening["judged"])
+    bench = Bench(task, conditions)
     return Study(bench, fingerprint(task, conditions))
 
 
