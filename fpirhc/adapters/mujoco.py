@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, base_and_order, counterparts, from_path_or_text, steps_per_cycle
+from fpirhc.adapters.names import adapter, base_and_order, counterparts, from_path_or_text, require, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
+_UNSTABLE = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
 _Values = Mapping[str, float]
 _Places = Mapping[str, tuple[int, int]]
 
@@ -81,10 +82,13 @@ class _Body:
             (self._data.qpos, self._data.qvel)[order][place] = value
         return self._measured()
 
-    def step(self, _time: float, command: np.ndarray) -> np.ndarray:
-        """Hold the command for a cycle."""
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Hold the command for a cycle; MuJoCo puts an unstable body back to its start, and only counts a warning."""
         self._data.ctrl[self._motors] = command
         self._mujoco.mj_step(self._model, self._data, self._steps)
+        warned = [self._data.warning[getattr(self._mujoco.mjtWarning, name)].number for name in _UNSTABLE]
+        told = "take a smaller timestep or an implicit integrator in its file"
+        require(not any(warned), f"MuJoCo says that the simulation is unstable in the cycle from {time:g} s; {told}")
         return self._measured()
 
     def _measured(self) -> np.ndarray:

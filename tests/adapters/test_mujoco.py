@@ -114,6 +114,19 @@ def test_a_probe_finds_the_coupling_and_a_setting_at_least_as_good_as_one_by_han
         assert errors[0][joint] <= 1.2 * min(one[joint] for one in errors[1:])
 
 
+def test_an_unstable_body_is_a_bad_answer_of_every_later_cycle(tmp_path, monkeypatch):
+    """MuJoCo puts it back to its start, from where the run went on and was complete."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a file of its warnings
+    stiff = REAL.replace("<joint armature", '<joint stiffness="1e9" armature')
+    reality = mujoco_body(stiff.replace("implicitfast", "Euler"), MODEL, period=PERIOD, start={"elbow": 1.0})
+    for _run in range(2):
+        reality.first(0)
+        mistakes = [reality.read(k * PERIOD, np.zeros(2)).mistake for k in range(30)]
+        first = next(k for k, mistake in enumerate(mistakes) if "unstable" in mistake)
+        assert f"MuJoCo says that the simulation is unstable in the cycle from {first * PERIOD:g} s" in mistakes[first]
+        assert all(mistakes[first:])
+
+
 def test_names_may_differ():
     turned = fp.Plant(
         {"a": "rad", "b": "rad"},
