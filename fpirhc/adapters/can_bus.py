@@ -4,7 +4,8 @@
     speed, torque = Field(0x181, "<h", scale=0.1), Field(0x201, "<f")
     body = can_body(bus, model, period=2e-3, measures={"w": speed}, inputs={"M": torque}, oldest=5e-3)
 
-A value is that of the newest message of its identifier, and its age that of the message's time stamp. Error frames are bad answers.
+A value is that of the newest message of its identifier, standard or extended, and its age that of the message's time stamp. Error
+frames are bad answers; remote frames, which ask for a value, are none.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class _Traffic:
 
     def open(self) -> None:
         """Forget what came before the last message of every identifier that waits."""
-        self._newest: dict[int, Any] = {}
+        self._newest: dict[tuple[int, bool, bool], Any] = {}  # identifier, extended, remote
 
     def write(self, command: Iterable[float]) -> None:
         """Send one message per identifier."""
@@ -93,9 +94,9 @@ class _Traffic:
         """Values of the newest messages, and their ages."""
         while (message := self._bus.recv(timeout=0)) is not None:
             require(not message.is_error_frame, "the bus has an error frame")
-            self._newest[message.arbitration_id] = message
+            self._newest[message.arbitration_id, message.is_extended_id, message.is_remote_frame] = message
         for at in self._read:
-            if (newest := self._newest.get(at.identifier)) is None:
+            if (newest := self._newest.get((at.identifier, at.extended, False))) is None:
                 raise InvalidProblem(f"no message 0x{at.identifier:X} has arrived")
             enough = len(newest.data) >= at.byte + struct.calcsize(at.format)
             require(enough, f"message 0x{at.identifier:X} has {len(newest.data)} bytes, too few for its field")

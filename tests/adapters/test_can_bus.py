@@ -83,8 +83,20 @@ def test_bad_traffic_is_a_bad_answer(buses):
     link = reality.body._link
     buses.show(1.7)
     assert mistake() == ""
-    link._newest[0x181].timestamp -= 2.0
+    link._newest[0x181, False, False].timestamp -= 2.0
     assert "h is 2 s old, and the oldest that is used is 0.5 s" in mistake()
+
+
+def test_an_extended_identifier_and_a_remote_frame_are_no_message_of_a_standard_one(buses):
+    """A number is two identifiers, one of each kind, and a remote frame asks for the value that it replaced."""
+    wide = Field(0x181, "<i", byte=2, scale=1e-6, extended=True)
+    reality, other = buses.body(), can_body(buses.own, TANK, period=PERIOD, measures={"h": wide}, inputs={"q": INFLOW})
+    buses.show(1.5)
+    buses.show(-99.0, is_extended_id=True)
+    buses.show(0.0, is_remote_frame=True, data=None, dlc=6)
+    assert reality.first(0) == pytest.approx([1.5])
+    buses.show(-99.0, is_extended_id=True)
+    assert other.first(0) == pytest.approx([-99.0])
 
 
 def test_mistakes_are_named(buses):
