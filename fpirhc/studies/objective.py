@@ -75,6 +75,15 @@ class Objective:
         """Return a value with the sign that the metric has; what is infinite is not a number."""
         return self._sign * value if math.isfinite(value) else math.nan
 
+    def told_interval(self, low: float, high: float) -> tuple[float, float]:
+        """Return the ends of an interval of differences so, the lower one first."""
+        ends = (self.told(low), self.told(high))
+        return ends if self._sign > 0 else ends[::-1]
+
+    def amount(self, value: float) -> float:
+        """Return a value so, for a ratio: a run that failed has nothing of what is to be large, and infinitely much of the rest."""
+        return 0.0 if self._sign < 0 and math.isinf(value) else self._sign * value
+
     def difference(self, value: float) -> str:
         """Return a difference of two values as text."""
         if not math.isfinite(value):

@@ -116,14 +116,19 @@ class SweepMap:
     """What one controller does."""
 
     controller: str  # its name
-    # the figure that is judged, an entry per value of every setting; smaller is better, and infinite where a run failed
-    values: np.ndarray
+    # the figure that is judged, an entry per value of every setting; smaller is better, and infinite where a run ended early
+    figures: np.ndarray
     outcomes: np.ndarray  # 'finished', 'diverged', 'ended early' or 'refused', of the same shape
     reasons: Mapping[str, str]  # why a first run of each outcome did not finish; '' where it only diverged
     without: tuple[str, ...]  # paths of settings that it does not have: its numbers are the same along these axes
     rebuilt: tuple[str, ...]  # paths of settings of which every value needed a loop of its own
     now: Mapping[str, float]  # its settings and those of the problem as they stand, by path
     apart: str = ""  # why its runs were one after the other; empty where they were side by side
+
+    @cached_property
+    def values(self) -> np.ndarray:
+        """The figures of the runs that finished, and infinite elsewhere: nothing is best by a run that diverged."""
+        return np.where(self.outcomes == "finished", self.figures, math.inf)
 
     @property
     def failed(self) -> float:
@@ -181,7 +186,7 @@ class Sweep(Study):
         for one in self.maps:
             for place in np.ndindex(one.values.shape):
                 settings = {axis.path: axis.values[k] for axis, k in zip(self.axes, place, strict=True)}
-                value = self.aim.told(float(one.values[place]))
+                value = self.aim.told(float(one.figures[place]))
                 yield {
                     **settings,
                     "controller": one.controller,
@@ -383,18 +388,18 @@ class _Runner:
                 self._ledger.append(new)
                 if progress:
                     progress(self._name, len(known), len(places))
-        values, outcomes = np.full(self._grid.shape, math.inf), np.empty(self._grid.shape, dtype=object)
+        figures, outcomes = np.full(self._grid.shape, math.inf), np.empty(self._grid.shape, dtype=object)
         reasons: dict[str, str] = {}
         for place in np.ndindex(*self._grid.shape):
             record = known[self._number(self._representative(place))]
-            values[place] = math.inf if record["value"] is None else record["value"]
+            figures[place] = math.inf if record["value"] is None else record["value"]
             outcomes[place] = record["outcome"]
             if record["outcome"] != "finished":
                 reasons.setdefault(record["outcome"], record["reason"])
         rebuilt = () if self._live else tuple(self._now)
         return SweepMap(
             self._name,
-            values,
+            figures,
             outcomes,
             reasons,
             self._without,

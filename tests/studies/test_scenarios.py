@@ -30,6 +30,7 @@ from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
 from fpirhc.plant.plant import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import is_late, scaled
+from fpirhc.studies.objective import Objective
 from fpirhc.studies.scenarios import paired
 from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error, scenario_numbers
 from fpirhc.studies.scenarios.cluster import DEATHS, Workers
@@ -216,6 +217,33 @@ def test_failures_are_counted_and_are_worse_than_any_error():
         in sentences
     )
     assert "Not run: C (no horizon)" in sentences
+
+
+def test_a_figure_of_which_more_is_better_keeps_its_sign_in_files(task, tmp_path):
+    """The share of a run in a band: what JSON has is that share, the lower end of an interval first."""
+    inside = fp.Metric("inside", lambda problem, run: float((abs(run["error.y"]) < 0.05).mean()), better="larger")
+    study = fp.compare_scenarios(
+        replace(task, metrics=[*task.metrics, inside]), count=4, folder=tmp_path, headline="inside", **SETTINGS
+    )
+    told = study.view.facts["controllers"]["CTC+FPI"]
+    shares = [r["metrics"]["inside"][""] for r in study.records["CTC+FPI"]]
+    assert told["values"] == shares
+    assert told["worst_error"] == min(shares) <= told["median_error"] <= max(shares)
+    assert told["difference"]["low"] <= told["difference"]["median"] <= told["difference"]["high"]
+    assert told["difference"]["high"] > 0
+
+
+def test_a_run_that_failed_has_nothing_of_what_is_to_be_large():
+    """Of nothing it is infinitely many times more, and of something none."""
+    figure = Objective(fp.Metric("inside", lambda problem, run: 1.0, better="larger"))
+
+    def records(share: float | None) -> list[dict[str, Any]]:
+        return [{**r, "metrics": {**r["metrics"], "inside": {"": share}}} for r in _records("A", [share] * 5)]
+
+    failed, fine = records(None), records(0.8)
+    assert summarise("A", failed, fine, seed=0, figure=figure).ratio == 0.0
+    assert summarise("A", fine, failed, seed=0, figure=figure).ratio == math.inf
+    assert summarise("A", records(0.4), fine, seed=0, figure=figure).ratio == pytest.approx(0.5)
 
 
 def test_failures_of_named_cases_are_no_sample():

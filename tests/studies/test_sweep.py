@@ -136,6 +136,17 @@ def test_larger_is_better_where_the_figure_says_so(tmp_path: Path) -> None:
     assert 0 < told[0] < told[-1] <= 1
 
 
+def test_a_run_that_diverged_wins_nothing(tmp_path: Path) -> None:
+    """Its figure may be the smallest one, and stands in the rows alone."""
+    found = swept(tmp_path, "exact.b=0.5:1:2", task=task_of(law=LAW, FPI=ADAPTIVE))
+    lost = replace(found.maps[0], figures=np.array([1e-9, 1e-9]), outcomes=np.array(["diverged", "diverged"]))
+    result = replace(found, maps=(lost, found.maps[1]))
+    assert list(result.winners) == [1, 1]
+    assert result.view.tables[0].rows[0].cells[2:] == ["none", "", ""]
+    assert np.isnan(result.view.facts["maps"][0]["values"]).all()
+    assert [row[result.aim.name] for row in result.rows()][:2] == [1e-9, 1e-9]
+
+
 WRONG = {
     "deformation.gain": "expected PATH=LOW:HIGH:COUNT, or PATH=LOW:HIGH:COUNT:log, such as deformation.gain=-2:-0.1:40",
     "exact.b=1:1:5": "an empty range; expected two different finite ends and at least 2 values",

@@ -344,7 +344,7 @@ class _Running:
         other = value if before is None else self._figure.value(before)
         self._values.add(value)
         self._differences.add(0.0 if value == other else value - other)
-        self._ratios.add(_ratio(value, other))
+        self._ratios.add(_ratio(self._figure.amount(value), self._figure.amount(other)))
         self._better += value < other
         self._equal += before is not None and value == other
         number = int(record["scenario"])

@@ -219,6 +219,7 @@ def _number(column: Number, of: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _facts(comparison: ScenarioComparison) -> dict[str, Any]:
+    figure = comparison.figure
     return {
         "problem": comparison.problem,
         "scenarios": comparison.count,
@@ -227,21 +228,20 @@ def _facts(comparison: ScenarioComparison) -> dict[str, Any]:
         "versions": comparison.versions,
         "headline": comparison.figure.name,
         "verdict": comparison.verdict,
-        "groups": {name: {one.name: _summary(one) for one in some} for name, some in comparison.groups.items()},
-        "controllers": {one.name: _summary(one) for one in comparison.summaries},
+        "groups": {name: {one.name: _summary(one, figure) for one in some} for name, some in comparison.groups.items()},
+        "controllers": {one.name: _summary(one, figure) for one in comparison.summaries},
         "skipped": comparison.skipped,
         "tuning": comparison.tuning,
     }
 
 
-def _summary(one: Summary) -> dict[str, Any]:
-    d = one.difference
+def _summary(one: Summary, figure: Objective) -> dict[str, Any]:
     return {
-        "median_error": one.median,
-        "difference": None if d is None else {"median": d.median, "low": d.low, "high": d.high},
+        "median_error": figure.told(one.median),
+        "difference": _difference(one, figure),
         "ratio": one.ratio,
         "better": one.better,
-        "worst_error": one.worst,
+        "worst_error": figure.told(one.worst),
         "worst_scenario": one.worst_scenario,
         "worst_name": one.worst_name,
         "rms_error": one.rms_error,
@@ -253,6 +253,13 @@ def _summary(one: Summary) -> dict[str, Any]:
         "rank_error": one.rank_error,
         "shown_scenarios": one.scenarios.tolist(),
         "errors": one.errors.tolist(),
-        "values": one.values.tolist(),
+        "values": [figure.told(value) for value in one.values.tolist()],
         "mismatch": one.mismatch.tolist(),
     }
+
+
+def _difference(one: Summary, figure: Objective) -> dict[str, float] | None:
+    if one.difference is None:
+        return None
+    low, high = figure.told_interval(one.difference.low, one.difference.high)
+    return {"median": figure.told(one.difference.median), "low": low, "high": high}
