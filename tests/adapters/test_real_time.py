@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ class Bus:
     def open(self) -> None:
         self.times = []
 
-    def write(self, command: np.ndarray) -> None:
+    def write(self, command: Iterable[float]) -> None:
         (self.sent,) = command
         self.times.append(self.tank.now)
         if self.bad == "refused" and len(self.times) == 3:

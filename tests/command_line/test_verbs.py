@@ -209,7 +209,7 @@ def names_what_is_there(line, tasks):
     for task in (tasks.get(p) or fp.load_problem(p) for p in problems if p in tasks or p in shipped_problems()):
         assert {*(options.get("controllers") or ()), *([one] if one else ())} <= set(task.controllers)
         patterns = [*(options.get("cases") or ()), *filter(None, [options.get("case")])]
-        assert not patterns or task.cases.matching(patterns)
+        assert not patterns or (task.cases and task.cases.matching(patterns))
         assert name != "tune" or task.tuning
         metric, _, of = (options.get("headline") or "rms_error").partition(".")
         assert metric in {m.name for m in task.metrics}

@@ -72,6 +72,7 @@ def test_lateness_that_is_stated_is_found_as_if_it_were_not(monkeypatch, body, s
     """The plant as estimated has all of it: margins on a plant without it would let through what destroys the loop."""
     monkeypatch.setattr(Rule, "shortlist", lambda _: {})
     problem = replace(body_problem(1.0, noise=0.05, **body), duration=2.0)
+    assert isinstance(problem.reality, fp.ExternalPlant)
     reality = replace(problem.reality, **stated.get("body", {}))
     found = fp.probe(replace(problem, reality=reality, **stated.get("problem", {})), RHC, cycles=150)
     assert found.dead_time["u"].value == 2

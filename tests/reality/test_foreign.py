@@ -151,10 +151,11 @@ def test_a_dead_time_is_stated_once_and_by_name():
 
 def test_a_dead_time_of_the_body_goes_with_the_body():
     """Another body brings its own, the model in its place has it simulated, and what is simulated before a body stays."""
-    stated = task(reality=fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002}))
-    slower = replace(stated, reality=replace(stated.reality, dead_time={"u": 0.003}))
+    body = fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002})
+    stated = task(reality=body)
+    slower = replace(stated, reality=replace(body, dead_time={"u": 0.003}))
     assert slower.dead_time.inputs == {"u": 0.003}
-    assert replace(stated, reality=replace(stated.reality, dead_time={})).dead_time.inputs == {}
+    assert replace(stated, reality=replace(body, dead_time={})).dead_time.inputs == {}
     assert replace(stated, reality=None).dead_time.inputs == {}
     assert stated.of_equations.dead_time.simulated.inputs == stated.of_model.dead_time.simulated.inputs == {"u": 0.002}
     more = replace(stated, dead_time=replace(stated.dead_time, inputs={"u": 0.003}))

@@ -14,6 +14,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
+from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
 from fpirhc.review.questions.dead_time import UNSTATED
 from fpirhc.studies.operating_limits import _latency
@@ -69,7 +70,7 @@ def problem(**facts) -> fp.Problem:
     )
 
 
-def law(form: fp.ModelReferenced) -> fp.ComputedTorque:
+def law(form: Deformation) -> fp.ComputedTorque:
     return fp.ComputedTorque(fp.Exponential(rate=3.0, integral=False), form)
 
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -49,8 +50,8 @@ def task(tmp_path, monkeypatch) -> Task:
     return fp.load_problem("cart.py")
 
 
-def compared(task: Task, folder: str = "out", **more: object) -> object:
-    settings = {"count": 2, "percent": 20.0, "seed": 0, "compiled": False, **more}
+def compared(task: Task, folder: str = "out", **more: Any) -> object:
+    settings: dict[str, Any] = {"count": 2, "percent": 20.0, "seed": 0, "compiled": False, **more}
     return compare_scenarios(task, folder=Path(folder), **settings)
 
 
