@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, base_and_order, counterparts, steps_per_cycle
+from fpirhc.adapters.names import adapter, counterparts, derivatives, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -29,7 +29,7 @@ def commonroad_body(
 
     Args:
         kind: of the package's model, "st" or "std".
-        model: the controller's model.
+        model: the controller's model, of order 2 at most, with time in s.
         period: of the problem, s; a whole number of ms.
         speed: at the start, m/s, which the car holds where the model has no input `acceleration`.
         vehicle: number of the package's set of parameters; 2 is a BMW 320i.
@@ -40,16 +40,17 @@ def commonroad_body(
         InvalidProblem: a name that the car or the model does not have, or a period that is no whole number of ms.
     """
     units, mistakes, counterpart = quantities(model), Mistakes("commonroad_body"), names or {}
+    parts = derivatives(mistakes, units)
     mistakes.unknown("kind", [kind], ("st", "std"))
-    own = dict.fromkeys(base_and_order(q)[0] for q in units)
+    own = dict.fromkeys(name for name, _ in parts.values())
     mistakes.unknown("names: name of the model", counterpart, [*own, *model.inputs])
     shown = counterparts(mistakes, "coordinate", own, {n: v for n, v in counterpart.items() if n in own}, _COORDINATES)
     sent = {n: v for n, v in counterpart.items() if n in model.inputs}
     inputs = counterparts(mistakes, "input", model.inputs, sent, ("steer", "acceleration"))
     mistakes.raise_if_any()
-    count = steps_per_cycle("commonroad_body", period, _STEP)
+    count = steps_per_cycle("commonroad_body", model, period, _STEP)
     body = _Car(kind, speed, vehicle, count, tuple(inputs.values()))
-    body.read = [(order, _COORDINATES.index(shown[name])) for name, order in map(base_and_order, units)]
+    body.read = [(order, _COORDINATES.index(shown[name])) for name, order in parts.values()]
     return ExternalPlant(body, measures=units, period=period)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, base_and_order, counterparts, from_path_or_text, require, steps_per_cycle
+from fpirhc.adapters.names import adapter, counterparts, derivatives, from_path_or_text, require, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -37,7 +37,7 @@ def mujoco_body(
 
     Args:
         mjcf: path of an MJCF or URDF file, or its text, which begins with "<".
-        model: the controller's model, with hinges in rad and slides in m.
+        model: the controller's model, of order 2 at most, with hinges in rad and slides in m, and time in s.
         period: of the problem, s; a whole number of the body's time steps.
         joints: coordinate -> joint of one degree of freedom, where the names differ.
         actuators: input -> actuator, where the names differ.
@@ -50,16 +50,17 @@ def mujoco_body(
     mujoco = package("mujoco", "outside")
     body = from_path_or_text(mjcf, mujoco.MjModel.from_xml_path, mujoco.MjModel.from_xml_string)
     units, mistakes = quantities(model), Mistakes("mujoco_body")
+    parts = derivatives(mistakes, units)
     free = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
     scalar = [joint for joint in map(body.joint, range(body.njnt)) if int(joint.type[0]) in free]
     of_joint = {j.name: (j.qposadr[0], j.dofadr[0], j.dofadr[0]) for j in scalar}
-    joint = counterparts(mistakes, "joint", dict.fromkeys(base_and_order(q)[0] for q in units), joints or {}, of_joint)
+    joint = counterparts(mistakes, "joint", (name for name, _ in parts.values()), joints or {}, of_joint)
     motors = {body.actuator(k).name: k for k in range(body.nu)}
     actuator = counterparts(mistakes, "actuator", model.inputs, actuators or {}, motors)
-    mistakes.unknown("start: quantity", start or {}, [q for q in units if base_and_order(q)[1] < 2])
+    mistakes.unknown("start: quantity", start or {}, [q for q, (_, order) in parts.items() if order < 2])
     mistakes.raise_if_any()
-    count = steps_per_cycle("mujoco_body", period, body.opt.timestep)
-    places = {q: (order, of_joint[joint[name]][order]) for q, (name, order) in ((q, base_and_order(q)) for q in units)}
+    count = steps_per_cycle("mujoco_body", model, period, body.opt.timestep)
+    places = {q: (order, of_joint[joint[name]][order]) for q, (name, order) in parts.items()}
     driven = [motors[name] for name in actuator.values()]
     return ExternalPlant(_Body(mujoco, body, count, driven, places, start or {}), measures=units, period=period)
 

@@ -12,6 +12,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import described
+from fpirhc.plant.plant import Plant
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -77,6 +78,16 @@ def require_methods(where: str, value: object, methods: Iterable[str], example: 
         raise InvalidValue(f"{where}: expected an object such as {example}, got {described(value)}")
 
 
+def require_seconds(where: str, model: Plant) -> None:
+    """Raise where the model has another unit of time than a clock or a physics engine.
+
+    Raises:
+        InvalidProblem: it has.
+    """
+    fix = "write the model with time_unit='s', its rates and parameters too"
+    require(model.time_unit == "s", f"{where}: its time is in s, and that of the model is in {model.time_unit}; {fix}")
+
+
 def counterparts(
     mistakes: Mistakes, what: str, own: Iterable[str], given: Mapping[str, str], valid: Iterable[str]
 ) -> dict[str, str]:
@@ -101,12 +112,13 @@ def from_path_or_text(source: str | Path, by_path: Callable[[str], R], by_text: 
     return by_path(text)
 
 
-def steps_per_cycle(where: str, period: float, step: float) -> int:
-    """Return how many steps of a simulator a control cycle has.
+def steps_per_cycle(where: str, model: Plant, period: float, step: float) -> int:
+    """Return how many steps of a simulator a control cycle has, both in s.
 
     Raises:
-        InvalidProblem: the period is no whole number of steps.
+        InvalidProblem: the period is no whole number of steps, or the model has another unit of time.
     """
+    require_seconds(where, model)
     count = max(round(period / step), 1)
     if abs(count * step - period) > 1e-9 * period:
         raise InvalidProblem(
@@ -114,6 +126,17 @@ def steps_per_cycle(where: str, period: float, step: float) -> int:
             f"{count * step:g} s, or another step"
         )
     return count
+
+
+def derivatives(mistakes: Mistakes, quantities: Iterable[str]) -> dict[str, tuple[str, int]]:
+    """Return the base and the order of every quantity of a body that moves; beyond accelerations they are mistakes."""
+    every = {quantity: base_and_order(quantity) for quantity in quantities}
+    for name in (name for name, order in every.values() if order > 2):
+        mistakes.add(
+            f"{name} is of a higher order than 2 in the model, and a body that moves shows no derivatives beyond the second; "
+            "write a model of order 2"
+        )
+    return every
 
 
 def base_and_order(quantity: str) -> tuple[str, int]:

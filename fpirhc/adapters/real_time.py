@@ -16,7 +16,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from fpirhc.adapters.names import require
+from fpirhc.adapters.names import require, require_seconds
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -122,8 +122,9 @@ def device(
         counter: address of a value that changes whenever the device has measured.
 
     Raises:
-        InvalidProblem: a quantity that the model does not have, or an input without address.
+        InvalidProblem: a quantity that the model does not have, an input without address, or a model whose time is not in s.
     """
+    require_seconds(setup.where, model)
     units, mistakes = quantities(model), Mistakes(setup.where)
     mistakes.unknown("measures: quantity", measures, units)
     mistakes.unknown("inputs: input", inputs, model.inputs)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter
+from fpirhc.adapters.names import adapter, require_seconds
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -48,6 +48,7 @@ def rotorpy_body(
         NotSupported: RotorPy is not installed.
         InvalidProblem: the model has other names.
     """
+    require_seconds("rotorpy_body", model)
     mistakes = Mistakes("rotorpy_body")
     mistakes.unknown("measured", quantities(model), _SEEN)
     mistakes.unknown("input", model.inputs, _SENT)

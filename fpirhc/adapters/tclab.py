@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter
+from fpirhc.adapters.names import adapter, require_seconds
 from fpirhc.adapters.real_time import RealTime
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
@@ -37,6 +37,7 @@ def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) ->
         NotSupported: tclab is not installed.
         InvalidProblem: the model has other names.
     """
+    require_seconds("tclab_body", model)
     tclab, mistakes = package("tclab", "outside"), Mistakes("tclab_body")
     mistakes.unknown("measured", model.output.elements, _SENSORS)
     mistakes.unknown("input", model.inputs, _HEATERS)

@@ -14,10 +14,12 @@ import fpirhc as fp
 from fpirhc.adapters.can_bus import Field, can_body
 from fpirhc.adapters.gymnasium import gymnasium_body
 from fpirhc.adapters.modbus import Register
-from fpirhc.adapters.names import finite_numbers
+from fpirhc.adapters.names import derivatives, finite_numbers, steps_per_cycle
 from fpirhc.adapters.opcua import opcua_body
 from fpirhc.adapters.real_time import Setup, device
-from fpirhc.errors import InvalidField, InvalidProblem, InvalidValue
+from fpirhc.adapters.rotorpy import rotorpy_body
+from fpirhc.adapters.tclab import tclab_body
+from fpirhc.errors import InvalidField, InvalidProblem, InvalidValue, Mistakes
 from fpirhc.members import within
 
 
@@ -71,6 +73,34 @@ def test_a_device_has_the_period_that_it_was_made_with():
     with pytest.raises(InvalidProblem, match=re.escape("one step of it takes 0.1, and the problem's period is 0.2")):
         body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.2)
     body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.1)
+
+
+MINUTES = fp.Plant({"x": "m"}, {"u": "m/min^2"}, {}, lambda q, v, u, p: {"x": u.u}, time_unit="min")
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda where: device(Setup(where, 1.0, None, 0, None, "1"), MINUTES, {}, {}, lambda _sent, _read: None),  # type: ignore[arg-type,return-value]
+        lambda where: steps_per_cycle(where, MINUTES, 1.0, 0.5),  # of MuJoCo and CommonRoad
+        lambda _where: tclab_body(MINUTES, period=1.0),
+        lambda _where: rotorpy_body(MINUTES, period=1.0),
+    ],
+)
+def test_a_clock_and_a_physics_engine_refuse_a_model_whose_time_is_not_in_seconds(use):
+    """A period of a minute lasted a second, with commands for a minute."""
+    with pytest.raises(
+        InvalidProblem, match="_body: its time is in s, and that of the model is in min; write the model with"
+    ):
+        use("mine_body")
+
+
+def test_a_derivative_beyond_the_second_is_a_mistake():
+    """It was an index error inside."""
+    mistakes = Mistakes("mine")
+    assert derivatives(mistakes, ["x''", "y'''"]) == {"x''": ("x", 2), "y'''": ("y", 3)}
+    with pytest.raises(InvalidProblem, match=r"^mine: y is of a higher order than 2 in the model"):
+        mistakes.raise_if_any()
 
 
 def test_what_a_package_raises_has_the_adapters_name():
