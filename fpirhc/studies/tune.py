@@ -245,13 +245,14 @@ def _tuned(
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
     generations = [range(at, min(at + population, trials)) for at in range(0, trials, population)]
     for generation in (range(_PRESENT, _PRESENT + 1), *generations):
-        asked: dict[int, Any] = {}
+        lacking = [number for number in generation if number not in known]
+        # Known ones of a generation are proposed too: an interrupted search goes on with the proposals that it would have had.
+        proposed = [number for number in generation if lacking and number != _PRESENT]
+        asked = {number: _proposal(optuna, study, ranges, conditions.seed, number) for number in proposed}
         new: list[dict[str, Any]] = []
-        for number in (k for k in generation if k not in known):
-            trial = None if number == _PRESENT else _proposal(optuna, study, ranges, conditions.seed, number)
-            shares = {} if trial is None else dict(trial.params)
-            settings = before if number == _PRESENT else _numbers(task, name, spans, shares)
-            asked[number] = trial
+        for number in lacking:
+            shares = dict(asked[number].params) if number in asked else {}
+            settings = _numbers(task, name, spans, shares) if number in asked else before
             new.append({"controller": name, "trial": number, "shares": shares, "settings": settings})
         for record, judged in zip(new, _judged(runs, numbers, aim, [one["settings"] for one in new]), strict=True):
             ledger.append(record | judged)
@@ -259,7 +260,7 @@ def _tuned(
             if progress:
                 progress(name, record["trial"] + 1, trials)
         for number in generation:
-            if asked.get(number) is not None:
+            if number in asked:
                 study.tell(asked[number], known[number]["cost"])
             elif number != _PRESENT:
                 shares, cost = known[number]["shares"], known[number]["cost"]

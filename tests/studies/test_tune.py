@@ -209,6 +209,24 @@ def test_a_disturbed_study_finds_what_a_calm_one_finds(task, tmp_path):
         fp.tune(task, trials=14, folder=tmp_path / "cut", **{**settings, "seed": 4})
 
 
+def test_a_generation_that_was_interrupted_goes_on_as_it_would_have_done(task, tmp_path):
+    """Within the first trials, which are random, and within those that learn; no finished trial is run again."""
+    facts: dict[str, Any] = {"seed": 0, "compiled": False, "population": 4, "controllers": ["CTC"]}
+
+    def lines(folder: str) -> list[str]:
+        return (tmp_path / folder / "trials.jsonl").read_text().splitlines(keepends=True)
+
+    fp.tune(task, trials=20, folder=tmp_path / "whole", **facts)
+    for finished in (2, 14):
+        folder = tmp_path / f"after {finished}"
+        folder.mkdir()
+        (folder / "trials.jsonl").write_text(
+            "".join(lines("whole")[: 2 + finished])
+        )  # the header, the settings as they are
+        fp.tune(task, trials=20, folder=folder, **facts)
+        assert lines(folder.name) == lines("whole")
+
+
 def test_command_line_journey(task, capsys):
     """Tune, paste the lines into the file, and compare with the file of tuned settings: all three agree."""
     assert main(["tune", "line.py", "--trials", "6", "--out", "t"]) == 0
