@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import CompileError, InvalidShape, InvalidValue, NoCode
+from fpirhc.plant.parameter import Parameter
 from fpirhc.simulation.metrics import known_metrics
 from fpirhc.simulation.metrics.base import Metric, first_measured, measured_errors
 from fpirhc.simulation.opencl import loaded_kernel
@@ -57,7 +58,8 @@ def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str 
 
     Args:
         ready: from `fp.simulator`.
-        exact: parameters of the plants, shape (plants, parameters), in the order of the plant's parameters.
+        exact: parameters of the plants, shape (plants, parameters), in the order of the parameters of what moves, which is the
+            reality where the problem has one.
         seed: of the noise of disturbances and sensors, the same for every plant.
         device: part of the name of an OpenCL device ('': the first graphics processor, else the first one), for loops that are
             scalar code; None: the vector registers of this machine.
@@ -65,22 +67,16 @@ def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str 
     Raises:
         InvalidName: no device has this name.
         InvalidShape: another number of parameters.
-        InvalidValue: a parameter that is not finite.
+        InvalidValue: a parameter that is not finite, or outside its bounds.
         NotInstalled: pyopencl (pip install 'fpirhc[opencl]'), or a device with double precision.
     """
     exact = np.atleast_2d(np.asarray(exact, dtype=float))
-    if exact.ndim != 2 or exact.shape[1] != ready.problem.plant.parameter.size:
-        names = ", ".join(ready.problem.plant.parameter.elements)
-        raise InvalidShape(f"run_many(exact of shape {exact.shape}): expected one row per plant with {names}")
-    if not np.isfinite(exact).all():
-        raise InvalidValue(
-            f"run_many: parameters of plant {int(np.argmin(np.isfinite(exact).all(axis=1)))} are not finite"
-        )
+    _check_parameters(ready.problem.moved.parameters, exact)
     judged = ready.loop.trace["error"].elements
     lanes = _LANES.of((ready,), (device,), lambda: Lanes(ready, _errors_alone(), device))
     rms, largest = (np.full((len(exact), len(judged)), np.nan) for _ in range(2))
     counts, left = np.zeros((len(exact), len(Status)), dtype=int), np.ones(len(exact), dtype=bool)
-    if not lanes.why:
+    if not lanes.why and len(exact):
         columns, left = lanes.of_parameters(exact, seed)
         rms, largest = (np.column_stack([columns[m][n] for n in judged]) for m in ("rms_error", "max_error"))
         counts = np.column_stack([np.ma.filled(columns["status"][one.name], 0) for one in Status])
@@ -96,6 +92,25 @@ def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str 
     by_name = (dict(zip(judged, columns.T.copy(), strict=True)) for columns in (rms, largest))
     statuses = {one.name: counts[:, one].copy() for one in Status if counts[:, one].any()}
     return ManyRuns(next(by_name), next(by_name), statuses, stops, lanes.width, lanes.why)
+
+
+def _check_parameters(parameters: Mapping[str, Parameter], exact: np.ndarray) -> None:
+    """Raise where rows are not those of plants."""
+    if exact.ndim != 2 or exact.shape[1] != len(parameters):
+        raise InvalidShape(
+            f"run_many(exact of shape {exact.shape}): expected one row per plant with {', '.join(parameters)}"
+        )
+    for (name, one), column in zip(parameters.items(), exact.T, strict=True):
+        low, high = one.bounds
+        for wrong, what in (
+            (~np.isfinite(column), "not finite"),
+            ((column < low) | (column > high), f"outside {low:g} to {high:g}"),
+        ):
+            if wrong.any():
+                number = int(np.argmax(wrong))
+                raise InvalidValue(
+                    f"run_many: plant {number}: '{name}' is {column[number]:g}, which is {what} {one.unit}"
+                )
 
 
 def _errors_alone() -> tuple[Metric, ...]:
@@ -292,10 +307,12 @@ class _Library:
 
 def _starts(ready: Simulator, exact: np.ndarray) -> np.ndarray:
     """First memories (plants, memory): one and the same but for the parameters, unless the start depends on these."""
-    place, ends = ready.loop.memory.slice("_exact"), [exact[0], exact[-1]]
-    first, last = (ready.first_memory(ready.problem.with_exact(one))[1] for one in ends)
+    place = ready.loop.memory.slice("_exact")
+    # The first plant, and for every parameter the one that differs most in it.
+    asked = dict.fromkeys([0, *map(int, np.abs(exact - exact[0]).argmax(axis=0))])
+    first, *others = (ready.first_memory(ready.problem.with_exact(exact[k]))[1] for k in asked)
     rest = np.delete(np.arange(len(first)), np.arange(place.start, place.stop))
-    if np.array_equal(first[rest], last[rest]):
+    if all(np.array_equal(first[rest], one[rest]) for one in others):
         starts = np.tile(first, (len(exact), 1))
         starts[:, place] = exact
         return starts

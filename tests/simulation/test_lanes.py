@@ -258,5 +258,42 @@ def test_wrong_parameters_are_named():
         run_many(ready, np.ones((1, 2)))
     exact = plants(ready, 3)
     exact[1, 0] = np.nan
-    with pytest.raises(InvalidValue, match="parameters of plant 1 are not finite"):
+    with pytest.raises(InvalidValue, match=r"plant 1: .* is nan, which is not finite"):
         run_many(ready, exact)
+
+
+def drifting() -> Simulator:
+    """A reality with a parameter that the model lacks, at which a state of its own settles before the start."""
+    model = fp.Plant({"y": "m"}, {"u": "m/s"}, {}, lambda q, u, p: {"y": u.u}, order=1)
+    real = fp.Plant(
+        {"y": "m", "z": "m/s"},
+        {"u": "m/s"},
+        {"b": fp.Parameter(1.0, 1.0, "1"), "c": fp.Parameter(1.0, 1.0, "m/s", bounds=(0.0, 4.0))},
+        lambda q, u, p: {"y": p.b * u.u + q.z, "z": p.c - q.z},
+        order=1,
+        controlled=("y",),
+    )
+    still = fp.Trajectory(lambda t: {"y": 0 * t})
+    problem = fp.Problem(model, still, {"y": 0.0}, period=0.01, duration=0.5, reality=fp.Reality(real))
+    return fp.simulator(problem, fp.ComputedTorque(fp.Exponential(rate=2.0)))
+
+
+def test_plants_are_those_of_the_reality_and_each_starts_where_it_settles():
+    """Between two that are one and the same there may be another."""
+    ready, exact = drifting(), np.array([[1.0, 1.0], [1.0, 3.0], [1.0, 1.0]])
+    many = run_many(ready, exact)
+    for k, one in enumerate(exact):
+        rms, largest, *_ = by_itself(ready, one)
+        np.testing.assert_allclose(many.rms_error["y"][k], rms, rtol=1e-12)
+        np.testing.assert_allclose(many.max_error["y"][k], largest, rtol=1e-12)
+
+
+def test_a_plant_outside_its_bounds_is_named_wherever_it_stands():
+    with pytest.raises(InvalidValue, match="plant 1: 'c' is 5, which is outside 0 to 4 m/s"):
+        run_many(drifting(), np.array([[1.0, 1.0], [1.0, 5.0], [1.0, 1.0]]))
+
+
+def test_no_plants_have_no_errors():
+    many = run_many(drifting(), np.empty((0, 2)))
+    assert many.rms_error["y"].shape == many.max_error["y"].shape == (0,)
+    assert not many.stops
