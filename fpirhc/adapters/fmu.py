@@ -11,7 +11,7 @@ from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-from fpirhc.adapters.names import adapter, counterparts
+from fpirhc.adapters.names import adapter, counterparts, other_types, require
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
@@ -33,24 +33,24 @@ def fmu_body(
         path: of the FMU.
         model: the controller's model; the variables of the FMU have its units.
         period: of the problem, in the model's unit of time; one communication step.
-        measures: quantity of the model ("q1", "q1'") -> variable of the FMU.
+        measures: quantity of the model ("q1", "q1'") -> variable of the FMU, of the type Real or Float64.
         inputs: input of the model -> variable of the FMU, where the names differ.
         parameters: variable of the FMU -> its value from the start on.
 
     Raises:
         NotSupported: FMPy is not installed.
-        InvalidProblem: a name that the FMU or the model does not have, or an FMU without co-simulation.
+        InvalidProblem: a name that the FMU or the model does not have, a variable of another type, or an FMU without co-simulation.
     """
     fmpy = package("fmpy", "outside")
     described = fmpy.read_model_description(str(path))
     units, mistakes, fixed = quantities(model), Mistakes("fmu_body"), parameters or {}
-    if described.coSimulation is None:
-        mistakes.add(f"{Path(path).name} is made for model exchange alone; export it for co-simulation")
-    known = {v.name: v.valueReference for v in described.modelVariables if v.type in ("Real", "Float64")}
+    require(bool(described.coSimulation), "fmu_body: the FMU is for model exchange alone; export it for co-simulation")
+    known = {v.name: v for v in described.modelVariables}
     mistakes.unknown("measures: quantity", measures, units)
     mistakes.unknown("variable", measures.values(), known)
-    mistakes.unknown("parameters: variable", fixed, [v.name for v in described.modelVariables])
+    mistakes.unknown("parameters: variable", fixed, known)
     sent = counterparts(mistakes, "input", model.inputs, inputs or {}, known)
+    other_types(mistakes, [known.get(name) for name in (*measures.values(), *sent.values())], "Real", "Float64")
     mistakes.raise_if_any()
     folder = fmpy.extract(str(path))
 
@@ -59,7 +59,7 @@ def fmu_body(
         fmpy.simulation.apply_start_values(unit, described, fixed)
         return unit
 
-    places = ([known[name] for name in names] for names in (sent.values(), measures.values()))
+    places = ([known[name].valueReference for name in names] for names in (sent.values(), measures.values()))
     body = _Body(made, described.fmiVersion[0] == "3", period, *places)
     weakref.finalize(body, rmtree, folder, ignore_errors=True)
     return ExternalPlant(body, measures={name: units[name] for name in measures}, period=period)

@@ -4,8 +4,9 @@
     measures = {"th": lambda seen: np.arctan2(seen[1], seen[0]), "th'": 2}
     problem = fp.Problem(plant=model, reality=gymnasium_body(env, model, measures=measures), ...)
 
-The period of the problem is the time that one step of the environment takes. Rewards are not read; an end that is not one of time
-(`terminated`) is a bad answer and ends the run.
+The period of the problem must be the time that one step of the environment takes. An environment does not state it, so another one
+is refused only where it is written: `dataclasses.replace(gymnasium_body(...), period=0.05)`. Rewards are not read; an end that is
+not one of time (`terminated`) is a bad answer and ends the run.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -97,6 +97,13 @@ def counterparts(
     found = {name: given.get(name, name) for name in own}
     mistakes.unknown(what, found.values(), valid)
     return found
+
+
+def other_types(mistakes: Mistakes, variables: Iterable[Any], *valid: str) -> None:
+    """Add a mistake for each variable (with a name and a type) that an adapter does not take; those that are unknown are None."""
+    for one in variables:
+        if one is not None and one.type not in valid:
+            mistakes.add(f"variable '{one.name}' is of the type {one.type}; expected {' or '.join(valid)}")
 
 
 def from_path_or_text(source: str | Path, by_path: Callable[[str], R], by_text: Callable[[str], R]) -> R:

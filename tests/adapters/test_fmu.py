@@ -98,6 +98,8 @@ def test_a_parameter_that_is_no_real_number_is_set(unit):
     [
         ({"measures": {"h": "leve"}}, "variable 'leve' is unknown. Did you mean 'level'?"),
         ({"measures": {"hh": "level"}}, "measures: quantity 'hh' is unknown. Did you mean 'h'?"),
+        ({"measures": {"h": "pipes"}}, "variable 'pipes' is of the type Integer; expected Real or Float64"),
+        ({"inputs": {"q": "pipes"}}, "variable 'pipes' is of the type Integer; expected Real or Float64"),
         ({"inputs": {}}, "input 'q' is unknown."),
         ({"parameters": {"inlet": 1.0}}, "parameters: variable 'inlet' is unknown. Did you mean 'outlet'?"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -25,21 +26,25 @@ PENDULUM = fp.Plant(
 )
 
 
-def swinging(gain: float) -> tuple[fp.Problem, fp.Run]:
-    env = gymnasium.make("Pendulum-v1", max_episode_steps=10_000)
-    env.unwrapped.max_torque, env.unwrapped.max_speed = 40.0, 100.0
-    env.unwrapped.action_space = env.action_space = gymnasium.spaces.Box(-40, 40, (1,))
-    task = fp.Problem(
+def problem(reality: fp.ExternalPlant, period: float) -> fp.Problem:
+    return fp.Problem(
         plant=PENDULUM,
-        reality=gymnasium_body(env, PENDULUM, measures=MEASURES),
+        reality=reality,
         sensing=fp.Sensing(estimator=fp.VelocityDifference()),
         reference=fp.Trajectory(lambda t: {"th": 0.8 * ca.sin(t)}),
         start={"th": 0.0},
-        period=0.05,
+        period=period,
         duration=20.0,
         measure_from=5.0,
         limits=fp.Limits(inputs={"u": (-40.0, 40.0)}),
     )
+
+
+def swinging(gain: float) -> tuple[fp.Problem, fp.Run]:
+    env = gymnasium.make("Pendulum-v1", max_episode_steps=10_000)
+    env.unwrapped.max_torque, env.unwrapped.max_speed = 40.0, 100.0
+    env.unwrapped.action_space = env.action_space = gymnasium.spaces.Box(-40, 40, (1,))
+    task = problem(gymnasium_body(env, PENDULUM, measures=MEASURES), period=0.05)
     law = fp.ComputedTorque(fp.Exponential(rate=3.0), fp.ModelReferenced(fp.Affine(gain=gain)))
     return task, fp.simulate(task, law, seed=3, compiled=False)
 
@@ -47,6 +52,13 @@ def swinging(gain: float) -> tuple[fp.Problem, fp.Run]:
 def test_adaptation_pays_behind_a_wrong_mass():
     errors = [fp.measure(*swinging(gain)).rms_error["th"] for gain in (-1e-6, -0.3)]
     assert errors[1] < 0.4 * errors[0]
+
+
+def test_a_time_step_that_is_written_is_compared_with_the_period():
+    """An environment does not state it, and runs with any period."""
+    body = gymnasium_body(gymnasium.make("Pendulum-v1"), PENDULUM, measures=MEASURES)
+    with pytest.raises(InvalidProblem, match=r"one step of it takes 0\.05, and the problem's period is 0\.1"):
+        problem(dataclasses.replace(body, period=0.05), period=0.1)
 
 
 def test_a_run_ends_by_name_where_the_episode_ends():
