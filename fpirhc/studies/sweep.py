@@ -276,7 +276,7 @@ def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
         with mistakes.caught():
             if axis.path in of_cases:
                 ends = (axis.values[0], axis.values[-1])
-                Cases({f"{axis.path} = {number(v)}": {axis.path: v} for v in ends}).check(task.problem)
+                _Values({f"{axis.path} = {number(v)}": {axis.path: v} for v in ends}).check(task.problem)
             else:
                 _check_controllers(task, axis, words)
     mistakes.raise_if_any()
@@ -332,6 +332,15 @@ def _unit(problem: Problem, path: str) -> str:
     return problem.time_unit if word in _TIMES else ""
 
 
+class _Values(Cases):
+    """Values of settings as cases; a message has them in place of the name of a case."""
+
+    _where = "sweep"
+
+    def _place(self, name: str, path: str = "", *, head: bool = False) -> str:  # noqa: ARG002
+        return name
+
+
 class _Grid:
     """The cells, by number: the last axis is the fastest. `of_problem`: paths that are the problem's."""
 
@@ -343,7 +352,10 @@ class _Grid:
             dict(zip([a.path for a in self._case_axes], values, strict=True))
             for values in itertools.product(*(a.values for a in self._case_axes))
         ]
-        self.cases = Cases({str(k): {**case, "seed": seed} for k, case in enumerate(cases)})
+        names = [", ".join(f"{path} = {float(value)!r}" for path, value in case.items()) for case in cases]
+        self.cases = _Values(
+            {name or "as it stands": {**case, "seed": seed} for name, case in zip(names, cases, strict=True)}
+        )
 
     def case(self, place: Sequence[int]) -> int:
         """Return the number of a cell's case."""

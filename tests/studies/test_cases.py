@@ -21,7 +21,7 @@ from fpirhc.cli.verb import ExitCode
 from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidValue, ProblemFileError
 from fpirhc.problem_files.problem_file import Task, in_case
 from fpirhc.studies.comparison.compare import check_gains
-from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.bench import Bench, Conditions, scenarios
 from fpirhc.studies.scenarios.draws import COMPARING
 
 CASES = """
@@ -233,6 +233,16 @@ def test_the_command(task, capsys):
     error = fp.measure(task.cases.problem("far", task.problem), run).rms_error["y"]
     record = next(r for r in compared(task, "far").records["CTC"])
     assert record["metrics"]["rms_error"]["y"] == error
+
+
+def test_the_options_of_a_case_that_begins_as_an_option_does_run_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("line.py").write_text(LINE.replace('"far": {', '"-far": {'))
+    task = fp.load_problem("line.py")
+    options = scenarios(task, Conditions(0, COMPARING, 0.0, compiled=False, named=True)).options(
+        task.cases.names.index("-far")
+    )
+    assert main(["run", "line.py", "CTC", "--no-compile", *options]) == ExitCode.FINISHED
 
 
 @pytest.mark.slow

@@ -140,3 +140,14 @@ def test_parts_of_unequal_sizes_belong_together(tmp_path, monkeypatch):
         with pytest.raises(WorkerDied):
             compare_scenarios(task, count=63, percent=10.0, shard=(k, 2), seed=0, folder=folder)
     assert merge_shards(folders, tmp_path / "all").records == 0
+
+
+def test_the_whole_is_no_part_of_itself(parts, tmp_path, capsys):
+    """It keeps what it holds, and the other parts are joined to it."""
+    first, second = (str(parts / f"part{k}") for k in (1, 2))
+    whole = str(tmp_path / "all")
+    assert main(["merge", first, "--out", whole]) == 0
+    assert main(["merge", whole, second, "--out", whole]) == 2
+    assert "is the folder of the whole and of a part" in " ".join(capsys.readouterr().err.split())
+    assert main(["merge", second, "--out", whole]) == 0
+    assert results(tmp_path / "all") == {**results(parts / "part1"), **results(parts / "part2")}

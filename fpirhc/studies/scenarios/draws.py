@@ -215,7 +215,10 @@ class NamedCases(Scenarios):
         return Scenario(name, group, seed, mismatch, key, built, problem, self._shared(name, built))
 
     def options(self, number: int) -> tuple[str, ...]:
-        return ("--case", self.cases.names[number], "--seed", str(self[number].seed))
+        name = self.cases.names[number]
+        # A name that begins as an option does would be taken for one.
+        case = (f"--case={name}",) if name.startswith("-") else ("--case", name)
+        return (*case, "--seed", str(self[number].seed))
 
     def has_many_alike(self, number: int) -> bool:
         alike = self._alike[self.cases.key(self.cases.names[number], self._data)]

@@ -303,8 +303,13 @@ def merge_shards(folders: Sequence[Path], out: Path) -> Joined:
         out: folder of the whole; it may hold some results already.
 
     Raises:
+        InvalidValue: the folder of the whole stands among those of the parts.
         OutputError: a folder without results, results under other conditions, or one result that differs between two folders.
     """
+    if out.resolve() in {folder.resolve() for folder in folders}:
+        raise InvalidValue(
+            f"'{out}' is the folder of the whole and of a part; it keeps the results that it holds, so leave it out of the parts"
+        )
     header, twice = header_of(folders[0] / LEDGER), 0
     with Ledger(out / LEDGER, header, RecordFields) as whole:
         known = _Places()
