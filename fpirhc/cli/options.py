@@ -89,10 +89,10 @@ def positive(text: str) -> float:
     return _number(text, text, lambda one: 0 < one < math.inf, "a number above 0")
 
 
-def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:
-    """--mismatch PERCENT, with the same meaning wherever it stands; see `fpirhc.plant.plant`."""
+def add_mismatch(parser: Parser, default: float | None = 0.0, dead_times: str = "dead times likewise") -> None:
+    """--mismatch PERCENT, with the same meaning for parameters wherever it stands; see `fpirhc.plant.plant`."""
     text = (
-        "every exact parameter lies within PERCENT %% of its value in the problem file, or of its spread, and dead times likewise "
+        f"every exact parameter lies within PERCENT %% of its value in the problem file, or of its spread, and {dead_times} "
         "(default: 0)"
     )
     parser.add_argument("--mismatch", type=mismatch, default=default, metavar="PERCENT", help=text)

@@ -19,6 +19,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import AboveZero, Accuracy, Seed
 from fpirhc.plant.plant import Parametric, drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.settings import current_setting
 from fpirhc.simulation.lanes import Lanes
 from fpirhc.simulation.metrics import Metrics
 from fpirhc.simulation.simulate import Simulator, simulator
@@ -26,9 +27,11 @@ from fpirhc.simulation.sums import Values
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.operating_limits import FAILS, Judge, Point, bracket
 from fpirhc.studies.scenarios.bench import ranges, relative_error
-from fpirhc.studies.scenarios.draws import SEARCHING
+from fpirhc.studies.scenarios.dead_times import DeadTimes
+from fpirhc.studies.scenarios.draws import SEARCHING, draws_differ
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, line, number
+from fpirhc.task.problem import Problem
 
 RISK, CONFIDENCE = 0.05, 0.999  # where nothing else is said
 _BOXES = 99  # of 1 % to 99 %
@@ -42,6 +45,7 @@ class Counterexample:
     """A plant of the box that fails."""
 
     parameters: Mapping[str, float]  # its exact parameters, by name
+    dead_times: Mapping[str, float]  # by path, in the unit of time; empty where they are the problem's
     why: str  # it fails
     from_percent: int  # the smallest box, in whole percent, at whose edge in this direction a plant fails
 
@@ -97,8 +101,9 @@ def robust_boxes(
 ) -> RobustBoxes:
     """Return for every controller the largest mismatch at which at most a share `risk` of all plants fails.
 
-    The box of P percent holds the plants that `fpirhc compare --scenarios --mismatch P` draws. N plants are drawn, one direction
-    each, and every box is asked with these; where none of the N fails,
+    The box of P percent holds the plants that `fpirhc compare --scenarios --mismatch P` draws: exact parameters, and dead times
+    that are those of the problem, or P percent shorter or longer, in whole cycles. N plants are drawn, one direction each, and
+    every box is asked with these; where none of the N fails,
 
         share of failing plants <= risk    with probability >= confidence,    N >= ln(99 / (1 - confidence)) / ln(1 / (1 - risk)),
 
@@ -119,7 +124,7 @@ def robust_boxes(
 
     Raises:
         InvalidProblem: unknown controllers, gains of the wrong sign.
-        InvalidValue: a share that is none, `fails` that is not positive, or a plant without parameters to draw.
+        InvalidValue: a share that is none, `fails` that is not positive, or a plant without parameters or dead times to draw.
     """
     begin = time.perf_counter()
     most = _most(task)
@@ -129,7 +134,7 @@ def robust_boxes(
     boxes, untried = [], {}
     for name, controller in chosen.items():
         try:
-            plants = _Plants(task, believing(task.problem, controller), draws, fails, seed, compiled)
+            plants = _Plants(task, believing(task.problem, controller), draws, most, fails, seed, compiled)
             boxes.append(_robust_box(name, plants, most, progress))
         except FpirhcError as error:
             untried[name] = str(error)
@@ -162,10 +167,10 @@ def _most(task: Task) -> int:
             beyond, refusal = middle, str(error)
         else:
             least, refusal = middle, ""
-    if least and any(high > low for low, high in exact_ranges(moved, least).values()):
+    if least and draws_differ(task.problem, least):
         return least
     why = refusal or "all are zero or given by signals"
-    raise InvalidValue(f"problem '{task.name}' has no parameters that can be drawn: {why}")
+    raise InvalidValue(f"problem '{task.name}' has no parameters or dead times that can be drawn: {why}")
 
 
 def _robust_box(name: str, plants: _Plants, most: int, progress: Progress | None) -> RobustBox:
@@ -191,15 +196,22 @@ def _robust_box(name: str, plants: _Plants, most: int, progress: Progress | None
 
 
 class _Plants:
-    """The plants of all boxes, by percent and direction: the share of the distribution of every parameter, shape (np,)."""
+    """The plants of all boxes, by percent and direction: the share of the distribution of every parameter, shape (np,).
 
-    def __init__(self, task: Task, controller: Controller, draws: int, fails: float, seed: int, compiled: bool) -> None:
+    Where dead times are drawn one share stands behind these: its thirds are shorter ones, those of the problem, and longer ones.
+    """
+
+    def __init__(
+        self, task: Task, controller: Controller, draws: int, most: int, fails: float, seed: int, compiled: bool
+    ) -> None:
         self._problem, self._judge = task.problem, Judge(task, fails, seed)
         self._controller, self._compiled, self._seed = controller, compiled, seed
-        self._parameters = task.problem.moved.parameters
-        streams = [np.random.SeedSequence(seed, spawn_key=(SEARCHING, k)).spawn(2) for k in range(draws)]
-        self._shares = np.array([np.random.default_rng(own).random(len(self._parameters)) for own, _ in streams])
-        self._noise = [int(noise.generate_state(1)[0]) for _, noise in streams]
+        self._parameters, self._dead_times = task.problem.moved.parameters, DeadTimes(task.problem, most)
+        streams = [np.random.SeedSequence(seed, spawn_key=(SEARCHING, k)).spawn(3) for k in range(draws)]
+        shares = [np.random.default_rng(own).random(len(self._parameters)) for own, _, _ in streams]
+        late = [np.random.default_rng(own).random(int(self._dead_times.drawn)) for _, _, own in streams]
+        self._shares = np.hstack([shares, late])
+        self._noise = [int(noise.generate_state(1)[0]) for _, noise, _ in streams]
         self._errors, self._metrics = np.zeros(draws), [m for m in task.metrics if m.name == "rms_error"]
         self._loop = self._built()
 
@@ -251,9 +263,9 @@ class _Plants:
     ) -> np.ndarray | None:
         """The errors of plants side by side; None where one cannot run, which the loop one after the other names."""
         try:
-            plants = [self._problem.with_exact(self._exact(percent, one)) for one in shares]
-            pairs = zip(plants, noise, strict=True)
-            runs = [lanes.one_run(self._loop, problem, own, exact_alone=True) for problem, own in pairs]
+            plants = [self._plant(percent, one) for one in shares]
+            pairs, alone = zip(plants, noise, strict=True), not self._dead_times.drawn
+            runs = [lanes.one_run(self._loop, problem, own, exact_alone=alone) for problem, own in pairs]
         except FpirhcError:
             return None
         return np.array([self._error(one) for one in lanes.values(runs)])
@@ -272,7 +284,7 @@ class _Plants:
         """Return the largest error that a search in the box meets, and a plant that fails, if it meets one."""
         from scipy.optimize import differential_evolution
 
-        size = min(_GENERATION, max(5, 4 * len(self._parameters)), max(5, len(self._shares) // 4))
+        size = min(_GENERATION, max(5, 4 * self._shares.shape[1]), max(5, len(self._shares) // 4))
         order = np.argsort(self._errors)[::-1]
         worst = self._shares[order[: max(size // 3, 2)]]
         start = np.vstack([worst, np.round(worst), 1 - np.round(worst)])  # their corners, and the corners across
@@ -284,7 +296,7 @@ class _Plants:
             largest = max(largest, float(errors.max()))
             return -errors
 
-        limits = [(0.0, 1.0)] * len(self._parameters)
+        limits = [(0.0, 1.0)] * self._shares.shape[1]
         generations = max(len(self._shares) // len(start) - 1, 1)
         try:
             differential_evolution(
@@ -303,7 +315,7 @@ class _Plants:
         return largest, None
 
     def _searched(self, percent: int, generation: np.ndarray, noise: int) -> np.ndarray:
-        """The errors of the plants of a generation, shape (plants, np); the first that fails ends the search."""
+        """The errors of the plants of a generation, a row of shares each; the first that fails ends the search."""
         if self._lanes is not None:
             errors = self._errors_of_lanes(self._lanes, percent, generation, [noise] * len(generation))
             if errors is not None and (errors <= self._judge.fails).all():
@@ -322,15 +334,29 @@ class _Plants:
             middle = (holds + fails) // 2
             holds, fails = (holds, middle) if self._point(middle, failing.shares, noise).why else (middle, fails)
         values = self._exact(percent, failing.shares)
-        return Counterexample(dict(zip(self._parameters, map(float, values), strict=True)), failing.point.why, fails)
+        parameters = dict(zip(self._parameters, map(float, values), strict=True))
+        return Counterexample(parameters, self._other_dead_times(percent, failing.shares), failing.point.why, fails)
+
+    def _other_dead_times(self, percent: int, shares: np.ndarray) -> dict[str, float]:
+        plant = self._plant(percent, shares)
+        both = {
+            path: [float(current_setting(one, path)) for one in (plant, self._problem)]
+            for path in self._dead_times.live
+        }
+        return {path: own for path, (own, usual) in both.items() if own != usual}
+
+    def _plant(self, percent: int, shares: np.ndarray) -> Problem:
+        """The problem with a plant of the box."""
+        lateness = min(int(3 * shares[-1]), 2) - 1 if self._dead_times.drawn else 0
+        return self._dead_times.at(lateness * percent).with_exact(self._exact(percent, shares))
 
     def _exact(self, percent: int, shares: np.ndarray) -> np.ndarray:
-        pairs = zip(self._parameters.values(), shares, strict=True)
+        pairs = zip(self._parameters.values(), shares, strict=False)
         return np.array([drawn(parameter, percent, float(share)) for parameter, share in pairs])
 
     def _point(self, percent: int, shares: np.ndarray, noise: int) -> Point:
         try:
-            problem = self._problem.with_exact(self._exact(percent, shares))
+            problem = self._plant(percent, shares)
         except FpirhcError as error:
             return Point(percent, math.inf, str(error))
         if self._loop.remembers:
@@ -338,7 +364,8 @@ class _Plants:
         return self._judge.point(percent, problem, self._loop.run(seed=noise, variant=problem))
 
     def _built(self) -> Simulator:
-        return simulator(self._problem, self._controller, compiled=self._compiled)
+        times = self._dead_times
+        return simulator(times.room, self._controller, compiled=self._compiled, live=times.live)
 
 
 class _Found(Exception):  # it ends a search and reports no error
@@ -394,7 +421,9 @@ def _sentences(result: RobustBoxes) -> Iterator[str]:
 
 
 def _plant(example: Counterexample) -> str:
-    values = ", ".join(f"{name} = {number(value)}" for name, value in example.parameters.items())
+    values = ", ".join(
+        f"{name} = {number(value)}" for name, value in {**example.parameters, **example.dead_times}.items()
+    )
     return f"{values} ({example.why}); in this direction plants fail from {example.from_percent} % on"
 
 

@@ -21,6 +21,7 @@ from fpirhc.fields.checked import Checked, FoundByName, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
+from fpirhc.review.grid import is_late
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.pairwise import harm_of_adaptation
 from fpirhc.studies.objective import Objective, objective
@@ -127,7 +128,7 @@ def tune(
         folder: folder to which finished trials are written, one by one.
         controllers: names of controllers; None: all that the task's tuning has.
         count: number of scenarios in a trial.
-        percent: range of the exact parameters' draws, percent.
+        percent: range of the exact parameters' draws, percent; dead times stay as they are.
         cases: in place of random scenarios, those cases of the task that these patterns name. The result says which they are, so
             that the others can judge it.
         metric: number that is the cost, for example 'settling.q1' or 'at_limit'; the cost has the opposite sign
@@ -176,6 +177,7 @@ def tune(
             _tuned(optuna, task, n, conditions, numbers, (trials, population), aim, ledger, progress) for n in names
         )
     words = f"{count} scenario{'s' if count > 1 else ''} within {percent:g} %"
+    words += ", with the problem's dead times" if percent and is_late(task.problem) else ""
     if cases is not None and task.cases is not None:
         words = f"cases {', '.join(task.cases.names[k] for k in numbers)}: {len(numbers)} of {len(task.cases.names)}"
     untouched = tuple(n for n in task.controllers if n not in names)

@@ -16,6 +16,7 @@ from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.operating_limits import Judge
 from fpirhc.studies.robust import robust_boxes, wanted_draws
+from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 from fpirhc.symbolic.native import find_compiler
 
 RATE, PERIOD = 60.0, 0.02  # 1/s, s
@@ -133,7 +134,9 @@ def test_wrong_shares_are_named(wrong, message):
 
 
 def test_a_plant_without_anything_to_draw_and_an_unknown_controller_are_named():
-    with pytest.raises(InvalidValue, match=r"problem 'pump' has no parameters that can be drawn: .*outside its bounds"):
+    with pytest.raises(
+        InvalidValue, match=r"problem 'pump' has no parameters or dead times that can be drawn: .*outside its bounds"
+    ):
         robust_boxes(pump(bounds=(1.0, 2.0)))
     with pytest.raises(InvalidProblem, match="lav"):
         robust_boxes(pump(), controllers=["lav"])
@@ -161,3 +164,41 @@ def test_the_command_prints_and_saves_what_was_found(tmp_path, capsys):
     )
     assert main(["robust", "two_mass", "--controllers", "CTCC", "--out", str(tmp_path)]) == 2
     assert "CTCC" in capsys.readouterr().err
+
+
+def late(cycles: int, rate: float = 5.0) -> Task:
+    """Y' = u behind a dead time that the law does not know; nothing else is drawn."""
+    task = pump()
+    plant = fp.Plant({"y": "m"}, {"u": "V"}, {}, lambda q, u, p: {"y": u.u}, order=1)
+    times = fp.DeadTime({"u": cycles * PERIOD})
+    law = fp.ComputedTorque(fp.Exponential(rate=rate, integral=False))
+    return replace(task, problem=replace(task.problem, plant=plant, dead_time=times), controllers={"law": law})
+
+
+COMPILES = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=COMPILES)])
+def test_a_box_holds_the_dead_times_that_a_comparison_draws(compiled, tmp_path):
+    """e+ = e - T rate e[k - d] is stable for T rate < 2 sin(pi / (2 (2 d + 1))): with T rate = 0.1 up to d = 15."""
+    (box,) = robust_boxes(late(10), risk=0.3, confidence=0.9, compiled=compiled).boxes
+    edge = max(d for d in range(30) if 2 * math.sin(math.pi / (2 * (2 * d + 1))) > 5.0 * PERIOD)
+    assert edge == 15
+    assert (box.percent, box.fails_at) == (50, 51)
+    drawn = {
+        percent: compare_scenarios(
+            late(10), count=6, percent=percent, seed=0, folder=tmp_path / f"{percent}", compiled=compiled
+        )
+        for percent in (box.percent, box.fails_at)
+    }
+    errors = {percent: max(r["error"] or math.inf for r in one.records["law"]) for percent, one in drawn.items()}
+    assert errors[50] < 0.5 < errors[51]
+
+
+def test_a_plant_that_fails_is_told_with_its_dead_time():
+    """Few draws have no late one among them, and the search finds it."""
+    (box,) = robust_boxes(late(10), risk=0.9, confidence=0.1, seed=16, compiled=False).boxes
+    assert box.percent == 99
+    assert box.counterexample is not None
+    assert box.counterexample.from_percent == 51
+    assert box.counterexample.dead_times == {"dead_time.inputs.u": pytest.approx(20 * PERIOD)}

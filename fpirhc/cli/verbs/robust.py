@@ -55,7 +55,8 @@ VERB = Verb(
     notes="""
 A run fails if it ends early, leaves a limit of a state by more than 2 % of its width, or has an rms error above --fails of the
 reference's range. The box of P percent holds the plants that `compare --scenarios --mismatch P` draws: every exact parameter
-is multiplied by a factor between 1 - P/100 and 1 + P/100, or lies in P percent of its own spread.
+is multiplied by a factor between 1 - P/100 and 1 + P/100, or lies in P percent of its own spread, and dead times are those of
+the problem, or P percent shorter or longer, in whole cycles. Controllers know none of this.
 Where none of the drawn plants fails, the share that does is at most --risk, with --confidence for all boxes of whole percents
 at once. Drawn plants seldom are the worst ones: from the worst of them a search looks for a plant of the box that fails.
 """,

@@ -34,7 +34,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--population", type=whole(1), default=1, metavar="N", help=text)
     add_seed(parser, "the proposals and scenarios")
     add_scenarios(parser, 1, "scenarios in every trial (default: 1)")
-    add_mismatch(parser)
+    add_mismatch(parser, dead_times="dead times stay as they are")
     add_cases(parser, "tune on these cases of the problem file in place of scenarios")
     text = "tune by this number of a run, such as settling.q1 (default: the problem's headline metric, or the relative error)"
     parser.add_argument("--metric", metavar="NAME", help=text)
@@ -129,7 +129,8 @@ VERB = Verb(
 A problem file lists the settings to tune, by dotted path:
   tuning = {"RHC+FPI": {"deformation.gain": fp.LogSpan(-1.5, -0.05), "deformation.scale": fp.LogSpan(5, 500)}}
 The cost is the rms error divided by the reference's range, the mean over the scenarios; runs that fail cost 10 to 20.
-The scenarios of tuning are never those of a comparison. Cases are those that you name, and the file says which:
+The scenarios of tuning are never those of a comparison, and dead times are those of the problem in all of them; cases may have
+others. Cases are those that you name, and the file says which:
 compare on the others.
 """,
 )

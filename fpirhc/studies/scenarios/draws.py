@@ -18,7 +18,8 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.plant.plant import Parametric, drawn, exact_ranges
-from fpirhc.review.grid import is_late, live_paths, roomy, scaled
+from fpirhc.review.grid import is_late
+from fpirhc.studies.scenarios.dead_times import DeadTimes
 from fpirhc.task.cases import START, Cases
 from fpirhc.task.problem import Problem
 
@@ -155,8 +156,8 @@ class RandomScenarios(Scenarios):
     def __getitem__(self, number: int) -> Scenario:
         plant, facts = self.of.moved, {"seed": self.seed, "use": self.use, "percent": self.percent}
         one = draw(plant, number=number, model=self.of.plant, **facts)  # type: ignore[arg-type]  # of several types
-        lateness = one.lateness if self._draws_dead_times else 0
-        built = self._late[lateness]
+        lateness = one.lateness if self._dead_times.drawn else 0
+        built = self._dead_times.at(lateness * self.percent)
         problem = built.with_exact(one.exact)
         return Scenario(str(number), "", one.seed, one.mismatch, lateness, built, problem, self._shared)
 
@@ -165,29 +166,22 @@ class RandomScenarios(Scenarios):
         return ("--scenario", str(number), "--mismatch", percent, "--seed", str(self.seed))
 
     def automatic(self, controller: Controller) -> Controller:
-        return resolved(self.of, controller) if self._draws_dead_times else controller
+        return resolved(self.of, controller) if self._dead_times.drawn else controller
 
     @property
     def differ_in_exact_alone(self) -> bool:
-        return not self._draws_dead_times
+        return not self._dead_times.drawn
 
     @cached_property
     def _shared(self) -> Shared | None:
         """The loop with live dead times, where they are drawn."""
-        return Shared(None, self._late[0], live_paths(self._late[0])) if self._draws_dead_times else None
+        times = self._dead_times
+        return Shared(None, times.room, times.live) if times.drawn else None
 
     @cached_property
-    def _draws_dead_times(self) -> bool:
-        """Whether the plant's dead times are other ones than the controllers'; they are not in studies that tune."""
-        return self.use == COMPARING and self.percent > 0 and is_late(self.of)
-
-    @cached_property
-    def _late(self) -> dict[int, Problem]:
-        """The problem with its dead times and with others, by lateness, all with queues for the longest of them."""
-        if not self._draws_dead_times:
-            return {0: self.of}
-        room = roomy(self.of, self.percent)
-        return {0: room, **{k: scaled(room, k * self.percent) for k in (-1, 1)}}
+    def _dead_times(self) -> DeadTimes:
+        """Those of the plants; studies that tune draw none."""
+        return DeadTimes(self.of, self.percent if self.use == COMPARING else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
