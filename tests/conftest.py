@@ -3,6 +3,8 @@
 A test that is not listed belongs to the quick lane, so that a new test runs in it until somebody measures. Times are those of
 the processor, user and system, children included, and so do not depend on what else the machine does. A test that reads a fixture
 of a module has the fixture's time too, whoever set it up: in the quick lane the first reader would have to.
+
+Loops are compiled without optimising, which takes a third of the time and gives the same bits; tests of C are as users have it.
 """
 
 from __future__ import annotations
@@ -15,6 +17,14 @@ from typing import Any
 
 import pytest
 
+os.environ.setdefault("FPIRHC_CFLAGS", "-O0")
+AS_SHIPPED = (
+    "export/",
+    "symbolic/",
+    "optimisers/test_kernels_in_c",
+    "optimisers/test_loops_in_c",
+    "optimisers/test_work_vector",
+)
 LANES = Path(__file__).with_name("lanes.txt")
 LONGEST = 0.2  # s, of all parameters of a test together, in the quick lane
 _seconds = pytest.StashKey[
@@ -63,6 +73,13 @@ def pytest_collection(session: pytest.Session) -> Generator[None, object, object
 def loaded_while_collecting(request: pytest.FixtureRequest) -> list[str]:
     """Modules of the problem files that this process loaded before its first test."""
     return request.config.stash[_loaded]
+
+
+@pytest.fixture(autouse=True)
+def compiled_as_shipped(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the compiler's flags to the package where C itself is tried."""
+    if _without_folder(request.node.nodeid).startswith(AS_SHIPPED):
+        monkeypatch.delenv("FPIRHC_CFLAGS", raising=False)
 
 
 @pytest.hookimpl(wrapper=True)

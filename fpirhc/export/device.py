@@ -235,9 +235,7 @@ def _identifier(name: str) -> str:
 _PORTABLE = re.compile(
     r"^#ifdef PORTABLE\n(.*?)^#else /\* PORTABLE \*/\n.*?^#endif /\* PORTABLE \*/\n", re.MULTILINE | re.DOTALL
 )
-_TUNED = re.compile(
-    r"^#if defined\(__GNUC__\) && !defined\(__clang__\)\n#pragma GCC optimize[^\n]*\n#endif\n", re.MULTILINE
-)
+_TUNED = re.compile(r"^#if [^\n]*\n#pragma GCC optimize[^\n]*\n#endif\n", re.MULTILINE)
 _PREFIXES = re.compile(r"^/\* How to prefix internal symbols \*/\n.*?^#endif\n", re.MULTILINE | re.DOTALL)
 _PREFIXED = re.compile(
     r"^(/\* Add prefix to internal symbols \*/|#define casadi_\w+ CASADI_PREFIX\(\w+\))\n", re.MULTILINE

@@ -23,7 +23,7 @@ from fpirhc.symbolic.expression import FINITE, TINY, Expression, graph, kind
 SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
 # Large leaves are compiled without much optimising; the loops around them never are. The loops use wider registers than the
 # leaves: with registers allocated across calls GCC forgets to clear their upper halves, and every leaf then runs at half speed.
-_FAST = """#if defined(__GNUC__) && !defined(__clang__)
+_FAST = """#if defined(__OPTIMIZE__) && defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize ("O3", "no-ipa-ra")
 #endif"""
 # Constants of the type that computes: a float is not a double with fewer digits. Compilers fold them.

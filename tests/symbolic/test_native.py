@@ -57,6 +57,21 @@ def test_same_numbers_as_the_virtual_machine(cache):
 
 
 @needs_compiler
+def test_own_flags_make_another_library_with_the_same_numbers(cache, monkeypatch):
+    """A plan whose loops are written in C, not optimised and optimised."""
+    task = fp.load_problem("leaking_tanks")
+    problem = replace(task.problem, duration=20 * task.problem.period, measure_from=0.0)
+    digests, counts = set(), []
+    for flags in ("", "-O0 -DFPIRHC_UNUSED='a word'"):
+        monkeypatch.setenv("FPIRHC_CFLAGS", flags)
+        run = fp.simulate(problem, task.controllers["RHC+FPI"], seed=0, compiled=True)
+        digests.add(run["command"].tobytes())
+        counts.append(len(_libraries(cache)))
+    assert len(digests) == 1
+    assert counts[1] == 2 * counts[0]
+
+
+@needs_compiler
 @pytest.mark.parametrize("count", [37, 5, 1])
 def test_a_chain_of_calls_is_that_of_the_virtual_machine(cache, count):
     """Memory after so many calls, and the results of these; what is read follows call by call."""
