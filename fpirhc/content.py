@@ -12,6 +12,7 @@ import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from enum import Enum
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -39,7 +40,7 @@ class _Content:
     def of(self, value: Any) -> bytes:
         """Return the content of a value; one that holds itself is a word where it is met again."""
         plain = value.item() if isinstance(value, np.generic) else value
-        if plain is None or isinstance(plain, bool | int | float | complex | str | bytes):
+        if type(plain) in _PLAIN or (type(plain) in (list, tuple) and {*map(type, plain)} <= _PLAIN):
             return _hash(type(plain).__name__.encode(), repr(plain).encode())
         key = id(value)
         if key not in self._known:
@@ -61,6 +62,9 @@ class _Content:
                 if one.metadata.get("setting", True) is not False:
                     yield self.of(one.name)
                     yield self.of(getattr(value, one.name))
+
+
+_PLAIN = {type(None), bool, int, float, complex, str, bytes}  # a list of these is told at once: it may be a long table
 
 
 def _hash(*parts: bytes) -> bytes:
@@ -152,6 +156,10 @@ def _casadi_function(value: ca.Function) -> Iterator[Any]:
 # By kind of a value: what of it counts. The first that fits is taken.
 _KINDS: dict[type, Callable[[Any], Iterator[Any]]] = {
     type: _class,
+    Enum: lambda value: iter([type(value), value.name]),
+    str: lambda value: iter([str(value)]),  # of a class of its own
+    float: lambda value: iter([float(value)]),
+    int: lambda value: iter([int(value)]),
     Mapping: lambda value: iter([*value.keys(), *value.values()]),
     list: iter,
     tuple: iter,

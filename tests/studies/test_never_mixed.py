@@ -133,6 +133,7 @@ def test_content_is_that_of_formulas_and_not_of_objects():
     assert digest(made(1.0, [2.0])) == digest(made(1.0, [2.0]))
     assert len({digest(made(*given)) for given in ((1.0, [2.0]), (3.0, [2.0]), (1.0, [3.0]))}) == 3
     assert digest({"one", "two", "three"}) == digest({"three", "one", "two"})
+    assert len({digest(one) for one in (1, 1.0, True, "1", [1], (1,), [1.0], fp.Status(1), fp.Status(0))}) == 9
 
 
 def test_content_of_a_value_that_holds_itself_has_an_end():

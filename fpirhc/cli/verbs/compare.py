@@ -55,7 +55,8 @@ Scenario k of a seed is the same for every controller, whatever the number of sc
 is multiplied by a factor of its own, log-uniform between 1 - PERCENT/100 and 1 + PERCENT/100; a parameter with a spread in the
 problem file is drawn from PERCENT/100 of it, 100 for all of it. Finished scenarios are kept in
 scenarios.jsonl in the output folder; after an interruption or a crash the same command continues from them. A folder that
-holds results of another problem, seed, mismatch or version is refused (exit code 3).
+holds results of another problem, seed, mismatch or version is refused (exit code 3). A problem is its file, the modules beside
+it, and every formula.
 Cases are scenarios with names: cases = fp.Cases({"heavy": {"exact.mass": 2.0}}) in the problem file, or fp.Cases.from_csv(FILE).
 """
 

@@ -47,7 +47,7 @@ VERB = Verb(
     ),
     notes="""
 Parts are made with fpirhc compare PROBLEM --scenarios N --shard K/M, one on each machine of a cluster, such as the tasks of
-an array job. Scenario k is the same one on every machine. Results of another problem file, seed or version are refused.
-A result that stands in two parts is kept once.
+an array job. Scenario k is the same one on every machine. Results of another problem, seed or version are refused; a problem
+is its file, the modules beside it, and every formula. A result that stands in two parts is kept once.
 """,
 )
