@@ -19,6 +19,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.path import moving
 from fpirhc.simulation.simulate import Patch, run_cycles, simulator
+from fpirhc.studies.scenarios.draws import COMPARING, RandomScenarios
 
 MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
 
@@ -138,6 +139,19 @@ def test_a_dead_time_of_the_body_is_known_and_not_simulated(name):
     inside, outside_ = run(problem, controller), run(own, controller)
     for signal in ("plant_state", "command"):
         assert np.abs(inside[signal] - outside_[signal]).max() <= 1e-9 * np.abs(inside[signal]).max()
+
+
+def test_scenarios_of_a_body_have_its_own_dead_time():
+    """It is not simulated, so that no other one can be drawn; its parameters are."""
+    body = fp.ExternalPlant(
+        measures=MEASURES,
+        make=lambda parameters, seed: Late(task()),
+        parameters={"k": fp.Parameter(1.0, 1.0, "1")},
+        dead_time={"u": 0.002},
+    )
+    drawn = RandomScenarios(replace(task(), reality=body), seed=0, use=COMPARING, percent=40.0)
+    assert {drawn[k].problem.dead_time.inputs["u"] for k in range(6)} == {0.002}
+    assert len({drawn[k].problem.moved.parameters["k"].exact for k in range(6)}) == 6
 
 
 def test_a_dead_time_is_stated_once_and_by_name():

@@ -19,11 +19,11 @@ class DeadTimes:
         most: by how many percent they are longer at most; 0: they stay as they are.
 
     Attributes:
-        drawn: whether there are others; there are none without a dead time.
+        drawn: whether there are others; there are none without a dead time, nor for a body outside that has its own.
     """
 
     def __init__(self, of: Problem, most: float) -> None:
-        self._of, self._most, self.drawn = of, most, most > 0 and is_late(of)
+        self._of, self._most, self.drawn = of, most, most > 0 and is_late(of) and not of.moves.dead_time
         self._known: dict[float, Problem] = {}
 
     @cached_property

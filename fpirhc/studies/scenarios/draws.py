@@ -18,7 +18,6 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.plant.plant import Parametric, drawn, exact_ranges
-from fpirhc.review.grid import is_late
 from fpirhc.studies.scenarios.dead_times import DeadTimes
 from fpirhc.task.cases import START, Cases
 from fpirhc.task.problem import Problem
@@ -64,7 +63,7 @@ def draw(
 def draws_differ(problem: Problem, percent: float) -> bool:
     """Return whether anything is drawn for scenarios of a comparison: a parameter whose range has a width, or a dead time."""
     ranges = exact_ranges(problem.moved, percent).values()
-    return any(high > low for low, high in ranges) or (percent > 0 and is_late(problem))
+    return any(high > low for low, high in ranges) or DeadTimes(problem, percent).drawn
 
 
 def _mismatch(model: Parametric, plant: Parametric, exact: np.ndarray) -> float:
