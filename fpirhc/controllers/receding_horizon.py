@@ -27,6 +27,7 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.cost import Cost
+from fpirhc.horizon.horizon import in_tuple
 from fpirhc.horizon.nominal import feedforward, require_reference_of_states
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import SCALE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
@@ -150,6 +151,11 @@ class RecedingHorizon(Controller):
     cost: Cost | None = None
     margins: Mapping[str, Sequence[float]] | None = field(default=None, hash=False, metadata={"setting": "where given"})
     follows_model: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
+
+    def __post_init__(self) -> None:
+        if self.margins is not None:
+            margins = {name: in_tuple(margin) for name, margin in self.margins.items()}
+            object.__setattr__(self, "margins", margins)
 
     @property
     def planner(self) -> Planner:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 
+from fpirhc.errors import Mistakes
 from fpirhc.horizon.cost import View
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value, expression
@@ -36,6 +38,32 @@ class ConstraintState:
 def limited(limits: Limits, plant: Plant, view: View, step: float) -> list[ConstraintState]:
     """Limited expressions of state and input of stages 0 ... N-1: rates of inputs, and paths."""
     return [_entry_of(name, one, view) for name, one in limits.written(plant, step).items()]
+
+
+def check_declared(limits: Limits, view: View) -> None:
+    """Raise where a path uses what a view does not have, whose entries are NaN there.
+
+    Raises:
+        InvalidProblem: all such paths, with what declares the entry.
+    """
+    mistakes = Mistakes("limits")
+    for part, lacking, remedy in _undeclared(view):
+        if not ca.SX(lacking.vector).is_constant():
+            continue
+        stand_in = Named(tuple(lacking), ca.SX.sym(part, len(tuple(lacking))), "input")
+        for name, one in limits.paths.items():
+            if ca.depends_on(
+                one.named_value(name, replace(view, **cast(dict[str, Any], {part: stand_in}))), stand_in.vector
+            ):
+                mistakes.add(f"paths['{name}'] uses {part}, which plans do not have here; {remedy}")
+    mistakes.raise_if_any()
+
+
+def _undeclared(view: View) -> list[tuple[str, Named, str]]:
+    """The entries of a view that limits may lack, by name, with what declares them."""
+    by_rate = "limit a change by Limits(rates=...), or write a Limit of your own with uses_rate = True"
+    by_cost = "leave it out, or take a cost that has it: Quadratic(deviation=...) or CustomCost(feedforward=True)"
+    return [("input_before", view.input_before, by_rate), ("feedforward", view.feedforward, by_cost)]
 
 
 def _entry_of(name: str, one: Limit, view: View) -> ConstraintState:
@@ -67,7 +95,7 @@ def ends(
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
     return [
         ConstraintState(f"{e} at the end", units[e], last * (next_state[places[e]] - target[places[e]]), -_GAP, _GAP)
-        for e in names
+        for e in dict.fromkeys(names)
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -12,6 +12,13 @@ from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import AtLeastOne, Count, Duration, NotNegative, described
 from fpirhc.plant.integrators import USUAL, Integrator
+
+Entry = TypeVar("Entry")
+
+
+def in_tuple(values: Sequence[Entry]) -> tuple[Entry, ...]:
+    """Return the entries of a tuple, a list or an array, which is neither true nor equal to another, as a tuple."""
+    return tuple(values.tolist() if isinstance(values, np.ndarray) else values)
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,9 @@ class Horizon(Checked):
     share: float = field(default=1.0, kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
+        for name in ("terminal", "blocks", "lengths", "measured"):
+            object.__setattr__(self, name, in_tuple(getattr(self, name)))
+        object.__setattr__(self, "margins", {name: in_tuple(margin) for name, margin in self.margins.items()})
         if self.lengths and (len(self.lengths) != self.stages or self.lengths[0] != 1):
             raise InvalidValue(
                 f"horizon: lengths must be {self.stages} finite numbers of at least 1, one for every stage in steps of the first, "
@@ -75,7 +85,7 @@ class Horizon(Checked):
         for name, margin in self.margins.items():
             if len(margin) != self.stages:
                 raise InvalidValue(
-                    f"horizon: margins of '{name}' must be {self.stages} numbers, one for every stage, got {margin!r}"
+                    f"horizon: margins of '{name}' must be {self.stages} numbers, one for every stage, got {described(margin)}"
                 )
         if self.discretisation.opaque:
             raise InvalidValue(

@@ -62,6 +62,7 @@ class OptimalControl:
         linear_outputs: function that returns the Functions (s, u, theta, at (ns + nu)) -> l and (s, theta, at (ns)) -> T, with the
             plant's outputs linearised at `at`.
         frozen: these Functions, where second derivatives are to be theirs.
+        soft_end: (s, theta) -> what soft limits of states add to T, by term of the stage cost; None where nothing does.
     """
 
     stages: int
@@ -93,6 +94,7 @@ class OptimalControl:
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
     linear_outputs: Callable[[], tuple[ca.Function, ca.Function]] | None = None
     frozen: tuple[ca.Function, ca.Function] | None = None
+    soft_end: ca.Function | None = None
 
     @property
     def scale(self) -> np.ndarray:

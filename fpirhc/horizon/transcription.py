@@ -13,6 +13,7 @@ from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
 from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.constraint_states import (
     ConstraintState,
+    check_declared,
     ends,
     hard,
     hard_state_bounds,
@@ -81,13 +82,13 @@ def _transcribed(
     _check_names(plant, horizon, limits)
     same, live = (plant.equations, reference, cost, limits, *others.values()), [n.of(ca.SX) for n in others.values()]
 
-    def expressed() -> tuple[_Stage, tuple[ca.Function, ca.Function, ca.Function]]:
+    def expressed() -> tuple[_Stage, tuple[ca.Function, ...]]:
         stage = _stage_expressions(plant, reference, horizon, cost, limits, live)
         return stage, _stage_functions(stage)
 
     stage, functions_of_stage = _STAGES.of(same, (horizon, *others), expressed)
     binding, free = stage.binding, stage.before.numel()
-    dynamics, stage_cost, terminal_cost = functions_of_stage
+    dynamics, stage_cost, terminal_cost, soft_end = functions_of_stage
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
@@ -102,6 +103,7 @@ def _transcribed(
         # The scale and the largest eigenvalue follow from the expansion; until `at` they are ones.
         ones, numbers = np.ones(plant.input.size), np.array([values[path] for path in settings])
         nodes = (*nodes[:2], live_table(nodes[2], numbers, ones, 1.0))
+    _check_finite_limits(dynamics, binding, nodes)
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     functions: dict[object, ca.Function] = {}
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
@@ -117,6 +119,7 @@ def _transcribed(
         stage_cost=stage_cost,
         terminal_cost=terminal_cost,
         terms=tuple(stage.terms),
+        soft_end=soft_end,
         start=_start(plant, free, len(binding)),
         state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding]]),
         state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
@@ -157,13 +160,14 @@ class _Stage:
     x_next: Expression
     terms: dict[str, Expression]
     final: Expression
+    soft_end: list[Expression]  # what soft limits of states add to it, by term
     binding: list[ConstraintState]
     settings: list[ca.SX]
     length: Expression | float
     linear_outputs: Callable[[], tuple[ca.Function, ca.Function]]
 
 
-_STAGES: Latest[tuple[_Stage, tuple[ca.Function, ca.Function, ca.Function]]] = Latest(8)  # whatever signals they meet
+_STAGES: Latest[tuple[_Stage, tuple[ca.Function, ...]]] = Latest(8)  # whatever signals they meet
 
 
 def _stage_expressions(
@@ -191,19 +195,23 @@ def _stage_expressions(
             x_next = stretched(x, applied, view.parameters.vector, length)
         else:
             x_next = advance(x, applied, view.parameters.vector)
+        check_declared(limits, limited_view)
         written = _written(plant, horizon, limits, limited_view, x_next, data)
         soft = softened(written, limits, plant, _seen(plant, horizon, x, data))
-        terms = {**_scalar_terms(cost.stage(view)), **soft}
+        terms = _joined(_scalar_terms(cost.stage(view)), soft, horizon)
         if horizon.blocks:
             # Inputs that have no effect are drawn to those that are held, so that a plan states what is applied.
             terms["held"] = (1 - data["free"]) * ca.sumsqr((u - before) / _reach(limits, plant))
-        end = replace(view, output=_outputs(plant, x, ca.SX.nan(plant.input.size), view.parameters.vector))
+        end = _end_view(plant, view, x, before if keeps_input else ca.SX.nan(plant.input.size))
         terminal = cost.terminal_cost(end, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.last)
-        soft_states = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
+        at_end = {f"soft {e}": soft[f"soft {e}"] for e in limits.soft if e in limits.states}
+        soft_states = sum(at_end.values(), start=ca.SX(0))
         final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.last * soft_states
+        soft_end = [horizon.last * at_end.get(name, ca.SX(0)) for name in terms]
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
     binding = hard(written, soft_names(limits, plant))
+    _check_entries(plant, keeps_input, written)
     settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding), *others], theta)
     if settings:
         live = live_signals(tuple(s.name() for s in settings), plant.input)
@@ -225,7 +233,19 @@ def _stage_expressions(
         )
 
     return _Stage(
-        x, before, u, applied, theta, x_next, terms, final, binding, settings, horizon.step * length, linear_outputs
+        x,
+        before,
+        u,
+        applied,
+        theta,
+        x_next,
+        terms,
+        final,
+        soft_end,
+        binding,
+        settings,
+        horizon.step * length,
+        linear_outputs,
     )
 
 
@@ -234,8 +254,8 @@ def _linearised(output: Named, variables: Expression, at: Expression) -> Named:
     return Named(tuple(output), values + slopes @ (variables - at), "output")
 
 
-def _stage_functions(stage: _Stage) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Functions of the dynamics, the stage cost and the terminal cost."""
+def _stage_functions(stage: _Stage) -> tuple[ca.Function, ...]:
+    """Functions of the dynamics, the stage cost, the terminal cost, and what soft limits add to it."""
     u, theta, binding = stage.u, stage.theta, stage.binding
     s = ca.vertcat(stage.x, stage.before, ca.SX.sym("z", len(binding)))
     s_next = ca.vertcat(
@@ -246,6 +266,7 @@ def _stage_functions(stage: _Stage) -> tuple[ca.Function, ca.Function, ca.Functi
         ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(s_next)]),
         ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(costs), ca.densify(costs)]),
         ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(stage.final)]),
+        ca.Function("fpirhc_soft_end", [s, theta], [ca.densify(ca.vertcat(*stage.soft_end))]),
     )
 
 
@@ -275,6 +296,24 @@ def _check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
                 f"margins of '{name}' reach {max(horizon.margins[name]):.6g}, which leaves nothing between its limits "
                 f"{lower:g} and {upper:g}; widen the limits, or adapt faster"
             )
+    mistakes.raise_if_any()
+
+
+def _joined(terms: Mapping[str, Expression], soft: Mapping[str, Expression], horizon: Horizon) -> dict[str, Expression]:
+    """The terms of the cost and of soft limits; a name that stands for two would drop one of them."""
+    mistakes = Mistakes("cost")
+    for name in sorted(terms.keys() & {*soft, *(["held"] if horizon.blocks else [])}):
+        of = "the inputs that Horizon(blocks=...) holds" if name == "held" else "a soft limit"
+        mistakes.add(f"term '{name}' has the name of the term of {of}; choose another")
+    mistakes.raise_if_any()
+    return {**terms, **soft}
+
+
+def _check_entries(plant: Plant, keeps_input: bool, written: list[ConstraintState]) -> None:
+    """Raise where a path has the name of another entry of the stage's state, which is then found under it."""
+    mistakes, names = Mistakes("limits"), list(_stage_state(plant, keeps_input, written).elements)
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        mistakes.add(f"paths: '{name}' is already the name of an entry of the plan; choose another")
     mistakes.raise_if_any()
 
 
@@ -360,6 +399,13 @@ def _view(
     )
 
 
+def _end_view(plant: Plant, view: View, x: Expression, before: Expression) -> View:
+    """The view of the end of the horizon, whose input is NaN, because there is none; the one before is that of the last stage."""
+    inputs, none = tuple(view.input), ca.SX.nan(plant.input.size)
+    output = _outputs(plant, x, none, view.parameters.vector)
+    return replace(view, output=output, input=Named(inputs, none, "input"), input_before=Named(inputs, before, "input"))
+
+
 def _hastened(view: View, factor: Expression) -> View:
     """The view with so many times the change of the input."""
     u, before = view.input, view.input_before
@@ -432,6 +478,26 @@ def _nodes(
     return states, inputs[:, : horizon.stages], data
 
 
+def _check_finite_limits(
+    dynamics: ca.Function, binding: list[ConstraintState], nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    """Raise where a limited expression is no number along the reference, about which plans are made."""
+    states, inputs, data = nodes
+    if not binding or not np.isfinite(states).all():
+        return  # `_check_finite` says that the states grow without bound
+    count = inputs.shape[1]
+    values = np.asarray(dynamics.map(count)(states[:, :count], inputs, data[:, :count]).full())[-len(binding) :]
+    mistakes = Mistakes("limits")
+    for entry, row in zip(binding, values, strict=True):
+        bad = np.flatnonzero(~np.isfinite(row))
+        if bad.size:
+            mistakes.add(
+                f"'{entry.name}' is {row[bad[0]]} on the reference at stage {bad[0]}, expected a finite number; limit the "
+                f"argument of a root or a logarithm in its place"
+            )
+    mistakes.raise_if_any()
+
+
 def _check_finite(
     names: tuple[str, ...],
     stage_cost: ca.Function,
@@ -448,6 +514,8 @@ def _check_finite(
         if not np.isfinite(value):
             hint = "" if cost.uses_rate else "; say CustomCost(rate=True) if it uses input_before"
             hint += "" if cost.uses_feedforward else "; say CustomCost(feedforward=True) if it uses feedforward"
+            if name == "terminal" and np.isnan(value):
+                hint += "; the end of the horizon has no input, so leave view.input out of CustomCost(terminal=...)"
             if not np.isfinite(states).all():
                 hint = ": the states that would keep the outputs there grow without bound"
             mistakes.add(f"term '{name}' is {value} on the reference {where}{hint}")

@@ -196,6 +196,21 @@ def _state_violation(ocp: OptimalControl, states: ca.MX) -> ca.MX:
     return worst
 
 
+def paid(ocp: OptimalControl) -> ca.Function:
+    """Function (s0, U, data) -> what violations of priced limits cost, which is no part of the cost; zero without prices."""
+    s0, inputs = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("U", ocp.input.size, ocp.stages)
+    data, total = ca.MX.sym("data", ocp.data.size, ocp.stages + 1), ca.MX(0)
+    states = rollout(ocp)(s0, inputs, data)[0]  # no part of the Function where nothing reads them
+    for k in np.flatnonzero(~ocp.hard).tolist():
+        row = states[k, 1:]
+        for limit, beyond in (
+            (ocp.state_lower[k], ocp.state_lower[k] - row),
+            (ocp.state_upper[k], row - ocp.state_upper[k]),
+        ):
+            total += ocp.state_price[k] * ca.sum2(ca.fmax(beyond, 0)) if abs(limit) < FINITE else 0
+    return ca.Function("fpirhc_paid", [s0, inputs, data], [total])
+
+
 def judge(ocp: OptimalControl) -> ca.Function:
     """Function (U, s0, data, lower, upper, M) -> (cost, stationarity, feasibility), by one rollout and one adjoint sweep.
 
@@ -321,8 +336,9 @@ def first_plan(
         return first
     memory = layout.start()
     memory[layout.slice("plan_inputs")] = np.tile(lower + reach / 2, ocp.stages).ravel(order="F")
-    other = improved(optimiser, ocp, state, data, memory, calls=calls)
-    return other if other[1][4] == Status.OK and other[1][0] < first[1][0] else first
+    other, price = improved(optimiser, ocp, state, data, memory, calls=calls), paid(ocp)
+    costs = [plan[1][0] + float(price(state, plan[0], data)) for plan in (other, first)]
+    return other if other[1][4] == Status.OK and costs[0] < costs[1] else first
 
 
 LAST = "(arg[5] ? *arg[5] : 0)"

@@ -18,7 +18,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import Count, NotNegative, Positive
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Optimiser, first_plan, sane, stage_later
+from fpirhc.optimisers.base import Optimiser, first_plan, paid, sane, stage_later
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
 from fpirhc.optimisers.plain import PlainSettings, plain_memory, plain_step, shifted_plain
@@ -113,7 +113,7 @@ class FixedPoint(Optimiser):
         return self._begun(ocp, plain_step(ocp, self._plain(converging=True)))
 
     def _begun(self, ocp: OptimalControl, one: ca.Function) -> ca.Function:
-        return _of_two_starts(one, self.memory(ocp)) if self.second_start else one
+        return _of_two_starts(ocp, one, self.memory(ocp)) if self.second_start else one
 
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:
         if ocp.bounds_states:
@@ -206,7 +206,7 @@ def _better(
     return [ca.if_else(better, new, old) for new, old in zip(results, first, strict=True)]
 
 
-def _of_two_starts(one: ca.Function, memory: Layout) -> ca.Function:
+def _of_two_starts(ocp: OptimalControl, one: ca.Function, memory: Layout) -> ca.Function:
     """Function like a step of an optimiser: the result of `one`, or of `one` from the start of its memory where that is cheaper.
 
     A plan that is not solved is taken only if neither is. The iterations are those of both.
@@ -218,7 +218,10 @@ def _of_two_starts(one: ca.Function, memory: Layout) -> ca.Function:
     warm = one(*arguments)
     cold = one(*arguments[:4], ca.MX(ca.DM(memory.start())))
     solved = [result[1][4] == int(Status.OK) for result in (warm, cold)]
-    cheaper = ca.logic_or(ca.logic_not(solved[0]), cold[1][0] < warm[1][0])
+    # The cost of a plan does not count what its violations of priced limits cost, which its optimum does.
+    price = paid(ocp)
+    costs = [result[1][0] + price(arguments[0], result[0], arguments[1]) for result in (warm, cold)]
+    cheaper = ca.logic_or(ca.logic_not(solved[0]), costs[1] < costs[0])
     better = ca.logic_and(solved[1], cheaper)
     count = ca.vertcat(ca.MX.zeros(3), 1, 0)
     chosen = [ca.if_else(better, new, old) for new, old in zip(cold, warm, strict=True)]

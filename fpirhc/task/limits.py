@@ -209,6 +209,8 @@ class Limits(Checked):
         mistakes.unknown("state", self.states, plant.state.elements)
         mistakes.unknown("rates: input", self.rates, plant.inputs)
         rates = [f"{name} rate" if name in plant.state.elements else name for name in self.rates]
+        for name in sorted(self.paths.keys() & {f"{name} rate" for name in self.rates}):
+            mistakes.add(f"paths: '{name}' is already the name of the limit in rates; choose another")
         mistakes.unknown("soft: limit of", self.soft, [*self.states, *self.paths, *rates])
         for name, interval in [*self.inputs.items(), *self.states.items(), *self.rates.items()]:
             _check_interval(name, interval, mistakes)

@@ -406,7 +406,7 @@ def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:
         whole = max(1, round(ratio))
         raise InvalidValue(
             f"period {period:g} {unit} does not divide the horizon step {horizon.step:g} {unit}; "
-            f"use a step of {whole * period:g} {unit} or a period of {horizon.step / whole:g} {unit}"
+            f"use a step of {whole * period:.12g} {unit} or a period of {horizon.step / whole:.12g} {unit}"
         )
     return round(ratio)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -122,6 +124,31 @@ def test_lqr_terminal_makes_a_short_horizon_endless():
     np.testing.assert_allclose(plan.inputs[:, 0], -np.asarray(gain) @ [1.0, -0.3], rtol=1e-6)
 
 
+def test_arrays_are_taken_where_tuples_are():
+    """An array of two entries is neither true nor equal to another one, and a list has no hash."""
+    fixed = fp.FixedPoint(iterations=1, tolerance=1e-6)
+
+    def made(of: Callable[[tuple[object, ...]], Any]) -> tuple[fp.Horizon, fp.RecedingHorizon]:
+        margins = {"angle": of((0.1, 0.2))}
+        entries = {"lengths": of((1.0, 2.0)), "blocks": of((1, 1)), "terminal": of(("angle",))}
+        return fp.Horizon(stages=2, step=0.1, margins=margins, **entries), fp.RecedingHorizon(fixed, margins=margins)
+
+    for kind in (np.array, list):
+        assert made(kind) == made(kind) == made(tuple)
+        assert hash(made(kind)[0]) == hash(made(tuple)[0])
+
+
+def test_the_end_of_a_horizon_has_the_input_of_its_last_stage_as_the_one_before():
+    """Also where a change of the input counts with the time that it takes."""
+    cost = fp.CustomCost(
+        terms=lambda v: {"a": (v.input.torque - v.input_before.torque) ** 2},
+        terminal=lambda v: v.input_before.torque,
+        rate=True,
+    )
+    ocp, data = built(cost, fp.Horizon(stages=4, step=0.1, lengths=(1, 2, 4, 8)))
+    assert float(ocp.terminal_cost([0.0, 0.0, 3.0], data[:, -1])) == 3.0
+
+
 def test_feedforward_makes_the_reference_free():
     """On the reference, with the model's own input, a cost of corrections is zero."""
     ocp, data = built(COSTS["deviation"])
@@ -137,6 +164,10 @@ BAD_COSTS = {
     "term": (fp.CustomCost(terms=lambda v: {"log": ca.log(v.state.angle)}), "term 'log' is -inf"),
     "name": (fp.CustomCost(terms=lambda v: {"a": v.state.angel}), "state 'angel' is unknown"),
     "before": (fp.CustomCost(terms=lambda v: {"a": v.input_before.torque}), "say CustomCost\\(rate=True\\)"),
+    "end": (
+        fp.CustomCost(lambda v: {"a": v.input.torque**2}, terminal=lambda v: v.input.torque),
+        "end .* has no input",
+    ),
     "lqr": (fp.Quadratic(states={"angle": 1.0}, terminal=fp.LQRTerminal()), "needs a positive effort"),
     "feedforward": (fp.CustomCost(terms=lambda v: {"a": v.feedforward.torque}), "say CustomCost\\(feedforward=True\\)"),
     "final": (
@@ -179,6 +210,27 @@ def test_mistakes_of_a_horizon():
             duration=1.0,
             horizon=fp.Horizon(stages=5, step=1e-2),
         )
+
+
+def test_a_period_that_is_advised_is_taken():
+    """Its digits are enough: a step of 0.34 s has no third of few digits."""
+    with pytest.raises(InvalidProblem) as refused:
+        replace(tasks.two_mass.problem, period=0.1, horizon=fp.Horizon(stages=5, step=0.34))
+    advised = float(str(refused.value).split("a period of ")[1].split(" s")[0])
+    assert replace(tasks.two_mass.problem, period=advised, horizon=fp.Horizon(stages=5, step=0.34))
+
+
+def named(name):
+    return lambda v: {name: v.state.angle**2 + v.input.torque**2}
+
+
+def test_a_term_has_no_name_of_another_one():
+    """Two of one name were one, and a cost or a limit was lost."""
+    for name, horizon in (("soft angle", fp.Horizon(stages=3, step=0.1)), ("held", fp.Horizon(3, 0.1, blocks=(1, 2)))):
+        limits = fp.Limits(states={"angle": (-1.0, 1.0)}, soft={"angle": 1.0})
+        cost = fp.CustomCost(terms=named(name))
+        with pytest.raises(InvalidProblem, match=f"term '{name}' has the name of"):
+            built(cost, horizon, limits=limits)
 
 
 def test_curvature_is_the_bend_of_the_cost_along_the_first_input():

@@ -9,13 +9,14 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from plants import known, pendulum
+from plants import chain, known, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.horizon.problem import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.optimisers.base import improved, paid
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Named
 from fpirhc.task.limits import Limit
@@ -178,6 +179,23 @@ def test_limits_in_a_closed_loop(case):
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.vector, upper=1.0)}), (), "one scalar"),
         (fp.Limits(soft={"angle": 1.0}), (), "soft: limit of"),
         (fp.Limits(), ("angel",), "angle"),
+        (
+            fp.Limits(rates={"torque": (-1.0, 1.0)}, paths={"torque rate": fp.PathConstraint(speed_and_angle)}),
+            (),
+            "'torque rate' is already the name of the limit in rates",
+        ),
+        (fp.Limits(paths={"angle at the end": fp.PathConstraint(speed_and_angle)}), ("angle",), "name of an entry"),
+        (
+            fp.Limits(paths={"root": fp.PathConstraint(lambda v: ca.sqrt(v.state.angle - 9))}),
+            (),
+            "'root' is nan .*stage 0",
+        ),
+        (fp.Limits(paths={"jerk": fp.PathConstraint(lambda v: v.input_before.torque)}), (), "input_before.*uses_rate"),
+        (
+            fp.Limits(paths={"off": fp.PathConstraint(lambda v: vars(v)["feedforward"].torque)}),
+            (),
+            "feedforward.*deviation",
+        ),
     ],
 )
 def test_mistakes_are_named(limits, terminal, message):
@@ -270,6 +288,36 @@ def test_priced_limits_have_the_optimum_of_a_problem_with_slacks():
         options={"ftol": 1e-12, "maxiter": 500},
     )
     assert known(plan.cost) + plan.slacks()["angle'"] == pytest.approx(total.fun, rel=1e-5)
+
+
+def test_a_second_start_counts_what_violations_of_priced_limits_cost():
+    """A remembered plan outside a forbidden middle is kept, because one inside it pays more than its cost is lower."""
+    plant, reference = chain(1), fp.Trajectory(lambda t: {"y": 0 * t})
+    apart = fp.PathConstraint(lambda v: v.state.y**4, lower=1.0)
+    limits = fp.Limits(inputs={"u": (-2.0, 2.0)}, paths={"apart": apart}, prices={"apart": 3.0})
+    horizon, cost = fp.Horizon(stages=5, step=1.0), fp.Quadratic(states={"y": 1.0}, effort={"u": 1e-2})
+    ocp = transcribe(plant, reference, horizon, cost, limits)
+    data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-6, second_start=True)
+    start = optimiser.memory(ocp).start()
+    memory = improved(optimiser.near_plan, ocp, np.array([1.1, 0.0]), data, start, calls=5)[2]
+    first = np.zeros(2)
+    arguments = first, data, ocp.input_lower, ocp.input_upper
+    totals = []
+    for one, remembered in ((optimiser, memory), (optimiser.near_plan, memory), (optimiser.near_plan, start)):
+        inputs, diagnostics, _ = one.step(ocp)(*arguments, remembered)
+        totals.append(float(diagnostics[0]) + float(paid(ocp)(first, inputs, data)))
+    assert totals[0] == pytest.approx(min(totals[1:]))
+    assert totals[1] < totals[2] - 1
+
+
+def test_the_price_of_a_soft_state_counts_the_end_too():
+    """What a soft limit adds to the cost of a plan is what it is said to cost."""
+    soft = horizon_of(fp.Limits(states={"angle": (-0.1, 0.1)}, soft={"angle": 7.0}))
+    free = horizon_of(fp.Limits())
+    plan = fp.solve(soft[0], FIXED, soft[2], soft[1])
+    costs = [float(rollout(ocp)(first, plan.inputs, data)[1]) for ocp, data, first in (soft, free)]
+    assert plan.slacks()["angle"] == pytest.approx(costs[0] - costs[1], rel=1e-9)
 
 
 def test_prices_are_refused_by_who_cannot_take_them():
