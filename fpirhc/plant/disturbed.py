@@ -97,8 +97,9 @@ def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str
     original, step = plant.next, float(plant.step or 1.0)
 
     def next_states(*arguments: Named) -> Mapping[str, Expression]:
-        *others, p = arguments
-        values = original(*others, _own(plant, p))
+        count = 1 if plant.algebraic is None else 2  # algebraic states come after the parameters
+        others, (p, *algebraic) = arguments[:-count], arguments[-count:]
+        values = original(*others, _own(plant, p), *algebraic)
         return {c: v + step * p[disturbance_name(c)] if c in coordinates else v for c, v in values.items()}
 
     vars(next_states)["__signature__"] = inspect.signature(original)

@@ -358,6 +358,8 @@ def with_space(unit: str) -> str:
 
 
 SMALL = 1e-6  # last step of Newton's method, relative; the error left is about its square
+NEGLIGIBLE = 1e-3  # share of a guess beside which a number counts as zero
+ROUNDING = 1e-12  # relative change of what is known that nobody tells from the rounding of its numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,16 +411,24 @@ class Algebraic(Checked):
         residual = self.residual(views, z)
         slope = ca.jacobian(residual, z)
         step_of = ca.Function("fpirhc_newton_step", [z, known], [ca.densify(ca.solve(slope, residual))])
-        at = self.first(views)
+        guess = at = self.first(views)
         if not ca.depends_on(slope, z):
             return at - step_of(at, known)
-        step: Expression = at
+        # A state that is zero, found from a guess of zero, has no size: only rounding is left of its equations then.
+        rounding = ROUNDING * ca.mtimes(ca.fabs(ca.jacobian(residual, known)), ca.fabs(known))
+        rounded_at = ca.Function("fpirhc_rounded", [z, known], [_all_below(residual, rounding)])
+        before: Expression = at
         for _ in range(self.steps):
-            step = step_of(at, known)
-            at = at - step
-        left = total(ca.fabs(step[k]) > SMALL * (1 + ca.fabs(at[k])) for k in range(len(self.names)))
+            before, at = at, at - step_of(at, known)
+        arrived = _all_below(at - before, SMALL * (ca.fabs(at) + NEGLIGIBLE * ca.fabs(guess)))
         # NaN is on neither side of a comparison, so arriving is asked for and not missing.
-        return at + nan_where(ca.logic_not(left < 0.5))
+        return at + nan_where(ca.logic_not(ca.logic_or(arrived, rounded_at(at, known))))
+
+
+def _all_below(values: Expression, most: Expression) -> Expression:
+    """Whether every entry is at most so large, by its size."""
+    inside = total(ca.fabs(values[k]) <= most[k] for k in range(values.numel()))
+    return inside > values.numel() - 0.5
 
 
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN

@@ -24,6 +24,7 @@ from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.motion import SECONDS
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
@@ -150,7 +151,7 @@ class RunMonitor:
     """How long something may be wrong before a cycle's status says so.
 
     Args:
-        saturated_after: time at a limit, s.
+        saturated_after: time at a limit: s; in the plant's own unit where its time has no seconds, as of a map that counts weeks.
         window: cycles over which the contraction is measured.
     """
 
@@ -164,7 +165,7 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, monitor: 
     `gate`: around the controller's step.
     """
     block = under_names(gate.block(), {"status": _GATED})
-    longest = round(monitor.saturated_after / problem.period)
+    longest = round(monitor.saturated_after / (problem.period * SECONDS.get(problem.plant.time_unit, 1.0)))
     watched = watch_block(problem, controller, _STATUS, longest=longest, window=monitor.window)
     own = _identity_block(fingerprint(problem, controller, block.memory))
     block, jumps = fed(block, "time", Signal(CLOCK)), response_jumps(nominal(problem), gate.reads)

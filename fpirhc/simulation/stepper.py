@@ -109,7 +109,8 @@ class Stepper(NumbersNow, Checked):
         Args:
             plausible: intervals (lower, upper) by name of a state ("q1", "q1'") or response ("q1''"), which replace the automatic
                 ones (see `fpirhc.controllers.plausible`).
-            max_age: oldest sample that is used, s; the time stamps of samples must then increase. None: they are not looked at.
+            max_age: oldest sample that is used, in the plant's unit of time; the time stamps of samples must then increase. None:
+                they are not looked at.
             monitor: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
             bounded: whether an optimiser whose call may take any time is refused.
             deadline: longest time of a step, s; longer ones are counted, see `deadline`. None: no step is timed.
@@ -181,14 +182,14 @@ class Stepper(NumbersNow, Checked):
         """Return (command, memory for the next cycle).
 
         Args:
-            time: s.
+            time: in the plant's unit of time.
             state: the measured state, shape (nx,). Where it is estimated, use `step_measured`.
             realised: the measured response of the controlled coordinates to the last command; any finite value in the first cycle,
                 and for a controller that does not adapt.
             memory: from `start` or from the step before.
             output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out. Where
                 they are estimated, use `step_measured`.
-            taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
+            taken: time stamp of the sample, in the plant's unit of time; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
                 the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
             setpoints: set-points from this step on, by coordinate or output: a number, or where they are announced one number per
@@ -240,7 +241,7 @@ class Stepper(NumbersNow, Checked):
         """Return (command, memory for the next cycle) from raw measurements.
 
         Args:
-            time: s.
+            time: in the plant's unit of time.
             measured: what the sensors show, in the order of `measures`; late by the dead time of the measurement, as it arrives.
             memory: from `start` or from the step before.
             taken, settings, setpoints: as in `step`.

@@ -361,6 +361,14 @@ class Cascade(Controller):
         slopes = ca.jacobian(self._units(plant, y, p, "to"), y)
         return ca.Function("fpirhc_steepness", [y, p], [ca.densify(ca.diag(slopes))])
 
+    def _as_coordinates(self, plant: Plant, first: np.ndarray, there: np.ndarray) -> np.ndarray:
+        """By how much every controlled coordinate would change for all of its value in the other unit, (n,)."""
+        function = self._steepness(plant)
+        if function is None:
+            return np.zeros(len(first))
+        slopes = np.abs(np.asarray(function(first, plant.approximate).full()).ravel())
+        return np.divide(np.abs(there), slopes, out=np.zeros(len(first)), where=slopes > 0)
+
     def _check_units(self, problem: Problem) -> None:
         """Raise where a unit is of nothing, or its functions are not each other's inverse at the reference's start."""
         plant, mistakes = problem.plant, Mistakes("Cascade")
@@ -369,8 +377,10 @@ class Cascade(Controller):
         first = _first_reference(problem)
         there = self._numbers(plant, first, "to")
         again = self._numbers(plant, there, "back")
+        # What `to` rounds at a coordinate near zero, 0 °C in kelvins, `back` cannot know.
+        sizes = np.fmax(np.abs(first), self._as_coordinates(plant, first, there))
         for k, name in enumerate(plant.controlled_names):
-            if not abs(again[k] - first[k]) <= _AGREE * max(1.0, abs(first[k])):
+            if not abs(again[k] - first[k]) <= _AGREE * sizes[k]:
                 mistakes.add(
                     f"units['{name}']: to({first[k]:g}) is {there[k]:g}, and back of it {again[k]:g}; expected {first[k]:g}, the "
                     "reference at the start: give functions that are each other's inverse, and a reference inside their range"

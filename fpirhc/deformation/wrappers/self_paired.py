@@ -159,7 +159,8 @@ def _estimated(
     past = ca.vertcat(request - mean_request, memory["delay_past"])[: size * (most + 1)]
     columns = ca.reshape(past, size, most + 1)
     error = response - mean_response - ca.mtimes(columns, memory["delay_weights"])
-    energy = ca.sumsqr(past) + _FLOOR * (1 + ca.sumsqr(mean_request))
+    size_of_all = ca.sumsqr(past) + _FLOOR * ca.sumsqr(mean_request)
+    energy = size_of_all + (size_of_all <= 0)  # requests of zero have no changes either
     roughness = ca.fmin(1, ca.sumsqr(past[size:] - past[: size * most]) / energy / _ROUGH)
     weights = memory["delay_weights"] + _STEP * roughness / energy * ca.mtimes(columns.T, error)
     cycles, near = _peak(weights, most)

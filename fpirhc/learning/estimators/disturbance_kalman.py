@@ -334,10 +334,23 @@ def _gain(fixed: ca.DM | None, seen: Seen, measured: int) -> Expression:
 
 
 def _rank(a: np.ndarray, c: np.ndarray) -> int:
-    """Rank of [A - I; C], with rows of size one."""
-    stacked = np.vstack([a - np.eye(len(a)), c])
+    """Rank of [A - I; C], the same in all units."""
+    stacked = _balanced(np.vstack([a - np.eye(len(a)), c]))
     rows = np.abs(stacked).max(axis=1) > 0
     return int(np.linalg.matrix_rank(stacked[rows] / np.abs(stacked[rows]).max(axis=1, keepdims=True), tol=1e-9))
+
+
+def _balanced(matrix: np.ndarray) -> np.ndarray:
+    """The matrix with rows and columns scaled so that its entries are as near to one as they can be (Curtis and Reid 1972).
+
+    Largest entries of size one in every row and column do not suffice: an entry beside a larger one may still be any unit's.
+    """
+    rows, columns = np.nonzero(matrix)
+    entries, height = np.arange(len(rows)), len(matrix)
+    belongs = np.zeros((len(rows), height + matrix.shape[1]))
+    belongs[entries, rows] = belongs[entries, height + columns] = 1.0
+    sizes = np.linalg.lstsq(belongs, np.log(np.abs(matrix[rows, columns])), rcond=None)[0]
+    return np.asarray(matrix * np.exp(-sizes[:height, None] - sizes[None, height:]))
 
 
 def _shown_by(plant: Plant, names: Sequence[str]) -> list[int]:

@@ -13,7 +13,7 @@ from fpirhc.fields.kinds import NotNegative, Range
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
 from fpirhc.symbolic.layout import Expression
 
-_RELATIVE, _FLOOR = 1e-9, 1e-12  # of the matrix that is inverted: a response without information changes nothing
+_RELATIVE = 1e-9  # of the trace of the matrix that is inverted: a response without information changes nothing
 
 
 _CONVERGENT = Range("a number between 0 and 2, both excluded", 0.0, 2.0, open_low=True, open_high=True)
@@ -60,9 +60,9 @@ class Projection(Rule):
         widths = ca.DM([(upper - lower) ** 2 for lower, upper in bounds.values()])
         spread = ca.mtimes(matrix, ca.diag(widths))
         square = ca.mtimes(spread, matrix.T)
-        square += (_RELATIVE * ca.trace(square) + _FLOOR) * ca.DM.eye(error.numel())
-        size = ca.sqrt(ca.sumsqr(error) + _FLOOR**2)
-        share = self.gain * ca.fmax(size - self.dead_zone, 0) / size
+        trace, size = ca.trace(square), ca.sqrt(ca.sumsqr(error))
+        square += (_RELATIVE * trace + (trace <= 0)) * ca.DM.eye(error.numel())
+        share = self.gain * ca.fmax(size - self.dead_zone, 0) / (size + (size <= 0))
         return share * ca.mtimes(spread.T, ca.solve(square, error))
 
 

@@ -1,0 +1,162 @@
+"""The same physics in another unit has the same answer."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem
+from fpirhc.learning.rules.base import Evidence
+from fpirhc.learning.rules.projection import Projection
+
+LAW = fp.ComputedTorque(fp.Exponential(rate=1.0, integral=False))
+
+
+def _root(size: float, guess: float, steps: int, root: float = 1.0) -> float:
+    """The algebraic state z of z^2 + z size = (root^2 + root) size^2, in `size`."""
+    algebraic = fp.Algebraic(
+        units={"z": "mol/L"},
+        equations=lambda q, u, p, z: {"z": z.z**2 + z.z * p.s - (root**2 + root) * p.s**2 * (1 + u.u)},
+        guess={"z": guess * size},
+        steps=steps,
+    )
+    plant = fp.Plant(
+        coordinates={"c": "mol/L"},
+        inputs={"u": "1"},
+        order=1,
+        response=lambda q, u, p, z: {"c": z.z + u.u},
+        algebraic=algebraic,
+        parameters={"s": fp.Parameter(size, size, "mol/L")},
+    )
+    return float(plant.equations.algebraic(0.0, 0.0, size)) / size
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-7])
+def test_an_algebraic_state_is_found_or_not_a_number_in_any_unit(size):
+    assert np.isnan(_root(size, guess=100.0, steps=6))
+    assert _root(size, guess=100.0, steps=14) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("guess", [0.0, 0.1])
+def test_an_algebraic_state_of_zero_is_found(guess):
+    assert _root(1e-7, guess, steps=6, root=0.0) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_a_kalman_filter_can_determine_does_not_depend_on_a_unit():
+    size = 1e-9
+    plant = fp.Plant.of_states(
+        states={"x": "1", "y": "mol"},
+        inputs={"u": "1"},
+        rates=lambda x, u, p: {"x": -x.x + u.u, "y": p.s * x.x - x.y},
+        outputs={"z": fp.Output("mol", lambda x, p: x.y)},
+        parameters={"s": fp.Parameter(size, size, "mol/s")},
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"z": 0.5 * size + 0 * t}),
+        start={"x": 0.0, "y": 0.0},
+        period=0.05,
+        duration=20.0,
+        disturbances={"x": fp.Step(at=0.0, size=0.3)},
+    )
+    learner = fp.DisturbanceKalman({"x": 1.0}, {"y": 0.01 * size}, noise={"x": 0.1, "y": 0.1 * size})
+    run = fp.simulate(problem, fp.Estimating(LAW, learner), seed=0, compiled=False)
+    assert run["state.y"][-1] == pytest.approx(0.5 * size, rel=1e-3)
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("ms", 1e-3), ("min", 60.0), ("week", 1.0)])
+def test_a_saturated_input_is_told_after_the_same_time_in_any_unit_of_time(unit, seconds):
+    plant = fp.Plant(
+        coordinates={"x": "m"},
+        inputs={"f": "N"},
+        order=1,
+        response=lambda q, u, p: {"x": u.f * p.a},
+        parameters={"a": fp.Parameter(1.0, 1.0, "1")},
+        time_unit=unit,
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"x": 1e9 + 0 * t}),
+        start={"x": 0.0},
+        period=0.1 / seconds,
+        duration=10.0 / seconds,
+        limits=fp.Limits(inputs={"f": (-1.0, 1.0)}),
+    )
+    law = fp.ComputedTorque(fp.Exponential(rate=seconds, integral=False))
+    stepper = fp.Stepper(problem, law, compiled=False)
+    memory, cycle = stepper.start(), 0
+    while stepper.trace()["status"].item() != fp.Status.SATURATED if cycle else True:
+        _, memory = stepper.step(cycle * problem.period, np.zeros(1), np.zeros(1), memory)
+        cycle += 1
+    assert cycle == 11
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-9, 0.0])
+def test_a_projection_learns_as_much_from_a_response_in_another_unit(size):
+    evidence = Evidence(lambda: (ca.SX(0), ca.SX(0)), lambda: (ca.SX(size), ca.SX(size * 0.5)), ca.SX(0))
+    learned = float(ca.evalf(Projection(gain=1.0).change(evidence, {"p": (0.0, 1.0)}, 1e-3)))
+    assert learned == pytest.approx(0.5 if size else 0.0)
+
+
+def test_a_dead_time_is_found_in_small_requests_too():
+    size = 1e-9
+    plant = fp.Plant(
+        coordinates={"x": "m"},
+        inputs={"f": "N"},
+        order=1,
+        response=lambda q, u, p: {"x": p.a * u.f * size - q.x},
+        parameters={"a": fp.Parameter(1.3, 1.0, "1")},
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"x": size * (ca.sin(20 * t) + ca.sin(31 * t))}),
+        start={"x": 0.0},
+        period=0.01,
+        duration=10.0,
+        dead_time=fp.DeadTime(inputs={"f": 0.03}),
+    )
+    law = fp.ComputedTorque(fp.Exponential(rate=2.0, integral=False), fp.SelfPaired(fp.Affine(gain=-0.6), most=8))
+    assert fp.simulate(problem, law, seed=0, compiled=False)["paired_cycles"][-1] == 3.0
+
+
+@pytest.mark.parametrize("level", [1.0, 1e-9])
+def test_a_wrong_pair_of_unit_functions_of_a_cascade_is_refused_in_any_unit(level):
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "m"},
+        order=1,
+        response=lambda q, u, p: {"y": p.a * (u.u - q.y)},
+        parameters={"a": fp.Parameter(1.0, 1.0, "1/s")},
+    )
+    problem = fp.Problem(
+        plant=plant, reference=fp.Trajectory(lambda t: {"y": level + 0 * t}), start={"y": 0.0}, period=0.1, duration=1.0
+    )
+
+    def check(factor: float) -> None:
+        unit = fp.TargetUnit(lambda y, _: y / level, lambda z, _: z * level * factor)
+        fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-0.6), fp.ThroughModel(lag=1.0), units={"y": unit}).check(
+            problem
+        )
+
+    check(1.0)
+    with pytest.raises(InvalidProblem, match="each other's inverse"):
+        check(1.1)
+
+
+def test_unit_functions_with_an_offset_agree_at_zero_but_for_rounding():
+    plant = fp.Plant(
+        coordinates={"T": "°C"},
+        inputs={"u": "K"},
+        order=1,
+        response=lambda q, u, p: {"T": p.a * (u.u - q.T)},
+        parameters={"a": fp.Parameter(1.0, 1.0, "1/s")},
+    )
+    problem = fp.Problem(
+        plant=plant, reference=fp.Trajectory(lambda t: {"T": 1e-9 + 0 * t}), start={"T": 0.0}, period=0.1, duration=1.0
+    )
+    kelvins = fp.TargetUnit(lambda y, _: y + 273.15, lambda z, _: z - 273.15)
+    fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-0.6), fp.ThroughModel(lag=1.0), units={"T": kelvins}).check(
+        problem
+    )
