@@ -73,7 +73,7 @@ _REMEDIES = {
     Status.RESTARTED: "the memory was not finite and was forgotten: the controller began anew; look at where the memory is kept.",
     Status.SOLVER_FAILED: "a solver raised an error: the cycle was skipped, with the last command and every memory as it was; "
     "use FixedPoint(), or look at the measurement that the solver was given.",
-    Status.SATURATED: "the command has been at a limit for longer than the stated time; integrals are frozen meanwhile: check the "
+    Status.SATURATED: "the command has been at a limit for longer than the stated time; integrals go no further into it: check the "
     "actuator, the sign of its gain, and whether the limits allow the task.",
     Status.NOT_CONTRACTING: "the measured response errors grow from cycle to cycle: the gain is too large or has the wrong sign "
     "for this plant; lower it, or put Guarded(...) around the map.",

@@ -14,7 +14,7 @@ time that is wrong by some cycles, also with the whole gain 1 / lambda_max. Erro
     RHC not predicting      0.48
     CTC                     0.15
     CTC+FPI unpaired        0.15
-    CTC+FPI paired             3
+    CTC+FPI paired           3.1
     CTC+FPI increment     0.0055
 
 With a dead time of 54 to 66 ms, still believed to be 60, RHC and RHC+FPI err by the same to 1 %. With a third of the weight of the

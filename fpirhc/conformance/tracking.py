@@ -31,6 +31,7 @@ Decay = Callable[[Array, int], Array]
 
 _TRIALS = 5
 _OFFERED = ("state", "_target", "nominal", "warm_up")  # what a law may read besides its own memory
+_LIMITED = ("clipped", "_cut_off", "_held")  # what the update may read besides
 _EXACT = 1e-9  # relative
 _DECAY = 0.01  # of the first error: the constant command within a cycle costs about rate x period
 _WIND = 0.01  # relative change of the desired response that counts as winding up
@@ -92,7 +93,7 @@ class _Trial:
 
     @cached_property
     def cycle(self) -> Composite:
-        """The law and its update as one step (memory, state, target, nominal, warm_up, clipped)."""
+        """The law and its update as one step (memory, state, target, nominal, warm_up, clipped, cut off, held)."""
         plant = self.plant
         reads = Layout(
             (
@@ -101,6 +102,8 @@ class _Trial:
                 plant.response_signal("nominal"),
                 scalar("warm_up"),
                 scalar("clipped"),
+                plant.response_signal("_cut_off"),
+                scalar("_held"),
             )
         )
         blocks, delays = [self.law, self.update], self.tracking.delays(plant)
@@ -111,10 +114,19 @@ class _Trial:
         return Evaluator(self.cycle.function)
 
     def __call__(
-        self, memory: Array, state: Array, target: Array, nominal: Array, *, warm_up: float = 1.0, clipped: float = 0.0
+        self,
+        memory: Array,
+        state: Array,
+        target: Array,
+        nominal: Array,
+        *,
+        warm_up: float = 1.0,
+        cut_off: Array | None = None,
     ) -> tuple[Array, Array, Array]:
         """(memory of the next cycle, desired response, error to the target)."""
-        next_memory, _, desired, error = self.evaluator(memory, state, target, nominal, warm_up, clipped)
+        cut = np.zeros(len(self.orders)) if cut_off is None else cut_off
+        clipped = float(np.any(cut != 0))
+        next_memory, _, desired, error = self.evaluator(memory, state, target, nominal, warm_up, clipped, cut, 0.0)
         return next_memory, desired, error
 
     def start(self) -> Array:
@@ -154,7 +166,7 @@ def only_declared_signals(trial: _Trial, generator: np.random.Generator) -> None
         size = law.writes[name].size
         hold(size == len(trial.orders), f"law() writes '{name}' with {size} entries, expected {len(trial.orders)}")
     _reads_only(law, {*_OFFERED, *remembered}, "law()")
-    _reads_only(update, {*_OFFERED, *remembered, *law.writes.names, "clipped"}, "update()")
+    _reads_only(update, {*_OFFERED, *remembered, *law.writes.names, *_LIMITED}, "update()")
     written = {*law.writes.names, *update.writes.names}
     for delay in delays:
         hold(delay.source in written, f"delays() carries '{delay.source}' on, which neither law() nor update() writes")
@@ -286,19 +298,19 @@ def error_decays(trial: _Trial, generator: np.random.Generator) -> None:
 
 
 def clipping_freezes(trial: _Trial, generator: np.random.Generator) -> None:
-    """While the command is clipped a constant error does not wind the law up: its desired response settles."""
+    """A constant error does not wind the law up further into a limit: its desired response settles."""
     state, target, nominal = trial.motion(generator)
     cycles = round(trial.duration / trial.period)
-    memory, halfway = trial.start(), np.zeros(0)
+    memory, halfway, cut_off = trial.start(), np.zeros(0), (target - state)[places(trial.plant, 0)]
     for cycle in range(cycles + 1):
-        memory, desired, _ = trial(memory, state, target, nominal, warm_up=float(cycle > 0), clipped=1)
+        memory, desired, _ = trial(memory, state, target, nominal, warm_up=float(cycle > 0), cut_off=cut_off)
         if cycle == cycles // 2:
             halfway = desired
     change, size = np.abs(desired - halfway), np.abs(desired - nominal) + _EXACT
     hold(
         within(change / size, _WIND),
         f"clipped for {trial.duration:g} s at a constant error, the desired response goes from {halfway} at half time to "
-        f"{desired}; leave the memory unchanged where `clipped` is 1",
+        f"{desired}; leave the memory unchanged where the error has the sign of `_cut_off`, or where `clipped` is 1",
     )
 
 

@@ -226,7 +226,8 @@ def _limit_block(problem: Problem) -> Block:
         plant.parameter,
         like(plant.input, "_command_before"),
     )
-    writes = (plant.input, plant.response_signal("deformed"), scalar("clipped"), scalar("_held"))
+    responses = map(plant.response_signal, ("deformed", "_cut_off"))
+    writes = (plant.input, *responses, scalar("clipped"), scalar("_held"))
 
     def step(s: Signals) -> dict[str, Expression]:
         # Finiteness is checked before the clamp: fmin and fmax turn NaN into a full-scale command.
@@ -237,6 +238,7 @@ def _limit_block(problem: Problem) -> Block:
         return {
             "command": command,
             "deformed": ca.if_else(finite, clipped_request, s.desired),
+            "_cut_off": s._deformed_unclipped - clipped_request,
             "clipped": ca.mmax(command != s.command_unclipped),
             "_held": 1 - finite,
         }

@@ -41,7 +41,7 @@ class Tracking(Checked, ABC):
     """Contract: q^Des from the nominal motion and the measured state.
 
     A law is two blocks with its memory between them, because the memory may depend on the command, which comes later in the cycle
-    (an integral must not grow while the command is clipped).
+    (an integral must not grow into a limit of the command).
     """
 
     @property
@@ -72,7 +72,11 @@ class Tracking(Checked, ABC):
 
     @abstractmethod
     def update(self, plant: Plant, period: float) -> Block:
-        """Block (_target_error, clipped, ...) -> memory of the law for the next cycle."""
+        """Block (_target_error, clipped, _cut_off, _held, ...) -> memory of the law for the next cycle.
+
+        `_cut_off` is the response of every controlled coordinate that limits of the inputs cut off, wanted less possible. `clipped`
+        is 1 where some input was clipped, and `_held` where the last command was repeated because that of now cannot be used.
+        """
 
     @abstractmethod
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
@@ -105,7 +109,7 @@ class Useful:
 
 
 class IntegralLaw(Tracking):
-    """A law whose memory between cycles is the integral of the error, which does not grow while the command is clipped."""
+    """A law whose memory between cycles is the integral of the error, which does not grow into a limit of the command."""
 
     if TYPE_CHECKING:
 
@@ -125,7 +129,7 @@ class IntegralLaw(Tracking):
         return other
 
     def update(self, plant: Plant, period: float) -> Block:
-        """Block that integrates the error, except while the command is clipped, and within its bounds."""
+        """Block that integrates the error, except further into a limit of the command, and within its bounds."""
         return integral_update(plant, period, self._useful(plant))
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
@@ -150,7 +154,10 @@ def law_signals(plant: Plant) -> tuple[Layout, Layout]:
 
 
 def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) -> Block:
-    """Block that integrates the error, except while the command is clipped, and where it asks for what no limits could meet.
+    """Block that integrates the error, except further into a limit, and where it asks for what no limits could meet.
+
+    Every coordinate is judged alone: its error counts where it is not of the sign of '_cut_off', what limits cut off of its
+    demand. So it takes the integral out of a limit, where a frozen integral could stay for ever.
 
     Over a gap the error is on a line: cycle by cycle the last one is integrated again, and the next sample adds the rest.
 
@@ -160,10 +167,12 @@ def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) 
     """
     writes = Layout((integral_signal(plant, "integral"),))
     increment, before = integral_signal(plant, "integral_increment"), integral_signal(plant, "_integral_before")
-    reads = (error_signal(plant), scalar("clipped"), integral_signal(plant, "_integral_used"))
+    cut_off, held = plant.response_signal("_cut_off"), scalar("_held")
+    reads = (error_signal(plant), cut_off, held, integral_signal(plant, "_integral_used"))
 
     def step(s: Signals) -> dict[str, Expression]:
-        error = ca.if_else(s.clipped, 0, s._target_error)
+        counts = ca.logic_and(s._target_error * s._cut_off <= 0, ca.logic_not(s._held))
+        error = ca.if_else(counts, s._target_error, 0)
         if not useful:
             return {"integral": s._integral_used + period * error}
         columns = zip(useful, ca.vertsplit(s._integral_used), ca.vertsplit(error), strict=True)

@@ -11,7 +11,7 @@ for half a second; no controller measures it. All derivatives are ideal.
     rms error, seed 0            q [m]
     CTC                          0.018
     CTC+FPI                    3.8e-05
-    CTC+FPI, gain too large      0.052
+    CTC+FPI, gain too large      0.050
     RHC                         0.0073
     RHC+FPI, model-referenced  1.2e-05
     RHC+FPI                    2.4e-05

@@ -13,7 +13,7 @@ and the third derivative are measured. Errors count from 16 days on:
 
     rms error, seed 0          size [ln(mm^3)]
     CTC                                   0.11
-    CTC+FPI                              0.015
+    CTC+FPI                              0.014
     RHC                                  0.017
     RHC+FPI, model-referenced          2.5e-06
     RHC+FPI                            0.00022

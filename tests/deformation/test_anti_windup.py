@@ -1,7 +1,7 @@
 """What anti-windup buys: a step of 2 m with a weak actuator, and the same loop with either of its two measures taken out.
 
 The measures: what a clipped command means becomes the stored request of the deformation, and the integral of the error does not
-grow while the command is clipped.
+grow into a limit.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ def request_kept(blocks, delays):
 
 
 def integral_runs(blocks, delays):
-    """Integrate the error also while the command is clipped."""
+    """Integrate the error also where it goes further into a limit."""
     update = blocks[-1]
 
     def step(s):
-        s.clipped = 0 * s.clipped
+        s._cut_off = 0 * s._cut_off
         return update.step(s)
 
     return [*blocks[:-1], Block(update.name, update.reads, update.writes, step)], delays

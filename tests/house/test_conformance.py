@@ -117,7 +117,7 @@ class Altered(fp.Exponential):
 
         def step(s):
             if self.change == "winds up":
-                s.clipped = 0 * s.clipped
+                s._cut_off = 0 * s._cut_off
             return block.step(s)
 
         return Block(block.name, block.reads, block.writes, step)

@@ -9,16 +9,17 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import commanding_blocks, like, reference_block, rename
+from fpirhc.controllers.base import commanding_blocks, fed, like, reference_block, rename
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
-from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.live import nominal, quotient
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.live import nominal, numbers, quotient
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import (
     Useful,
@@ -96,7 +97,8 @@ class PID(Undeformed):
             rename("desired", response, plant.response_signal("desired")),
             self._law(problem),
             *closing,
-            integral_update(plant, problem.period, self._useful(problem)),
+            self._cut_off_block(plant),
+            fed(integral_update(plant, problem.period, self._useful(problem)), "_cut_off", _cut_off(plant)),
         ]
         return blocks, [*delays, *integral_delay(plant)]
 
@@ -108,6 +110,20 @@ class PID(Undeformed):
             Useful(self.integral.get(n, 0.0), self.proportional[n], float(size) if size > 0 else math.inf)
             for n, size in zip(names, sizes, strict=False)
         ]
+
+    def _cut_off_block(self, plant: Plant) -> Block:
+        """Block (command before and after its limits) -> what they cut off in every loop, with the sign of the error's share.
+
+        Without a model the response that is cut off is not known, but every loop has its own input.
+        """
+        gains = numbers([self.integral.get(name, 0.0) for name in plant.controlled_names])
+
+        def step(s: Signals) -> dict[str, Expression]:
+            return {_CUT_OFF: gains * (s.command_unclipped - s.command)}
+
+        return Block(
+            "cut_off", Layout((like(plant.input, "command_unclipped"), plant.input)), Layout((_cut_off(plant),)), step
+        )
 
     def _law(self, problem: Problem) -> Block:
         """Block (state, reference, integral, warm_up) -> command, and the model's response to it (for readers of a log)."""
@@ -145,6 +161,13 @@ class PID(Undeformed):
             plant.response_signal("_deformed_unclipped"),
         )
         return Block("pid", Layout(reads), Layout(writes), step, gains_before(plant, integral_gains))
+
+
+_CUT_OFF = "_command_cut_off"
+
+
+def _cut_off(plant: Plant) -> Signal:
+    return vector(_CUT_OFF, plant.controlled_names)
 
 
 EXAMPLES = (

@@ -181,7 +181,8 @@ class Slotted(Controller):
             delays += delays_for_channel(law.delays(light), one)
         blocks += [command_block(problem, channels), judge_block(), _count_block(problem, channels)]
         blocks += [
-            for_channel(c.slot.tracking.update(c.plant, problem.period), c, {"clipped", "time"}, {}) for c in channels
+            for_channel(c.slot.tracking.update(c.plant, problem.period), c, {"clipped", "time"}, {"_held": "_repeated"})
+            for c in channels
         ]
         counted = {"warm_up": "_warm_up_now", "_slot_before": "slot", "_age_before": "_age"}
         delays += [Delay(discrete(now), source) for now, source in counted.items()]
@@ -552,6 +553,7 @@ def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
         # Exactly the request where nothing was clipped.
         clipped_requests = requests + slot["gain"] * (entries - commands)
         exact = ca.logic_and(slot["active"], usable)
+        cut_off = slot["gain"] * (commands - entries)
         return {
             "command": command,
             "nominal": slot["nominal"],
@@ -560,14 +562,16 @@ def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
             "clipped": ca.mmax(command != unclipped),
             "slot_held": ca.logic_not(good),
             "_held": ca.logic_not(finite),
+            "_repeated": ca.logic_not(usable),
             "_offset": _finite(_pick(slot["active"], slot["offset"])),
             "_distance": _finite(_pick(slot["active"], slot["distance"])),
+            **{c.wire("_cut_off"): cut_off[k] for k, c in enumerate(channels)},
         }
 
     reads = [c.signal(n) for c in channels for n in _PER_SLOT]
     responses = [by_slot(channels, n) for n in ("nominal", "desired", "deformed")]
-    scalars = [scalar(n) for n in ("clipped", "slot_held", "_held", "_offset", "_distance")]
-    writes = (plant.input, *responses, *scalars)
+    scalars = [scalar(n) for n in ("clipped", "slot_held", "_held", "_repeated", "_offset", "_distance")]
+    writes = (plant.input, *responses, *scalars, *(c.signal("_cut_off") for c in channels))
     return Block("command", Layout((*reads, like(plant.input, "_command_before"))), Layout(writes), step)
 
 
