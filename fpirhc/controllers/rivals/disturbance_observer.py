@@ -23,7 +23,7 @@ from fpirhc.tracking.base import Tracking
 
 @dataclass(frozen=True)
 class DisturbanceObserver(Undeformed):
-    """Inverse dynamics less the observed disturbance at the input.
+    """Inverse dynamics less the observed disturbance at the input. Dead time is not compensated.
 
     Args:
         tracking: the law that gives the desired response.

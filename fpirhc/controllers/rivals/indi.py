@@ -23,7 +23,7 @@ from fpirhc.tracking.base import Tracking
 
 @dataclass(frozen=True)
 class INDI(Undeformed):
-    """Increments of the command by the model's input gain.
+    """Increments of the command by the model's input gain. Dead time is not compensated.
 
     Args:
         tracking: the law that gives the desired response.

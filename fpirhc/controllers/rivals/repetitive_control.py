@@ -26,7 +26,7 @@ MOST = 20_000  # cycles of a period: each is one number per coordinate in the co
 
 @dataclass(frozen=True)
 class RepetitiveControl(Undeformed):
-    """Inverse dynamics of a request that is learned from period to period.
+    """Inverse dynamics of a request that is learned from period to period. Dead time is not compensated.
 
     Args:
         tracking: the law that gives the desired response.
