@@ -24,7 +24,7 @@ from fpirhc.fields.checked import Checked, missing
 from fpirhc.fields.kinds import Few
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.parameter import Parameter, with_exact_values
-from fpirhc.symbolic.expression import expression, graph, total
+from fpirhc.symbolic.expression import FINITE, expression, graph, total
 from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
 from fpirhc.symbolic.live import nan_where
 
@@ -358,7 +358,7 @@ def with_space(unit: str) -> str:
 
 
 SMALL = 1e-6  # last step of Newton's method, relative; the error left is about its square
-NEGLIGIBLE = 1e-3  # share of a guess beside which a number counts as zero
+NEGLIGIBLE = 1e-3  # share of a guess, or of a unit of an input, beside which a number counts as zero
 ROUNDING = 1e-12  # relative change of what is known that nobody tells from the rounding of its numbers
 
 
@@ -432,6 +432,9 @@ def _all_below(values: Expression, most: Expression) -> Expression:
 
 
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN
+INVERSE_ROUNDING = (
+    1e-15  # relative response error at which Newton's method stops, where no step of 1e-12 stops it before
+)
 NEWTON_ITERATIONS = 50  # CasADi's own largest number, said here because the worst case of an exported step counts it
 
 
@@ -490,17 +493,34 @@ def inverse_by_newton(plant: Motion, response: ca.Function) -> ca.Function:
     """
     x, u, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
-    error = ca.Function("fpirhc_inversion", [u, x, r, p], [response(x, u, p) - r])
-    options = {"error_on_fail": False, "max_iter": NEWTON_ITERATIONS}
+    size = ca.SX.sym("size", r.numel())
+    error = ca.Function("fpirhc_inversion", [u, x, r, p, size], [(response(x, u, p) - r) / size])
+    options = {"error_on_fail": False, "max_iter": NEWTON_ITERATIONS, "abstol": INVERSE_ROUNDING}
     finder = ca.rootfinder("fpirhc_newton", "fast_newton", error, options)
     xm, rm, pm = (ca.MX.sym(n, s) for n, s in (("x", x.numel()), ("r", r.numel()), ("p", p.numel())))
     count = len(plant.inputs)
     gain_at_zero = ca.sparsify(ca.substitute(ca.jacobian(response(x, u, p), u), u, ca.SX.zeros(count)))
     blind = ca.sprank(gain_at_zero.sparsity()) < count
-    root = finder(ca.DM.ones(count) if blind else ca.DM.zeros(count), xm, rm, pm)
-    residual = ca.norm_inf(error(root, xm, rm, pm))
+    first = ca.DM.ones(count) if blind else ca.DM.zeros(count)
+    sizes = _sizes_of_response(plant, response, first)(xm, rm, pm)
+    root = finder(first, xm, rm, pm, sizes)
+    residual = ca.norm_inf(error(root, xm, rm, pm, sizes))
     # NaN is on neither side of a comparison, so arriving is asked for and not missing.
-    lost = ca.logic_not(residual <= INVERSE_TOLERANCE * (1 + ca.norm_inf(rm)))
+    lost = ca.logic_not(residual <= INVERSE_TOLERANCE)
     return ca.Function(
         "fpirhc_inverse", [xm, rm, pm], [root + graph(nan_where(expression(lost)))], ["x", "r", "p"], ["u"]
     )
+
+
+def _sizes_of_response(plant: Motion, response: ca.Function, first: ca.DM) -> ca.Function:
+    """Function (state, response, parameters) -> what is large for each response, beside which an error is zero.
+
+    It has the unit of the response: what is asked, what there is at the first inputs, and what little a negligible input adds.
+    """
+    x, u, p = plant.symbols()
+    r = ca.SX.sym("r", len(plant.controlled_names))
+    there, slope = (ca.substitute(e, u, first) for e in (response(x, u, p), ca.jacobian(response(x, u, p), u)))
+    effects = [ca.if_else(ca.fabs(e) < FINITE, ca.fabs(e), 0) for e in ca.vertsplit(ca.densify(slope))]
+    size = ca.fabs(r) + ca.fabs(there) + NEGLIGIBLE * ca.vertcat(*map(ca.sum2, effects))
+    # Where all of it is zero, the first inputs answer exactly.
+    return ca.Function("fpirhc_sizes", [x, r, p], [ca.densify(size + (size <= 0))])

@@ -14,6 +14,34 @@ from fpirhc.learning.rules.projection import Projection
 LAW = fp.ComputedTorque(fp.Exponential(rate=1.0, integral=False))
 
 
+@pytest.mark.parametrize("size", [1e-12, 1e9])
+def test_an_input_found_by_newtons_method_is_that_of_the_response_in_another_unit(size):
+    def commanded(k: float) -> float:
+        plant = fp.Plant(
+            coordinates={"V": "m^3"},
+            inputs={"u": "1"},
+            order=1,
+            response=lambda q, u, p: {"V": p.k * (u.u + u.u**3)},
+            parameters={"k": fp.Parameter(k, k, "m^3/s")},
+        )
+        return float(plant.equations.inverse(0.0, 2 * k, k))
+
+    assert commanded(1.0) == pytest.approx(1.0)
+    assert commanded(size) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("k", [1.0, 1e-12])
+def test_an_input_that_nothing_gives_is_not_a_number_in_any_unit(k):
+    plant = fp.Plant(
+        coordinates={"V": "m^3"},
+        inputs={"u": "1"},
+        order=1,
+        response=lambda q, u, p: {"V": p.k * (1 + u.u**2)},
+        parameters={"k": fp.Parameter(k, k, "m^3/s")},
+    )
+    assert np.isnan(float(plant.equations.inverse(0.0, 0.5 * k, k)))
+
+
 def _root(size: float, guess: float, steps: int, root: float = 1.0) -> float:
     """The algebraic state z of z^2 + z size = (root^2 + root) size^2, in `size`."""
     algebraic = fp.Algebraic(
