@@ -49,6 +49,7 @@ class OptimalControl:
         nodes: states, inputs and data along the reference from t = 0.
         along: quadratic model of the cost along the reference.
         written: number of the last entries of the state, which are limits of rates, paths and the end; they are zero in s_0.
+        met: number of the last of these, which must meet the reference at the end.
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
         node_times: of s_0 ... s_N from the start, shape (N + 1,), s.
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
@@ -95,6 +96,7 @@ class OptimalControl:
     linear_outputs: Callable[[], tuple[ca.Function, ca.Function]] | None = None
     frozen: tuple[ca.Function, ca.Function] | None = None
     soft_end: ca.Function | None = None
+    met: int = 0
 
     @property
     def scale(self) -> np.ndarray:
@@ -170,6 +172,20 @@ class OptimalControl:
         changed = replace(self, nodes=nodes, along=along, curvature=input_curvature(along, self.step))
         table[self.data.slice(SCALE)], table[self.data.slice(STEEPEST)] = changed.scale[:, None], changed.steepest
         return changed
+
+    @property
+    def equations(self) -> np.ndarray:
+        """Which states have limits that are an equation and no range (ns,): those that are equal, and what the end must meet."""
+        return np.asarray(
+            (self.state_lower == self.state_upper) | (np.arange(self.state.size) >= self.state.size - self.met)
+        )
+
+    @property
+    def half_ranges(self) -> np.ndarray:
+        """Half the range of every state's limits (ns,); infinite where a side is free or the limits are an equation."""
+        with np.errstate(invalid="ignore"):
+            half = 0.5 * (self.state_upper - self.state_lower)
+        return np.where(self.equations, np.inf, half)
 
     @property
     def hard(self) -> np.ndarray:

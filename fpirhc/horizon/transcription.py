@@ -129,6 +129,7 @@ def _transcribed(
         nodes=nodes,
         along=along,
         written=len(binding),
+        met=len(set(horizon.terminal)),
         state_price=state_prices(limits, state, plant, horizon.step),
         settings=settings,
         live_bounds=tuple(live_numbers(limits.inputs)),

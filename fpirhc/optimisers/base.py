@@ -21,7 +21,10 @@ from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import Native, native
 
 FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept, where an optimiser has no unit for it
-KEPT = 1e-6  # the same as a share of half the range, where it has one
+_SHARE = (
+    1e-3  # largest violation that still counts as kept, as a share of half a range that is so small that this is less
+)
+KEPT = 1e-6  # the same where an optimiser has a unit for it
 _ITERATIONS = "iterations", "most_iterations"  # settings of an optimiser that bound its work
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 _PATIENCE = 4  # calls in a row that may leave the violation as it is
@@ -184,16 +187,25 @@ def stationarity(
     return _largest(inputs - clip(inputs - scale * gradient, lower, upper))
 
 
-def _state_violation(ocp: OptimalControl, states: ca.MX) -> ca.MX:
-    """Return the largest violation of a hard state bound by s_1 ... s_N; zero without bounds."""
+def _state_violation(ocp: OptimalControl, states: ca.MX, factors: np.ndarray | None = None) -> ca.MX:
+    """Return the largest violation of a hard state bound by s_1 ... s_N, times its factor; zero without bounds."""
+    times = np.ones(ocp.state.size) if factors is None else factors
     worst: ca.MX = ca.MX(0)
     for k in np.flatnonzero(ocp.hard).tolist():
         row = states[k, 1:]
         if ocp.state_lower[k] > -FINITE:
-            worst = ca.fmax(worst, ca.mmax(ocp.state_lower[k] - row))
+            worst = ca.fmax(worst, times[k] * ca.mmax(ocp.state_lower[k] - row))
         if ocp.state_upper[k] < FINITE:
-            worst = ca.fmax(worst, ca.mmax(row - ocp.state_upper[k]))
+            worst = ca.fmax(worst, times[k] * ca.mmax(row - ocp.state_upper[k]))
     return worst
+
+
+def counted(ocp: OptimalControl, violation: ca.MX, states: ca.MX) -> ca.MX:
+    """Return the violation that the status counts, which is larger for limits so close together that `FEASIBLE` means nothing."""
+    enlarged = FEASIBLE / np.minimum(FEASIBLE, _SHARE * ocp.half_ranges)
+    if not (enlarged > 1).any():
+        return violation
+    return _state_violation(ocp, states, enlarged)
 
 
 def paid(ocp: OptimalControl) -> ca.Function:
@@ -257,7 +269,7 @@ def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, toler
 
     Args:
         finite: whether the plan and its numbers are finite.
-        violation: the largest violation of a state bound.
+        violation: the largest violation of a state bound, as `counted`.
     """
     converged = ca.if_else(residual <= tolerance, int(Status.OK), int(Status.NOT_CONVERGED))
     feasible = ca.if_else(violation <= FEASIBLE, converged, int(Status.INFEASIBLE))

@@ -20,7 +20,6 @@ from fpirhc.symbolic.expression import FINITE, is_finite
 
 _LEAST = 1e-3  # a smaller spread of the reference is no measure of a state
 _CAPACITY = 1e4  # largest multiplier of a hard limit, in units of cost per unit
-_NARROW = 1e-6  # limits closer together than this share of the reference's spread are an equation, not a range
 ENOUGH = 0.99  # share of the largest multiplier from which a limit counts as given up
 STIFF = 1e8  # weight of an equality, in units of 1 / gamma
 BOUNDARY = 0.99  # largest share of the distance to the boundary in one step
@@ -48,26 +47,24 @@ class Scales:
 def scales(ocp: OptimalControl) -> Scales:
     """Return the scales of a problem, from its limits and its reference.
 
-        inputs    half the range of the input, 1 where it is free
-        states    half the range of the state's limits; without both, half the spread of the reference and a tenth of its size
+        inputs    half the range of the input; where it is free, the least move along the reference that shifts a limited state
+                  by its unit, which is 1 for an input that shifts none
+        states    half the range of the state's limits; without both, or where they are an equation, half the spread
+                  of the reference and a tenth of its size
         cost      C = median over the inputs of Q_uu (half range)^2, with Q_uu the curvature that is left along an input of the
                   first stage once all later inputs answer it: without the answer it grows with every stage of an unstable model
 
     gamma = unit^2 / C turns a gradient into a move, and 1e4 C / unit is the largest multiplier that a limit of a state may have.
     """
-    inputs = _half(ocp.input_lower, ocp.input_upper)
-    inputs = np.where(np.isfinite(inputs) & (inputs > 0), inputs, 1.0)
     nodes = ocp.nodes[0]
     size = np.abs(nodes).max(axis=1)
     about = 0.5 * np.ptp(nodes, axis=1) + 0.1 * size
     about = np.where(about > 0, np.maximum(about, _LEAST), 1.0)
-    range_ = _half(ocp.state_lower, ocp.state_upper)
-    narrow = ~(np.isfinite(range_) & (range_ > _NARROW * about))
+    range_ = ocp.half_ranges
+    states = np.where(np.isfinite(range_), range_, about)
+    places = np.flatnonzero(np.isfinite(ocp.state_lower) | np.isfinite(ocp.state_upper))
+    inputs = _input_units(ocp, states, places)
     cost = float(np.median(_answered_curvature(ocp) * inputs**2))
-    places, states = (
-        np.flatnonzero(np.isfinite(ocp.state_lower) | np.isfinite(ocp.state_upper)),
-        np.where(narrow, about, range_),
-    )
     hard = ocp.hard[places]
     capacity = np.where(hard, _CAPACITY * cost / states[places], ocp.state_price[places])
     return Scales(inputs, states, cost, tuple(int(k) for k in places), capacity, hard)
@@ -75,8 +72,22 @@ def scales(ocp: OptimalControl) -> Scales:
 
 def tolerated(ocp: OptimalControl) -> np.ndarray:
     """Return the violation of every state's limits that still counts as kept, shape (ns,)."""
-    half = _half(ocp.state_lower, ocp.state_upper)
-    return np.where(np.isfinite(half) & (half > KEPT), np.minimum(FEASIBLE, KEPT * half), FEASIBLE)
+    half = ocp.half_ranges
+    return np.where(np.isfinite(half), np.minimum(FEASIBLE, KEPT * half), FEASIBLE)
+
+
+def _input_units(ocp: OptimalControl, states: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """The units of the inputs (nu,), with those of the states (ns,), of which some are limited at these places."""
+    half = _half(ocp.input_lower, ocp.input_upper)
+    free = ~np.isfinite(half)
+    units = np.where(~free & (half > 0), half, 1.0)
+    if not free.any() or not places.size:
+        return units
+    # A force of 1 N is nothing to a car: limits that a plan can keep were given up.
+    slopes = np.abs(ocp.along.sensitivity()[:, places]).reshape(ocp.stages, places.size, ocp.stages, ocp.input.size)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moves = (states[places, None] / slopes.max(axis=(0, 2))).min(axis=0)
+    return np.where(free & np.isfinite(moves) & (moves > 0), moves, units)
 
 
 def _answered_curvature(ocp: OptimalControl) -> np.ndarray:

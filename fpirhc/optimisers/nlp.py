@@ -23,6 +23,7 @@ from fpirhc.optimisers.base import (
     Optimiser,
     call_arguments,
     clip,
+    counted,
     judge,
     remembered_plan,
     sane,
@@ -136,7 +137,8 @@ class MultipleShooting(Optimiser):
         finite = is_finite(ca.vertcat(ca.vec(inputs), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
         plan = ca.if_else(finite, inputs, start)
         numbers = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
-        status = status_of(finite, residual, violation, self.tolerance)
+        counts = counted(ocp, violation, rollout(ocp)(s0, inputs, data)[0])
+        status = status_of(finite, residual, counts, self.tolerance)
         next_parts = {
             "plan_inputs": ca.vec(plan),
             # A solve that was not finite must not poison the next warm start.

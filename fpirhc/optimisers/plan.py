@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,6 @@ from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 
 _WORST = 5  # violations in a text
-_EQUATION = 1e-6  # limits closer together than this are an equation
 _AT_LIMIT = 1e-3  # of its range: an input this near counts as at its limit
 _MOSTLY = 0.5  # share of the stages on which an input that stands at its limit is named
 _AT_BOUND = 1e-6  # relative distance within which an input counts as at its bound
@@ -89,8 +89,11 @@ class Plan:
                 by = max(low - value, value - high)
                 means_something = stage > 0 or k < ocp.state.size - ocp.written
                 if by > most[k] and means_something and ocp.hard[k]:
-                    side = f"below {low:g}" if value < low else f"above {high:g}"
-                    violations.append((stage > 0, -by, f"'{name}' is {value:.6g} {unit}, {side}, at stage {stage}"))
+                    side = "below" if value < low else "above"
+                    limit, beyond = (_apart(v, by) for v in (low if value < low else high, value))
+                    violations.append(
+                        (stage > 0, -by, f"'{name}' is {beyond} {unit}, {side} {limit}, at stage {stage}")
+                    )
         return tuple(text for _, _, text in sorted(violations)[:_WORST])
 
     def reasons(self) -> tuple[str, ...]:
@@ -188,6 +191,12 @@ def solve(
     )
 
 
+def _apart(value: float, by: float) -> str:
+    """Return a number with so many digits that another one is seen to be so far from it."""
+    digits = 2 + math.ceil(math.log10(max(abs(value) / by, 1.0)))
+    return f"{value:.{min(max(digits, 6), 17)}g}"
+
+
 def _stages(ocp: OptimalControl) -> str:
     lengths = np.unique(np.round(np.diff(ocp.node_times), 12))
     return f"{ocp.stages} of {' to '.join(f'{v:g}' for v in (lengths[0], lengths[-1])[: lengths.size])} {ocp.time_unit}"
@@ -226,7 +235,7 @@ def _breaches(ocp: OptimalControl, states: np.ndarray) -> list[_Breach]:
             beyond = np.where(np.isfinite(over), np.maximum(over, 0), 0.0)
             if k >= ocp.state.size - ocp.written:
                 beyond[0] = 0
-            equation = bool(high - low <= _EQUATION)
+            equation = bool(ocp.equations[k])
             one = _Breach(
                 ocp.state.elements[k], ocp.state.units[k], float(limit), side, beyond, equation, float(most[k])
             )
@@ -261,7 +270,7 @@ def _sentence(ocp: OptimalControl, breach: _Breach, stuck: list[str], others: li
             f"'{breach.name}' misses the reference by {amount}{held}: a horizon of {length} is too short to reach it; "
             f"lengthen it, or take '{breach.name.removesuffix(' at the end')}' out of Horizon(terminal=...)"
         )
-    limit = f"'{breach.name}' {breach.side} {breach.limit:g}"
+    limit = f"'{breach.name}' {breach.side} {_apart(breach.limit, most)}"
     begins = breach.beyond[0] > breach.tolerated
     start = f"begins {breach.beyond[0]:.3g} {breach.unit} beyond it".replace("  ", " ") if begins else "begins inside"
     if last == ocp.stages:

@@ -17,6 +17,7 @@ from fpirhc.horizon.problem import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import improved, paid
+from fpirhc.optimisers.plan import _apart
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Named
 from fpirhc.task.limits import Limit
@@ -318,6 +319,43 @@ def test_the_price_of_a_soft_state_counts_the_end_too():
     plan = fp.solve(soft[0], FIXED, soft[2], soft[1])
     costs = [float(rollout(ocp)(first, plan.inputs, data)[1]) for ocp, data, first in (soft, free)]
     assert plan.slacks()["angle"] == pytest.approx(costs[0] - costs[1], rel=1e-9)
+
+
+def speed_limited(mass, length):
+    """(ocp, data, first state) of a mass without limits of its force, which moves by a length with its speed limited."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"F": "N"},
+        order=2,
+        response=lambda q, v, u, p: {"q": u.F / p.m},
+        parameters={"m": fp.Parameter(mass, mass, "kg")},
+    )
+    reference, horizon = fp.Trajectory(lambda t: {"q": length + 0 * t}), fp.Horizon(stages=8, step=0.1)
+    states = {"q": 10.0 / length**2, "q'": 0.1 / length**2}
+    cost = fp.Quadratic(states=states, effort={"F": 1e-2 / (mass * length) ** 2})
+    ocp = transcribe(plant, reference, horizon, cost, fp.Limits(states={"q'": (-length, length)}))
+    return ocp, stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full(), np.zeros(2)
+
+
+@pytest.mark.parametrize(("mass", "length"), [(1.0, 1.0), (1500.0, 1.0), (1e-6, 1.0), (1.0, 1e-9)])
+def test_units_of_forces_and_lengths_do_not_matter(mass, length):
+    """A limit that can be kept is kept at the same optimum, whatever its size and that of a free input."""
+    ocp, data, first = speed_limited(mass, length)
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6 * mass * length), first, data)
+    assert plan.status == fp.Status.OK
+    other, data, first = speed_limited(1.0, 1.0)
+    assert known(plan.cost) == pytest.approx(known(fp.solve(other, IPOPT, first, data).cost), rel=1e-6)
+    assert plan.states[1].max() <= (1 + 1e-6) * length
+
+
+def test_a_plan_beyond_a_small_limit_is_not_ok():
+    """IPOPT relaxes limits by 1e-8, which is more than this one; the violation is told with digits that show it."""
+    ocp, data, first = speed_limited(1.0, 1e-9)
+    plan = fp.solve(ocp, fp.Ipopt(tolerance=1e-12), first, data)
+    assert plan.states[1].max() > 1.5e-9
+    assert plan.status == fp.Status.INFEASIBLE
+    assert "above 1e-09" in plan.violations()[0]
+    assert _apart(5.5e6, 0.4) == "5500000"
 
 
 def test_prices_are_refused_by_who_cannot_take_them():
