@@ -128,11 +128,20 @@ def differences(where: str, before: Flat, now: Flat) -> list[str]:
     sentences = []
     for name in sorted({*before, *now}):
         old, new = before.get(name, missing), now.get(name, missing)
-        if fingerprint(None if old is missing else [old]) != fingerprint(None if new is missing else [new]):
+        if fingerprint(None if old is missing else [_by_value(old)]) != fingerprint(
+            None if new is missing else [_by_value(new)]
+        ):
             was = "was not there" if old is missing else f"was {json.dumps(old)}"
             now_is = "is gone" if new is missing else f"is {json.dumps(new)}"
             sentences.append(f"{where}: {name} {was}, {now_is}")
     return sentences
+
+
+def _by_value(value: Any) -> Any:
+    """Plain data in which 2 and 2.0 are one number."""
+    if isinstance(value, list):
+        return [_by_value(entry) for entry in value]
+    return float(value) if type(value) is int else value
 
 
 def _flat(value: Any) -> dict[str, Any]:
@@ -296,7 +305,10 @@ def problems_here(folder: Path, baselines: Path | None = None) -> tuple[list[Pat
     folders = [baselines] if baselines else [p / FOLDER for p in places]
     named: dict[str, Path] = {}
     for path in (f for p in places for f in sorted(p.glob("*.py")) if _is_problem(f)):
-        named.setdefault(path.stem, path)
+        if named.setdefault(path.stem, path) != path:
+            raise BaselineError(
+                f"'{named[path.stem]}' and '{path}' have one name; rename one, or check them one by one"
+            )
     for path in (f for h in folders for f in sorted(h.glob("*.json"))):
         named.setdefault(path.stem, (place if baselines else path.parents[1]) / f"{path.stem}.py")
     listed = {name: reason for h in folders for name, reason in _unchecked(h / UNCHECKED).items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation, Iteration
 from fpirhc.deformation.model_referenced import ModelReferenced
-from fpirhc.errors import InvalidValue, Mistakes, OutputError
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import input_columns
 from fpirhc.sensing.base import response_names
@@ -27,6 +28,7 @@ from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
+from fpirhc.whole_file import write_whole
 
 _HOLDS = (1, 2, 4, 8, 16)  # cycles
 _NOISES, _SHARE = 2.0, 0.1  # amplitude: of the noise, and of the deviation of the desired response
@@ -270,13 +272,11 @@ class Replay:
 
     def write(self, path: Path) -> None:
         """Write a table: time and the commands by input."""
-        try:
-            with path.open("w", newline="", encoding="utf-8") as file:
-                table = csv.writer(file)
-                table.writerow(("time", *self.inputs))
-                table.writerows(np.column_stack([self.times, self.commands]).tolist())
-        except OSError as error:
-            raise OutputError(f"{path} cannot be written: {error.strerror}") from None
+        text = io.StringIO(newline="")
+        table = csv.writer(text)
+        table.writerow(("time", *self.inputs))
+        table.writerows(np.column_stack([self.times, self.commands]).tolist())
+        write_whole(text.getvalue(), path, "table of commands")
 
 
 @checked_call

@@ -66,6 +66,10 @@ def title_of(path: Path) -> str:
 def find_problem(name_or_path: str) -> Path:
     """Return the path of a shipped problem or of a user's file."""
     path = Path(name_or_path)
+    try:
+        path.exists()
+    except OSError as error:  # such as a name that is too long
+        raise ProblemFileError(f"no file at '{name_or_path}': {error.strerror}") from None
     shipped = {name: path for group in shipped_groups().values() for name, path in group.items()}
     if path.suffix == ".py" and path.is_file():
         return path

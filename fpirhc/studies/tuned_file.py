@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from fpirhc.errors import Mistakes, ProblemFileError
+from fpirhc.errors import InvalidValue, Mistakes, ProblemFileError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values, with_settings
 from fpirhc.studies.comparison.comparison import Comparison
@@ -56,6 +56,14 @@ def noted(comparison: Comparison, notes: Mapping[str, str]) -> Comparison:
     """Return the comparison with a note on every controller that `notes` names."""
     all_notes = {e.name: (*e.notes, notes[e.name]) if e.name in notes else e.notes for e in comparison.entries}
     return replace(comparison, entries=tuple(replace(e, notes=all_notes[e.name]) for e in comparison.entries))
+
+
+def check_apart(tuned: Mapping[str, Values], settings: Collection[str], file: Path) -> None:
+    """Raise if a number is both tuned and set; `settings`: paths that are set."""
+    for name, values in tuned.items():
+        for path in values:
+            if path in settings:
+                raise InvalidValue(f"--set {path}: '{file}' has this number of '{name}' too; leave one of them out")
 
 
 def with_tuned(task: Task, tuned: Mapping[str, Values]) -> Task:

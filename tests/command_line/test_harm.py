@@ -126,6 +126,14 @@ def test_a_run_with_another_gain_is_judged_with_it(file, capsys):
     assert factors[1] > 1.5 * factors[0]
 
 
+def test_a_run_to_other_set_points_has_no_verdict_on_those_of_the_file(file, capsys):
+    text = Path("line.py").read_text()
+    steps = 'fp.Setpoint({"y": [(0.0, 0.0), (1.0, 0.1)]}, rate=6.0)'
+    Path("line.py").write_text(text.replace('fp.Trajectory(lambda t: {"y": ca.sin(3 * t)})', steps))
+    assert red(shown(capsys, "run", "line.py", "CTC+gentle", "--no-compile"))
+    assert red(shown(capsys, "run", "line.py", "CTC+gentle", "--no-compile", "--set", "setpoints.y=0.5")) == []
+
+
 def test_tuning_says_that_the_best_settings_do_harm(file, capsys):
     """The search may not leave small gains, and the best of them still loses."""
     pytest.importorskip("optuna")

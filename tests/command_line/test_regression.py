@@ -21,6 +21,7 @@ from fpirhc.baselines.baseline import (
     KINDS,
     TIGHT,
     Expected,
+    differences,
     expected,
     fingerprint,
     problems_here,
@@ -339,6 +340,22 @@ def test_folders_of_a_problems_folder_are_checked_too(tmp_path):
     files, unchecked = problems_here(tmp_path)
     assert [str(p.relative_to(tmp_path / "problems")) for p in files] == ["gallery/gone.py", "one.py", "gallery/two.py"]
     assert unchecked == {"three": "slow"}
+
+
+def test_two_problems_of_one_name_are_refused(tmp_path):
+    """One of them would go unchecked."""
+    for inner in ("a", "b"):
+        (tmp_path / "problems" / inner).mkdir(parents=True)
+        (tmp_path / "problems" / inner / "arm.py").write_text("problem, controllers = 1, {}")
+    with pytest.raises(BaselineError, match=r"a/arm.py' and '.*b/arm.py' have one name; rename one"):
+        problems_here(tmp_path)
+
+
+def test_a_number_is_the_same_with_and_without_a_point():
+    """An edit from 2.0 to 2 changes no run, and from True to 1 is another kind of setting."""
+    assert differences("problem", {"duration": 2.0, "box": [-1.0, 1.0]}, {"duration": 2, "box": [-1, 1]}) == []
+    assert differences("problem", {"duration": 2.0}, {"duration": 3}) == ["problem: duration was 2.0, is 3"]
+    assert len(differences("problem", {"on": True}, {"on": 1})) == 1
 
 
 def test_other_versions_are_told_where_something_changed(folder, capsys):

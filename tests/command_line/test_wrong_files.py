@@ -461,6 +461,9 @@ export two_mass CTC --out o --live gain =>
     setting 'gain': neither the controller nor the problem's cost, limits, dead_time, reference
 compare two_mass --tuned notes.txt => 'notes.txt' is not a file that 'fpirhc tune' wrote
 replay two_mass CTC short.csv => recording short.csv: line 2 has 1 entries, the line of names 2
+probe mine.py --recording words.csv --cycles 7 =>
+    --cycles is of an excitation, and a --recording has been excited: leave one of them out
+replay mine.py RHC words.csv --out words.csv => --out words.csv is the recording itself, which would be lost
 probe mine.py --recording words.csv => recording words.csv: line 4 is not made of numbers: 0, abc
 """
 NOT_WRITABLE = """
@@ -579,3 +582,8 @@ def test_help_is_understood_as_a_command(words, said, capsys):
         main(words)
     assert ended.value.code == 0
     assert capsys.readouterr().out.startswith(said)
+
+
+def test_a_name_that_no_file_can_have_is_bad_input(capsys):
+    assert main(["compare", f"{'x' * 300}.py"]) == 2
+    assert capsys.readouterr().err.endswith(".py': File name too long\n")

@@ -239,6 +239,7 @@ def test_the_options_of_a_case_that_begins_as_an_option_does_run_it(tmp_path, mo
     monkeypatch.chdir(tmp_path)
     Path("line.py").write_text(LINE.replace('"far": {', '"-far": {'))
     task = fp.load_problem("line.py")
+    assert task.cases
     options = scenarios(task, Conditions(0, COMPARING, 0.0, compiled=False, named=True)).options(
         task.cases.names.index("-far")
     )

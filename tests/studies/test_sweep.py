@@ -164,11 +164,8 @@ WRONG = {
 
 def test_a_value_in_the_middle_that_the_problem_does_not_take_is_named(tmp_path: Path) -> None:
     """By the setting: a sweep has no cases of which anybody knows."""
-    planned = {
-        "horizon": fp.Horizon(stages=4, step=PERIOD),
-        "cost": fp.Quadratic(states={"y": 1.0}, deviation={"u": 1e-3}),
-    }
-    task = replace(task_of(), problem=replace(pump(), **planned))
+    horizon, cost = fp.Horizon(stages=4, step=PERIOD), fp.Quadratic(states={"y": 1.0}, deviation={"u": 1e-3})
+    task = replace(task_of(), problem=replace(pump(), horizon=horizon, cost=cost))
     with pytest.raises(FpirhcError, match=r"^horizon.stages = 6.5: .*Horizon.stages: expected a whole number"):
         swept(tmp_path, "horizon.stages=4:9:3", task=task)
 

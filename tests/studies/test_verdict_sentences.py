@@ -14,7 +14,7 @@ import fpirhc as fp
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
-from fpirhc.studies.comparison.causes import Yardstick
+from fpirhc.studies.comparison.causes import Yardstick, _slew_cause, limit_cause
 from fpirhc.studies.comparison.changes import Finding, Outcome
 from fpirhc.studies.comparison.entry import Entry, no_bound_because
 from fpirhc.studies.comparison.optimality import Optimality
@@ -485,6 +485,16 @@ def test_a_step_limit_is_the_cause_from_the_largest_change_on():
     assert no_difference(plain=plain) == ""
     # What the adaptive controller asks for may diverge because of something else.
     assert no_difference(desired=changing, settings={"step_limit": 2.0}) == ""
+
+
+def test_runs_that_end_early_show_neither_limits_nor_slew():
+    """Before the first cycle that counts a share is no number, and a desired response that diverges asks for no larger scale."""
+    plain, nothing = entry("RHC"), {"measured": {"at_limit": {"": np.nan}}}
+    assert limit_cause(plain, entry("FPI", "RHC", **nothing)) == ""
+    changing = np.where(np.arange(CYCLES)[:, None] < 50, 0.0, [3.0, 4.0])
+    adaptive = entry("FPI", "RHC", settings={"step_limit": 2.0})
+    assert _slew_cause(entry("RHC", desired=changing), adaptive)
+    assert _slew_cause(entry("RHC", desired=changing, stop="the state diverges"), adaptive) == ""
 
 
 def test_a_run_of_two_cycles_shows_no_slew():

@@ -92,10 +92,12 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.terminal import announce_backend, progress_bars
     from fpirhc.studies.comparison.compare import compare, select
     from fpirhc.studies.open_loop import with_optimisers
-    from fpirhc.studies.tuned_file import noted, read_tuned, with_tuned
+    from fpirhc.studies.tuned_file import check_apart, noted, read_tuned, with_tuned
 
     tuned = read_tuned(options.tuned, task) if options.tuned else None
-    task = with_tuned(task, tuned.values) if tuned else task
+    if tuned:
+        check_apart(tuned.values, numbers(options.settings), Path(options.tuned))
+        task = with_tuned(task, tuned.values)
     task = with_numbers_of_all(task, numbers(options.settings), options.controllers) if options.settings else task
     controllers = options.controllers
     if options.optimisers:

@@ -22,12 +22,15 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
+    from fpirhc.errors import InvalidValue
     from fpirhc.probing.recording import replay
     from fpirhc.report.terminal import say, show_table
     from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.view import to_json
     from fpirhc.summary import Column, Table
 
+    if options.out is not None and options.out.resolve() == options.recording.resolve():
+        raise InvalidValue(f"--out {options.out} is the recording itself, which would be lost; name another file")
     answer = replay(task.problem, select(task, [options.controller])[options.controller], options.recording)
     if options.out is not None:
         answer.write(options.out)

@@ -59,23 +59,25 @@ def _run(options: argparse.Namespace) -> ExitCode:
     elif options.mismatch is not None:
         raise InvalidValue("--mismatch belongs to --scenario K, the number of a scenario")
     folder = results_folder(options.out, task.name)
+    settings, points = by_kind(numbers(options.settings))
     with progress_bars() as progress:
         problem, changed, run = _simulated(
             task.problem,
             controller,
-            *by_kind(numbers(options.settings)),
+            settings,
+            points,
             seed=seed,
             name=name,
             compiled=not options.no_compile,
             progress=_named(progress, name),
         )
     which = options.case or ("" if options.scenario is None else f"scenario {options.scenario}")
-    stem = "".join(c if c.isalnum() else "_" for c in f"{name} {which}".strip())
+    stem = "".join(c if c.isalnum() or c == "-" else "_" for c in f"{name} {which}".strip())
     run.save(folder / f"{stem}.npz")
     save_figure(run.plot(), folder / f"{stem}.png")
     announce_backend([run])
     facts = {"seed": seed, "compiled": not options.no_compile, "metrics": task.metrics}
-    harm = harm_of_adaptation(problem, name, changed, **facts)
+    harm = () if points else harm_of_adaptation(problem, name, changed, **facts)  # of a run with the file's set-points
     show_run(run, measure(problem, run, task.metrics), harm, folder / f"{stem}.npz")
     return ExitCode.FINISHED if run.stop is None else ExitCode.ENDED_EARLY
 

@@ -223,7 +223,7 @@ def _slew_cause(plain: Entry, adaptive: Entry) -> str:
     A plan moves it in a step, which the map follows until the next plan.
     """
     limit, every = adaptive.run.settings["step_limit"], plain.plan_every
-    if not isinstance(limit, float) or plain.run.cycles < MANY_CYCLES * every:
+    if not isinstance(limit, float) or plain.run.cycles < MANY_CYCLES * every or plain.run.stop is not None:
         return ""
     desired = plain.run["desired"]
     largest = float(np.linalg.norm(desired[every:] - desired[:-every], axis=1).max()) / every
@@ -280,7 +280,7 @@ def stuck_cause(entry: Entry) -> str:
 def limit_cause(plain: Entry, adaptive: Entry) -> str:
     """Return a sentence where commands at their limits are a reason; else nothing."""
     before, after = (_share(e, "at_limit", "") for e in (plain, adaptive))
-    if after < _OFTEN:
+    if not after >= _OFTEN:  # nor where the run ends before the first cycle that counts
         return ""
     fact = f"Its command stands at a limit in {in_percent(after)} of the cycles (that of {plain.name} in {in_percent(before)})"
     if before >= _OFTEN and not np.ptp(adaptive.run["reference"], axis=0).any():
