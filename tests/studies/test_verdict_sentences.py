@@ -489,8 +489,7 @@ def test_a_step_limit_is_the_cause_from_the_largest_change_on():
 
 def test_runs_that_end_early_show_neither_limits_nor_slew():
     """Before the first cycle that counts a share is no number, and a desired response that diverges asks for no larger scale."""
-    plain, nothing = entry("RHC"), {"measured": {"at_limit": {"": np.nan}}}
-    assert limit_cause(plain, entry("FPI", "RHC", **nothing)) == ""
+    assert limit_cause(entry("RHC"), entry("FPI", "RHC", measured={"at_limit": {"": np.nan}})) == ""
     changing = np.where(np.arange(CYCLES)[:, None] < 50, 0.0, [3.0, 4.0])
     adaptive = entry("FPI", "RHC", settings={"step_limit": 2.0})
     assert _slew_cause(entry("RHC", desired=changing), adaptive)
