@@ -187,9 +187,14 @@ def test_cycles_that_are_skipped_have_no_linear_loop():
 
 @pytest.mark.parametrize("limit", [2.0, 1.0])
 def test_plans_that_keep_no_hard_limit_have_no_linear_loop(limit):
-    """Held at 1.5 m: with a limit of 1 m no plan is feasible, and the slope of what the optimiser leaves there means nothing."""
+    """Held at 1.5 m, with forces that cannot be back in a stage: with a limit of 1 m no plan is feasible.
+
+    The slope of what the optimiser leaves there means nothing.
+    """
     held = fp.Trajectory(lambda t: {"q": 1.5 + 0 * t})
-    problem = oscillator(reference=held, start={"q": 1.5}, limits=fp.Limits(states={"q": (-limit, limit)}))
+    problem = oscillator(
+        reference=held, start={"q": 1.5}, limits=fp.Limits({"u": (-12.0, 12.0)}, {"q": (-limit, limit)})
+    )
     found = own_loops(review_grid(problem, 0.0, 0), PLAIN)
     assert bool(found.loops) == (limit > 1.5)
     assert found.reason == ("" if found.loops else "no plan along the reference keeps its limits of states")
