@@ -7,9 +7,8 @@ of states keeps these limits too, and they are verified and named like states.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -47,23 +46,24 @@ def check_declared(limits: Limits, view: View) -> None:
         InvalidProblem: all such paths, with what declares the entry.
     """
     mistakes = Mistakes("limits")
-    for part, lacking, remedy in _undeclared(view):
+    for part, lacking, with_own, remedy in _undeclared(view):
         if not ca.SX(lacking.vector).is_constant():
             continue
         stand_in = Named(tuple(lacking), ca.SX.sym(part, len(tuple(lacking))), "input")
         for name, one in limits.paths.items():
-            if ca.depends_on(
-                one.named_value(name, replace(view, **cast(dict[str, Any], {part: stand_in}))), stand_in.vector
-            ):
+            if ca.depends_on(one.named_value(name, with_own(stand_in)), stand_in.vector):
                 mistakes.add(f"paths['{name}'] uses {part}, which plans do not have here; {remedy}")
     mistakes.raise_if_any()
 
 
-def _undeclared(view: View) -> list[tuple[str, Named, str]]:
-    """The entries of a view that limits may lack, by name, with what declares them."""
+def _undeclared(view: View) -> list[tuple[str, Named, Callable[[Named], View], str]]:
+    """The entries of a view that limits may lack, by name, with the view that has them, and what declares them."""
     by_rate = "limit a change by Limits(rates=...), or write a Limit of your own with uses_rate = True"
     by_cost = "leave it out, or take a cost that has it: Quadratic(deviation=...) or CustomCost(feedforward=True)"
-    return [("input_before", view.input_before, by_rate), ("feedforward", view.feedforward, by_cost)]
+    return [
+        ("input_before", view.input_before, lambda own: replace(view, input_before=own), by_rate),
+        ("feedforward", view.feedforward, lambda own: replace(view, feedforward=own), by_cost),
+    ]
 
 
 def _entry_of(name: str, one: Limit, view: View) -> ConstraintState:
