@@ -24,6 +24,7 @@ from fpirhc.export.cortex import Image
 from fpirhc.export.device import Device
 from fpirhc.export.processor import Processor
 from fpirhc.export.target import device_of, target_called, write
+from fpirhc.export.targets.c import template
 from fpirhc.symbolic.native import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -216,23 +217,26 @@ def test_a_session_with_many_programs_leaves_few_of_them_running(monkeypatch):
     assert len(fp.simulate(problem, first, seed=0).time) == 5
 
 
+WIDE = """
+#define ARM_INPUTS 103
+#define ARM_COMMANDS 34
+typedef double casadi_real;
+typedef struct { double number[ARM_INPUTS]; } arm_inputs;
+typedef struct { double number[ARM_COMMANDS]; } arm_command;
+typedef struct { int cycles; } arm_controller;
+static void arm_init(arm_controller* c) { c->cycles = 0; }
+static int arm_step(arm_controller* c, arm_inputs* in, arm_command* out) {
+  return out->number[0] = in->number[0], ++c->cycles;
+}
+"""
+
+
 @needs_compiler
-def test_a_program_is_told_how_many_numbers_a_wide_sample_has(tmp_path):
+def test_a_program_says_how_many_numbers_a_wide_sample_has(tmp_path):
     """A hundred and three: more than two digits."""
-    names = [f"x{k}" for k in range(34)]
-    plant = fp.Plant(
-        coordinates=dict.fromkeys(names, "m"),
-        inputs={f"F{k}": "N" for k in range(34)},
-        order=2,
-        response=lambda q, v, u, p: {name: u[f"F{name[1:]}"] / p.m for name in names},
-        parameters={"m": fp.Parameter(1.2, 1.0, "kg")},
-    )
-    reference = fp.Trajectory(lambda t: dict.fromkeys(names, 0 * t))
-    problem = fp.Problem(plant, reference, start=dict.fromkeys(names, 0.1), period=1e-2, duration=0.05)
-    controller = fp.ComputedTorque(fp.Exponential(5.0))
-    device = device_of(problem, controller, "wide", name="wide", cycles=1)
-    write(device, target_called("c"), tmp_path)
-    assert answers([program(tmp_path)], "h\n") == ["h wide 103 34"]
+    (tmp_path / "processor.c").write_text(template("processor.c", {"name": "arm", "NAME": "ARM", "title": "wide"}))
+    (tmp_path / "arm.h").write_text(WIDE)
+    assert answers([program(tmp_path)], "h\n") == ["h arm 103 34"]
 
 
 @needs_compiler
