@@ -21,9 +21,7 @@ from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import Native, native
 
 FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept, where an optimiser has no unit for it
-_SHARE = (
-    1e-3  # largest violation that still counts as kept, as a share of half a range that is so small that this is less
-)
+_SHARE = 1e-3  # of half a range, where this is less than `FEASIBLE`
 KEPT = 1e-6  # the same where an optimiser has a unit for it
 _ITERATIONS = "iterations", "most_iterations"  # settings of an optimiser that bound its work
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations

@@ -432,9 +432,7 @@ def _all_below(values: Expression, most: Expression) -> Expression:
 
 
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN
-INVERSE_ROUNDING = (
-    1e-15  # relative response error at which Newton's method stops, where no step of 1e-12 stops it before
-)
+INVERSE_ROUNDING = 1e-15  # relative response error at which it stops, unless a step of 1e-12 stops it before
 NEWTON_ITERATIONS = 50  # CasADi's own largest number, said here because the worst case of an exported step counts it
 
 

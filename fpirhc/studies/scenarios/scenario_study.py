@@ -105,9 +105,8 @@ def compare_scenarios(
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
     many = compiled and len(every) >= SIDE_BY_SIDE  # of all parts, which are joined only where they ran alike
-    begun = bool(
-        begun_with(folder / LEDGER, "side_by_side", many)
-    )  # what was begun one by one is not mixed with the other
+    # What was begun one by one is not mixed with the other.
+    begun = bool(begun_with(folder / LEDGER, "side_by_side", many))
     conditions = Conditions(
         seed,
         COMPARING,
