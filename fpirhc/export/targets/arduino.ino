@@ -2,7 +2,8 @@
 
 #include <@name@.h>
 
-const unsigned long TICKS = @ticks@; /* microseconds of @NAME@_PERIOD, which is in @unit@ */
+/* Microseconds of @NAME@_PERIOD, which is in @unit@. */
+@pace@
 
 static @name@_controller controller;
 static @name@_inputs in;

@@ -18,6 +18,7 @@ from fpirhc.errors import CompileError, InvalidValue, NotSupported
 from fpirhc.export.device import Device
 from fpirhc.export.target import Target, device_of
 from fpirhc.export.targets.c import IN_FLOAT, filled, layout_of, seconds, sources
+from fpirhc.plant.motion import SECONDS
 
 _SHORT_CALLS = "-Wl,--relax"  # calls of what is near take two bytes less
 _FLAGS = (
@@ -81,7 +82,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     if sizes and all(lacking.values()):
         least = "; ".join(f"{board} lacks {what}" for board, what in lacking.items())
         raise NotSupported(f"'{device.title}' fits no board: {least}. Use {_smaller(device)}")
-    sketch = filled(device, "arduino.ino", unit=device.problem.plant.time_unit, ticks=str(_ticks(device)))
+    sketch = filled(device, "arduino.ino", unit=device.problem.plant.time_unit, pace=_pace(device))
     return {
         "library.properties": _properties(device),
         **{f"src/{file}": text for file, text in own.items()},
@@ -96,18 +97,21 @@ def _sizes(sizes: Mapping[_Board, _Size]) -> list[str]:
 
 
 def _clock(device: Device) -> str:
-    hours = IN_FLOAT * seconds(device, "the target arduino") / 3600
-    return f"In float a time tells its cycle for {IN_FLOAT} cycles, {hours:.3g} h: then the example begins anew at time 0.\n"
+    last = f"{IN_FLOAT * float(device.problem.period):.3g} {device.problem.plant.time_unit}"
+    return f"In float a time tells its cycle for {IN_FLOAT} cycles, {last}: then the example begins anew at time 0.\n"
 
 
-def _ticks(device: Device) -> int:
-    """The period in microseconds."""
+def _pace(device: Device) -> str:
+    """The line with the period in microseconds."""
+    unit = device.problem.plant.time_unit
+    if unit not in SECONDS:
+        return f'#error "the period is in {unit}: write const unsigned long TICKS = ...; with its microseconds here"'
     ticks = round(1e6 * seconds(device, "the target arduino"))
     if not 1 <= ticks < 2**31:  # half of what the counter of microseconds holds
         raise InvalidValue(
             f"the period of {1e-6 * ticks:g} s is none that the clock of an Arduino counts: expected 1 us to 35 min"
         )
-    return ticks
+    return f"const unsigned long TICKS = {ticks};"
 
 
 def _own(device: Device) -> dict[str, str]:
