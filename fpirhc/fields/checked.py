@@ -191,6 +191,8 @@ class _Arguments:
         yield from self._wrong_names(arguments, values, named)
         every = {**values, **named}
         wrong = [n for n, value in every.items() if n in self.expected and not accepts(self.expected[n], value)]
+        if not wrong:
+            return
         if self._swapped(wrong, every):
             name, (one, other) = self.owner.__name__, wrong
             yield f"{name}: the values of '{one}' and '{other}' are swapped; write {name}({one}=..., {other}=...)"

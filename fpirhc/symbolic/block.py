@@ -111,7 +111,7 @@ class Block:
         """
         return self._built[0]
 
-    @property
+    @cached_property
     def inputs(self) -> Layout:
         """The signals that are read, and the live settings in the step."""
         return self._built[1]

@@ -142,12 +142,13 @@ class Layout:
         for s in self.signals:
             if s.name in slices:
                 raise InvalidName(f"signal '{s.name}' appears twice in one layout")
-            if s.start and len(s.start) != s.size:
-                raise InvalidShape(f"signal '{s.name}' has {s.size} entries but {len(s.start)} start values")
+            size = s.size
+            if s.start and len(s.start) != size:
+                raise InvalidShape(f"signal '{s.name}' has {size} entries but {len(s.start)} start values")
             if not all(map(math.isfinite, s.start)):
                 raise InvalidValue(f"start value of '{s.name}' is not finite: {s.start}")
-            slices[s.name] = slice(at, at + s.size)
-            at += s.size
+            slices[s.name] = slice(at, at + size)
+            at += size
         # Layouts are built and asked many times while a loop is composed; their names and places are plain attributes.
         vars(self).update(names=tuple(slices), size=at, _slices=slices)
 

@@ -230,7 +230,7 @@ def copied(value: T, changes: Mapping[str, object]) -> T:
 
 def _mapped(value: object, change: Callable[[LiveNumber], object]) -> object:
     """The value with `change` applied to its live numbers; the same object where it has none."""
-    return _changed(value, change) if _has_live(value) else value
+    return _changed(value, change) if type(value) not in _LEAVES and _has_live(value) else value
 
 
 def _changed(value: object, change: Callable[[LiveNumber], object]) -> object:

@@ -68,16 +68,16 @@ class LinearLaw(IntegralLaw):
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         self.check_cycle(plant, period)
         reads, writes = law_signals(plant)
-        orders = plant.response_orders.values()
-        first_gains = [self.gains(order)[0] for order in orders] if self.integral else []
+        gains = [self.gains(order) for order in plant.response_orders.values()]
+        first_gains = [own[0] for own in gains] if self.integral else []
 
         def step(s: Signals) -> dict[str, Expression]:
             error = s._target - getattr(s, plant.output.name)
             errors, own = error_chains(plant, error), own_errors(plant, error)
-            first_integral = ca.vertcat(*map(self._first_integral, own, errors))
+            first_integral = ca.vertcat(*map(self._first_integral, gains, own, errors))
             integral_before, remembered = bumpless(s, first_gains)
             integral = ca.if_else(s.warm_up > 0.5, integral_before, first_integral)
-            feedback = [self._feedback(integral[k], chain) for k, chain in enumerate(errors)]
+            feedback = [self._feedback(gains[k], integral[k], chain) for k, chain in enumerate(errors)]
             return {
                 "_target_error": ca.vertcat(*own),
                 "desired": s.nominal + ca.vertcat(*feedback),
@@ -93,14 +93,14 @@ class LinearLaw(IntegralLaw):
         gains = [(*self.gains(order), 1.0)[:2] for order in plant.response_orders.values()]
         return [Useful(integral, error, most) for (integral, error), most in zip(gains, self.largest, strict=True)]
 
-    def _feedback(self, integral: Expression, chain: list[Expression]) -> Expression:
+    def _feedback(self, gains: Sequence[float], integral: Expression, chain: list[Expression]) -> Expression:
         terms = [integral, *chain] if self.integral else chain
-        return total(g * e for g, e in zip(self.gains(len(chain)), terms, strict=True))
+        return total(g * e for g, e in zip(gains, terms, strict=True))
 
-    def _first_integral(self, error: Expression, chain: list[Expression]) -> Expression:
+    def _first_integral(self, gains: Sequence[float], error: Expression, chain: list[Expression]) -> Expression:
         if not (self.integral and self.bumpless):
             return error * 0
-        first, *others = self.gains(len(chain))
+        first, *others = gains
         return -total(g * e for g, e in zip(others, chain, strict=True)) / first
 
 
