@@ -50,9 +50,12 @@ def test_a_run_that_ends_early_is_no_yardstick():
 
 
 def test_ranges_are_those_of_references_that_move():
-    """The start counts; a set-point that is held where it starts has none."""
+    """The start counts, and any size; a set-point that is held where it starts, or nearly at 0, has none."""
     assert ranges(tank(duration=10.0))["y"] == pytest.approx(0.6, rel=1e-3)
     assert ranges(tank(reference=fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}))) == {}
+    small = fp.Trajectory(lambda t: {"y": 1e-10 * ca.sin(t)})
+    assert ranges(tank(reference=small, start={"y": 0.0}, duration=10.0))["y"] == pytest.approx(2e-10, rel=1e-3)
+    assert ranges(tank(reference=fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}), start={"y": 1 + 1e-13})) == {}
 
 
 def held_tank(size: float) -> fp.Problem:

@@ -254,11 +254,6 @@ def test_steps_of_a_plan_are_followed_until_the_next_plan():
         assert max(errors.values()) < 3e-4  # m; with the small one 5.8, without adaptation .02
 
 
-def test_without_a_pair_the_smallest_error_is_named(pair):
-    alone = [replace(entry(e, y=v), pair=None) for e, v in zip(pair, (0.25, 0.75), strict=True)]
-    assert findings(alone, {}, None)[0].text.startswith("plain has the smallest rms error (0.25)")
-
-
 def test_a_pair_has_the_same_formulas_where_several_controllers_have_the_same_settings():
     """Two costs that users wrote as functions look the same in a description of the settings."""
     task = fp.load_problem("two_mass")

@@ -187,11 +187,11 @@ def test_a_hard_limit_that_a_run_breaks_is_told():
     """The mass begins faster than its hard limit: the note says how fast; with a soft limit there is none, and none inside."""
     mass = fp.Plant({"q": "m"}, {"u": "N"}, {"m": fp.Parameter(1.0, 1.0, "kg")}, lambda q, v, u, p: {"q": u.u / p.m})
 
-    def notes(limit: float, **soft: float) -> tuple[str, ...]:
+    def notes(limit: float, size: float = 1.0, **soft: float) -> tuple[str, ...]:
         problem = fp.Problem(
             plant=mass,
             reference=fp.Trajectory(lambda t: {"q": 0 * t}),
-            start={"q": 0.0, "q'": -1.5},
+            start={"q": 0.0, "q'": -1.5 * size},
             period=0.05,
             duration=1.0,
             limits=fp.Limits(states={"q'": (-limit, limit)}, soft=soft),
@@ -202,4 +202,5 @@ def test_a_hard_limit_that_a_run_breaks_is_told():
         return broken_limits(problem, fp.simulate(problem, plan, seed=0, compiled=False))
 
     assert notes(1.0) == ("q' reaches -1.5 m/s, beyond its hard limit of -1 m/s",)
+    assert notes(1e-8, 1e-8) == ("q' reaches -1.5e-08 m/s, beyond its hard limit of -1e-08 m/s",)
     assert notes(2.0) == notes(1.0, **{"q'": 10.0}) == ()

@@ -112,6 +112,29 @@ def test_where_nobody_finishes_every_end_is_told():
     )
 
 
+ALONE = "; no controller is here both with and without adaptation, so adaptation itself is not judged."
+
+
+@pytest.mark.parametrize(
+    ("figure", "rows", "said_of_it"),
+    [
+        (None, {"A": (1.0, 0.2), "B": (0.5, 0.4)}, "A has a relative error, rms over range, of 0.158, the smallest"),
+        (None, {"A": (1.0,)}, "A has an rms error of y of 1 m"),
+        ("larger", {"A": (1.0,), "B": (2.0,)}, "B has loss 2 N, the largest"),
+    ],
+)
+def test_without_a_pair_the_best_row_is_named(figure, rows, said_of_it):
+    """Errors of a metre and of a radian count over their ranges; a figure ranks where there is one; one row is no smallest."""
+    loss = Metric("loss", lambda problem, run: 0.0, better=figure or "smaller", unit="N")
+    entries = [
+        entry(n, errors=dict(zip("yz", e, strict=False)), measured={"loss": {"": e[0]}}, metrics=[loss])
+        for n, e in rows.items()
+    ]
+    aim = Objective(loss, unit="N") if figure else None
+    [told] = findings(entries, {}, None, Yardstick({"y": 10.0, "z": 1.0}), figure=aim)
+    assert told.text == said_of_it + ALONE
+
+
 JUDGED = "FPI {} loss ({:g} N after {:g} N without adaptation; {} is better)."
 ASIDE = "By loss FPI and RHC cannot be set side by side: {} none."
 
@@ -122,6 +145,8 @@ ASIDE = "By loss FPI and RHC cannot be set side by side: {} none."
         ("smaller", 4.0, 2.0, Outcome.BETTER, JUDGED.format("improves", 2, 4, "smaller")),
         ("larger", 4.0, 2.0, Outcome.WORSE, JUDGED.format("worsens", 2, 4, "larger")),
         ("larger", -4.0, -2.0, Outcome.BETTER, JUDGED.format("improves", -2, -4, "larger")),
+        ("larger", -1.0, 1.0, Outcome.BETTER, JUDGED.format("improves", 1, -1, "larger")),
+        ("smaller", 4e-10, 2e-10, Outcome.BETTER, JUDGED.format("improves", 2e-10, 4e-10, "smaller")),
         ("smaller", 4.0, 4.0, Outcome.NO_DIFFERENCE, JUDGED.format("does not clearly change", 4, 4, "smaller")),
         ("smaller", math.nan, 2.0, Outcome.BETTER, ASIDE.format("RHC has")),
         ("smaller", 4.0, math.nan, Outcome.WORSE, ASIDE.format("FPI has")),
@@ -138,6 +163,7 @@ def test_the_figure_that_a_problem_is_judged_by(better, before, after, outcome, 
     figure = Objective(loss, unit="N")
     one, other, *_ = findings(rows, {}, None, None, figure=figure)
     assert (one.outcome, one.text) == (outcome, said_of_it)
+    assert math.isnan(one.ratios.get("loss", math.nan)) or one.ratios["loss"] == after / before
     assert other.text.startswith("FPI makes no clear difference: it changes the rms error of y")
 
 

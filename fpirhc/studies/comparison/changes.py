@@ -52,6 +52,7 @@ HELPS = 0.9  # an rms error below this share of the pair's counts as lower
 HURTS = 1.1
 MINOR = 0.01  # of the largest relative error
 ROUNDING = 1e-9  # relative errors
+_AT_START = 1e-12  # of the start: rounding of an output there, such as cos(pi / 2) for 0
 _SAMPLES = 2000
 _MANY = 1e6
 _QUARTER_TURN = {"rad": math.pi / 2, "deg": 90.0}
@@ -133,9 +134,10 @@ def ranges(problem: Problem, *, start: bool = True) -> dict[str, float]:
     states = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full())
     wanted = np.column_stack([problem.start_output, states]) if start else states
     moving = {}
+    started = _AT_START * float(np.abs(problem.start_state).max(initial=0.0))
     for name in problem.judged_names:
         row = wanted[plant.output.elements.index(name)]
-        if np.ptp(row) > ROUNDING * max(1.0, float(np.abs(row).max())):
+        if np.ptp(row) > max(started, ROUNDING * np.abs(row).max()):
             moving[name] = float(np.ptp(row))
     return moving
 

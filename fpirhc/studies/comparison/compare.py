@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import cast
+
+import numpy as np
 
 from fpirhc.contraction.spectrum import assess_gain
 from fpirhc.controllers.base import Controller
@@ -298,7 +301,7 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
     return Contraction(predicted[""], growing, measured, assess_gain(controller.deformation, spectrum), spectrum)
 
 
-_CLOSE = 1e-3  # share of a limit, within which a state keeps it
+_CLOSE = 1e-3  # share of half the range of its limits, or of the only one, within which a state keeps it
 
 
 def broken_limits(problem: Problem, run: Run) -> tuple[str, ...]:
@@ -308,8 +311,9 @@ def broken_limits(problem: Problem, run: Run) -> tuple[str, ...]:
     texts = []
     for k in hard:
         (low, high), values = limits.states[names[k]], run["plant_state"][:, k]
+        half, small = 0.5 * (high - low), min(FEASIBLE, _CLOSE * float(np.abs(values).max()))
         for beyond, limit, end in ((values.max() - high, high, values.max()), (low - values.min(), low, values.min())):
-            if beyond > max(FEASIBLE, _CLOSE * abs(limit)):
+            if beyond > (_CLOSE * half if math.isfinite(half) else max(small, _CLOSE * abs(limit))):
                 unit = with_space(units[k])
                 texts.append(f"{names[k]} reaches {end:.4g}{unit}, beyond its hard limit of {limit:g}{unit}")
     return tuple(texts)

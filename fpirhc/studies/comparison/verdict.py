@@ -63,7 +63,9 @@ def findings(
     by_figure = (
         [_by_figure(*pair, figure) for pair in ordered] if figure is not None and figure.metric is not None else []
     )
-    judged = [_told_of_partner(judge(*pair, measure), pair[0] in partners) for pair in ordered] or [_no_pair(entries)]
+    judged = [_told_of_partner(judge(*pair, measure), pair[0] in partners) for pair in ordered] or [
+        Finding(_without_a_pair(entries, measure.scales, figure), Outcome.NOT_COMPARABLE)
+    ]
     not_followed_pairs = {
         n for f in judged if f.outcome is Outcome.NOT_COMPARABLE and f.ratios for n in f.pair or ()
     }  # by `not_followed`
@@ -93,18 +95,23 @@ def _by_figure(plain: Entry, adaptive: Entry, figure: Objective) -> Finding:
         )
         return Finding(f"By {name} {adaptive.name} and {plain.name} cannot be set side by side: {none}.", outcome, pair)
     sign = -1 if metric.better == "larger" else 1
-    change = Change(name, abs(before), abs(after))
-    gained = sign * (before - after)
     outcome = Outcome.NO_DIFFERENCE
-    if change.outcome is not Outcome.NO_DIFFERENCE or before * after < 0:
-        outcome = Outcome.BETTER if gained > 0 else Outcome.WORSE
+    if _differ(figure, before, after):
+        outcome = Outcome.BETTER if sign * (before - after) > 0 else Outcome.WORSE
+    ratio = Change(name, abs(before), abs(after)).ratio if before * after >= 0 else math.nan
     text = (
         f"{figure.text(sign * after)} after {figure.text(sign * before)} without adaptation; {figure.better} is better"
     )
     verb = {Outcome.BETTER: "improves", Outcome.WORSE: "worsens", Outcome.NO_DIFFERENCE: "does not clearly change"}[
         outcome
     ]
-    return Finding(f"{adaptive.name} {verb} {name} ({text}).", outcome, pair, {name: change.ratio})
+    return Finding(f"{adaptive.name} {verb} {name} ({text}).", outcome, pair, {name: ratio})
+
+
+def _differ(figure: Objective, before: float, after: float) -> bool:
+    """Whether two numbers of a figure clearly differ: by more than its floor, and by more than a tenth or in their sign."""
+    floor = figure.metric.floor if figure.metric is not None else 0.0
+    return abs(after - before) > floor and not (before * after > 0 and HELPS <= after / before <= HURTS)
 
 
 def _told_of_partner(finding: Finding, apart: bool) -> Finding:
@@ -203,25 +210,29 @@ def _factor(change: Change) -> str:
     return f" ({times(change.ratio if more else 1 / change.ratio)} {'more' if more else 'less'})"
 
 
-def _no_pair(entries: Sequence[Entry]) -> Finding:
-    return Finding(_without_a_pair(entries), Outcome.NOT_COMPARABLE)
-
-
-def _without_a_pair(entries: Sequence[Entry]) -> str:
+def _without_a_pair(entries: Sequence[Entry], scales: Mapping[str, float], figure: Objective | None) -> str:
+    """The best row: by the figure, else by the errors that some of the rows weigh."""
     if not entries:
         return "No controller finished, so nothing can be compared."
     finished = [e for e in entries if e.run.stop is None]
     if not finished:
         return "No controller finished its run: " + "; ".join(f"{e.name}: {e.run.stop}" for e in entries) + "."
-    best = min(finished, key=_worst_rms)
-    return (
-        f"{best.name} has the smallest rms error ({_worst_rms(best):.3g}); no controller is here both with and without "
-        "adaptation, so adaptation itself is not judged."
+    weighed = (
+        None if any(e.weighed is None for e in finished) else frozenset().union(*(e.weighed or () for e in finished))
     )
-
-
-def _worst_rms(entry: Entry) -> float:
-    return max(entry.metrics.rms_error.values())
+    if figure is not None and figure.metric is not None:
+        best = min(finished, key=lambda e: figure.of(e.metrics))
+        number, word = figure.of(best.metrics), {"smaller": "smallest", "larger": "largest"}[figure.better]
+        found = (
+            f"{best.name} has {figure.noun} {figure.text(number)}"
+            if math.isfinite(number)
+            else f"No row has {figure.noun}"
+        )
+    else:
+        best = min(finished, key=lambda e: relative_error(e, scales, weighed))
+        number, word, found = 0.0, "smallest", f"{best.name} has {_said(best, scales, weighed)}"
+    found += f", the {word}" if len(finished) > 1 and math.isfinite(number) else ""
+    return f"{found}; no controller is here both with and without adaptation, so adaptation itself is not judged."
 
 
 def _price(plain: Entry, adaptive: Entry) -> str:
@@ -267,8 +278,7 @@ def _best_by(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, figure:
     if pair is None or name is None:
         return []
     ahead, best = min(values[e.name] for e in pair), values[name]
-    outcome = Change(figure.name, abs(ahead), abs(best)).outcome
-    if not best < ahead or (math.isfinite(ahead) and ahead * best > 0 and outcome is Outcome.NO_DIFFERENCE):
+    if not best < ahead or (math.isfinite(ahead) and not _differ(figure, ahead, best)):
         return []
     both = ", ".join(f"{e.name} {figure.text(values[e.name])}" for e in pair)
     return [f"By {figure.noun} {name} is better than this pair: {figure.text(best)} ({both})."]

@@ -190,12 +190,14 @@ def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> 
         f"{figure.interval(difference.low, difference.high)}; "
         f"{figure.better} in {one.better} of {one.count} {what}{f', equal in {one.equal}' if one.equal else ''}"
     )
-    times = f"{one.ratio:.3g} times its {figure.noun}"
+    # Of numbers that may be negative, such as a lowest level, a ratio can say the opposite.
+    more = figure.better == ("larger" if one.outcome is Outcome.BETTER else "smaller")
+    times = f"; {one.ratio:.3g} times its {figure.noun}" if one.ratio >= 0 and (one.ratio > 1) == more else ""
     worse = "larger" if figure.better == "smaller" else "smaller"
     if one.outcome is Outcome.BETTER:
-        return f"{one.name} has a {figure.better} {figure.noun} than {baseline.name} ({numbers}; {times})."
+        return f"{one.name} has a {figure.better} {figure.noun} than {baseline.name} ({numbers}{times})."
     if one.outcome is Outcome.WORSE:
-        return f"{one.name} has a {worse} {figure.noun} than {baseline.name} ({numbers}; {times})."
+        return f"{one.name} has a {worse} {figure.noun} than {baseline.name} ({numbers}{times})."
     return f"{one.name} and {baseline.name} show no clear difference ({numbers})."
 
 
