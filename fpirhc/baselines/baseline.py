@@ -243,7 +243,8 @@ def expected(
             not_compared[name] = "some variants have a value and some have none, or words that differ"
         else:
             compared[name] = metric
-    return Expected(outcomes, compared, not_compared)
+    broken = {name: why for r in results for name, why in r.broken.items() if name not in compared}
+    return Expected(outcomes, compared, {**not_compared, **broken})
 
 
 def _metric(family: run_metrics.Metric, measured: Sequence[tuple[str, Number]], quantum: float) -> Metric | None:

@@ -106,7 +106,7 @@ def judge(
     for name in names:
         rows += _rows(name, baseline.controllers.get(name), fresh.get(name), metrics)
     causes = _stale(baseline, settings, list(fresh))
-    notes = [f"{name}: {one.why}" for name, one in fresh.items() if one.why]
+    notes = [f"{name}: {why}" for name, one in fresh.items() for why in (one.why, *one.broken.values()) if why]
     return Judgement(
         baseline.problem,
         tuple(rows),

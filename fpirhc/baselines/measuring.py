@@ -6,7 +6,7 @@ import math
 import multiprocessing
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -37,6 +37,9 @@ class Measurement:
     outcome: str  # class of its outcome
     why: str  # reason for an outcome other than `FINISHED`
     numbers: Mapping[str, Number]  # its numbers by metric; NaN where there is none
+    broken: Mapping[str, str] = field(
+        default_factory=dict
+    )  # why metrics have no number, by name: their functions raised
 
 
 @dataclass(frozen=True)
@@ -122,19 +125,15 @@ def measure_job(task: Task, job: Job) -> Measurement:
         run = simulate(problem, ready, seed=variant.seed, compiled=variant.compiled, flags=variant.flags)
         if run.stop is not None:
             return Measurement(DIVERGED, run.stop, {})
-        numbers = _numbers(task, problem, run)
+        measured = measure(problem, run, task.metrics)
+        numbers: dict[str, Number] = {m.key(element): value for m, element, value in measured if m.compared != "not"}
         for metric, value in numbers.items():
             if metric_of(metric, task.metrics).finite and isinstance(value, float) and not math.isfinite(value):
                 return Measurement(DIVERGED, f"{metric} is not finite", {})
         plan = first_plan(task, problem, ready) if variant.plans else {}
     except FpirhcError as error:
         return Measurement(f"{REFUSED} ({type(error).__name__})", str(error), {})
-    return Measurement(FINISHED, "", {**numbers, **plan})
-
-
-def _numbers(task: Task, problem: Problem, run: Run) -> dict[str, Number]:
-    measured = measure(problem, run, task.metrics)
-    return {m.key(element): value for m, element, value in measured if m.compared != "not"}
+    return Measurement(FINISHED, "", {**numbers, **plan}, measured.broken)
 
 
 def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str, Number]:

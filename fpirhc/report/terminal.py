@@ -222,7 +222,7 @@ def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Path) -> No
         say(f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
         say(f"ended early: {run.stop}")
-    for text in run.remarks:
+    for text in (*metrics.broken.values(), *run.remarks):
         say(text)
     say(f"saved: {saved}", wrap=False)
 

@@ -122,9 +122,8 @@ class Objective:
         numbers = record["metrics"].get(self.metric.name, {})
         if self.element not in numbers and record["outcome"] == "finished":
             names = [self.metric.key(element) for element in numbers]
-            raise InvalidName(
-                f"metric '{self.name}': a run of '{record['controller']}' has none.{nearest(self.name, names)}"
-            )
+            lacking = nearest(self.name, names) if names else " Where its function raises, 'fpirhc run' says why."
+            raise InvalidName(f"metric '{self.name}': a run of '{record['controller']}' has none.{lacking}")
         value = None if record["outcome"] == "ended early" else numbers.get(self.element)
         return None if value is None else value * self._sign
 

@@ -189,14 +189,17 @@ def test_stale_settings_are_named(folder, capsys):
 
 
 def test_accept_replaces_a_baseline_and_keeps_the_reason(folder, capsys):
-    """After it the check holds again; the widths of the bands are told."""
-    text = (folder / "noisy.py").read_text()
+    """After it the check holds again; the widths of the bands are told, and by every command which metric broke."""
+    text = (folder / "noisy.py").read_text() + "metrics = (fp.Metric('mine', lambda problem, run: 1 / 0),)\n"
     (folder / "noisy.py").write_text(text.replace("rate=6.0", "rate=7.0"))
     assert main(["check", "noisy.py", "--no-compile"]) == 6
     assert main(["accept", "noisy.py", "--reason", " faster\n tracking", "--no-compile"]) == 0
     assert read_baseline(folder / "baselines" / "noisy.json").reason == "faster tracking"
     assert main(["check", "noisy.py", "--no-compile"]) == 0
-    assert "± " in capsys.readouterr().out
+    assert main(["run", "noisy.py", "CTC", "--no-compile"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "± " in shown
+    assert shown.count("metric 'mine' could not be computed (ZeroDivisionError: division by zero)") == 4
 
 
 def signed(facts):

@@ -130,7 +130,7 @@ def test_a_run_that_ended_at_once_has_no_numbers():
     assert metrics.solve == {}
     assert metrics.statuses == {"NON_FINITE": 1}
     assert metrics["cycles"] == {"": 0}
-    assert metrics.broken == fp.measure(problem(), run(1.0)).broken == ()
+    assert metrics.broken == fp.measure(problem(), run(1.0)).broken == {}
 
 
 def test_a_pair_with_a_run_that_ended_before_errors_count_is_informative():

@@ -365,8 +365,8 @@ def test_figures_that_mean_nothing_are_refused(wrong, message):
 def test_a_signal_that_is_not_there_breaks_its_figure_alone():
     metrics = fp.measure(problem(), run(0.0), [figures.Largest("comand.u"), figures.Nadir("command.u")])
     assert metrics["nadir"][""] == 0.0
-    assert "metric 'largest'" in metrics.broken[0]
-    assert "Did you mean 'command.u'?" in metrics.broken[0]
+    assert "metric 'largest'" in metrics.broken["largest"]
+    assert "Did you mean 'command.u'?" in metrics.broken["largest"]
 
 
 FILE = """

@@ -47,7 +47,7 @@ def test_a_broken_metric_is_told_by_its_name():
     metrics = fp.measure(brief(), run, [mine, rms])
     assert metrics["largest"][""] > 0
     assert metrics["mine"] == {}
-    [sentence] = metrics.broken
+    [sentence] = metrics.broken.values()
     assert sentence.startswith("metric 'mine' could not be computed (ZeroDivisionError: division by zero)")
 
 

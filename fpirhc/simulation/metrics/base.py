@@ -9,7 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import entry_points
 from numbers import Integral, Real
@@ -242,13 +242,13 @@ class Metrics(FoundByName):
         values: numbers by metric and element; a single number has the element ''. Metrics that the run does not have are left out.
         units: units by metric and element.
         entries: the metrics that were measured, by name.
-        broken: sentences about those whose function raised an error; they have no numbers.
+        broken: sentences about those whose function raised an error, by name; they have no numbers.
     """
 
     values: Mapping[str, Mapping[str, float]]
     units: Mapping[str, Mapping[str, str]]
     entries: Mapping[str, Metric]
-    broken: tuple[str, ...] = ()
+    broken: Mapping[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Mapping[str, float]:
         if isinstance(name, str) and name in self.entries:
@@ -349,11 +349,11 @@ def measure(problem: Problem, run: Run, metrics: Sequence[Metric] | None = None)
         InvalidValue: a metric's function returned no numbers.
     """
     entries = known_metrics() if metrics is None else metrics
-    broken: list[str] = []
-    results = {m: attempted(f"metric '{m.name}'", m.function, problem, run, broken=broken) for m in entries}
+    told: dict[str, list[str]] = {m.name: [] for m in entries}
+    results = {m: attempted(f"metric '{m.name}'", m.function, problem, run, broken=told[m.name]) for m in entries}
     values = {m.name: numbers for m, result in results.items() if (numbers := m.numbers(result))}
     units = {m.name: {e: m.unit_of(problem, e) for e in values[m.name]} for m in entries if m.name in values}
-    return Metrics(values, units, {m.name: m for m in entries}, tuple(broken))
+    return Metrics(values, units, {m.name: m for m in entries}, {n: one[0] for n, one in told.items() if one})
 
 
 @dataclass(frozen=True)

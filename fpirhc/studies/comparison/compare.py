@@ -245,7 +245,7 @@ def _entry(
             *told,
             *run.remarks,
             *broken,
-            *metrics.broken,
+            *metrics.broken.values(),
         ),
         lyapunov=view,
         prediction=prediction,
